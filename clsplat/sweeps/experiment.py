@@ -1,4 +1,4 @@
-"""Running a pipeline, or the cells of a matrix one after the other and comparing them."""
+"""Run a pipeline, or run the cells of a matrix one after another and compare them."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -43,8 +43,6 @@ from clsplat.sweeps.compare.page import write_comparison
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
-# Running one pipeline in its folder, with a log and a progress bar.
-
 LOG = logging.getLogger("clsplat")
 
 
@@ -56,9 +54,9 @@ def run_pipeline(
     live: Live | None = None,
     minutes: float | None = None,
 ) -> None:
-    """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json says why.
+    """Run one pipeline in its folder, with a log and a progress bar.
 
-    state: the folder before the run; minutes: as for `Job.run`.
+    state: the folder before the run.  minutes: as for `Job.run`.  Raises ClsplatError; status.json holds the reason.
     """
     outputs.check_output_paths(pipeline, state)
     out = state.out
@@ -85,23 +83,23 @@ def run_pipeline(
             else:
                 execute_within(minutes, pipeline, run, start, show, execute)
         for line in summary(out):
-            LOG.debug("%s", line)  # who asked for the run shows it
+            LOG.debug("%s", line)  # the caller prints it
 
 
-MOST_MINUTES = 525_600  # a year
+MAX_MINUTES = 525_600  # a year
 
 
 @dataclass(frozen=True)
 class Job:
-    """A checked pipeline or matrix, and the folder that it runs in."""
+    """A checked pipeline or matrix, and the folder it runs in."""
 
     work: Pipeline | Experiment
-    state: RunState  # the folder, as it is before the run
+    state: RunState  # the folder before the run
     start: Start
 
     @property
     def out(self) -> Path:
-        """The folder."""
+        """The folder it runs in."""
         return self.state.out
 
     @classmethod
@@ -114,15 +112,15 @@ class Job:
         start: Start = "new",
         execution: dict[str, Any] | None = None,
     ) -> "Job":
-        """Check a pipeline file, or a shipped one by name; `overrides` are 'stage.key=value'.  Raises ConfigError.
+        """Check a pipeline file, or a shipped pipeline by name.  Raises ConfigError.
 
-        out: default runs/NAME, with a number where that is another run; start: "resume" goes on from the newest
-        checkpoint, "restart" begins again in a folder that holds a run; execution: of a matrix, in the place of its
-        own.
+        out: default runs/NAME, with a number appended if that folder holds another run.  overrides:
+        'stage.key=value'.  start: "resume" continues from the newest checkpoint, "restart" runs from the first step
+        in a folder that holds a run.  execution: replaces the `execution` of a matrix.
         """
         state = None
         if out is not None:
-            path_exists(out)  # raises where no file can have that name
+            path_exists(out)  # raises if no file can have that name
             state = RunState.read(out)
         return cls._open(pipeline, state, scene, overrides, start, execution)
 
@@ -136,8 +134,8 @@ class Job:
         start: Start,
         execution: dict[str, Any] | None,
     ) -> "Job":
-        changes = overrides_of(overrides, scene)
-        experiment = load_experiment(pipeline, changes, execution)
+        edits = overrides_of(overrides, scene)
+        experiment = load_experiment(pipeline, edits, execution)
         if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
         if experiment and state and start == "resume" and execution is None and state.phase is not Phase.DONE:
@@ -147,11 +145,11 @@ class Job:
                     f"{state.out}: was started with --on; its cells are in {shorten(str(before))}: give --on FILE again"
                 )
         if state:
-            return cls(experiment or load(pipeline, changes), state, start)
+            return cls(experiment or load(pipeline, edits), state, start)
         if experiment:
             return cls(experiment, free_folder(Path("runs") / experiment.name, None, start), start)
-        checked = load(pipeline, changes)
-        return cls(checked, free_folder(Path("runs") / checked.settings.name, checked, start), start)
+        single = load(pipeline, edits)
+        return cls(single, free_folder(Path("runs") / single.settings.name, single, start), start)
 
     @classmethod
     def resume(
@@ -162,59 +160,61 @@ class Job:
         execution: dict[str, Any] | None = None,
         steps: int | None = None,
     ) -> "Job":
-        """Take the pipeline that a run folder holds, to continue it there.  Raises ConfigError or DataError.
+        """Open the run in a folder to continue it.  Raises ConfigError or DataError.
 
-        scene: where its photographs are; default: where they were; execution: as for `open`; steps: of its training.
+        scene: the new folder of its photographs, if they were moved.  execution: as for `open`.  steps: a new number
+        of training steps.
         """
         state = RunState.read(out)
         if PIPELINE not in state.names:
-            again = (
-                f"; run its `clsplat run … --out {shell_quote(out)} --resume` again" if STATUS in state.names else ""
-            )
-            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{again}")
+            hint = f"; run its `clsplat run … --out {shell_quote(out)} --resume` again" if STATUS in state.names else ""
+            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{hint}")
         if steps is not None:
             overrides = [*overrides, f"{state.steps_key}={steps}"]
         return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
-        """What would run, as lines of text, of a single run with a rough range of the time that it takes.
+        """Return what would run, as lines of text; for a single run with a rough estimate of its time.
 
-        Raises what `run` raises before it begins.
+        Raises what `run` raises before it starts.
         """
         if isinstance(self.work, Experiment):
             return describe_matrix(self.work, self.state, device, self.start)
         return describe.describe(self.work, self.state, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
-        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
+        """Run it; finished outputs that are up to date are not made again.
 
-        live: the port of a live preview, 0 for any; None: there is none.  minutes: that it takes, from when its
-        photographs are read, in as many steps as fit.
+        live: the port of a live preview, 0 for any free one; None: no preview.  minutes: a time budget that starts
+        when the photographs are read; the number of steps is chosen to fit it.
+        Raises ClsplatError; status.json holds the reason.
         """
-        if minutes is not None and not 0 < minutes <= MOST_MINUTES:
-            raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0, up to {MOST_MINUTES:,}")
+        if minutes is not None and not 0 < minutes <= MAX_MINUTES:
+            raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0, up to {MAX_MINUTES:,}")
         if minutes is not None and isinstance(self.work, Experiment):
             raise ConfigError(
                 "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
             )
         if minutes is not None and self.start == "resume" and self.state.phase >= Phase.BEGUN:
-            raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
+            raise ConfigError("--minutes chooses the steps of a new run; omit it to continue this run")
         with live_preview(live) as preview:
             if isinstance(self.work, Experiment):
                 run_matrix(self.work, self.state, device, self.start, preview)
             elif start := start_of(self.work, self.state, self.start):
                 folder = self.work.settings.scene.folder
                 if start == "resume" and not folder.exists():
-                    remedy = f"`clsplat resume {shell_quote(self.out)} --scene DIR` says where they are now"
+                    remedy = f"if you moved it, run `clsplat resume {shell_quote(self.out)} --scene DIR`"
                     raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
                 run_pipeline(self.work, self.state, device, start, preview, minutes)
             else:
                 _require_same_photographs(self.work, self.out)
-                LOG.info("%s: up to date: its outputs are whole; change a setting or the folder to run again", self.out)
+                LOG.info(
+                    "%s: up to date: its outputs are complete; change a setting or the folder to run again", self.out
+                )
 
 
 def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError where those of a run that is done have changed since; prepared ones are noted with it."""
+    """Raise ConfigError if the photographs changed after the run; prepared photographs are not checked."""
     scene = pipeline.settings.scene
     if not pipeline.settings.prepare and scene.folder.exists():
         _, identity = identify(scene, sha256)
@@ -223,27 +223,26 @@ def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:
 
 @contextmanager
 def live_preview(port: int | None) -> Iterator[Live | None]:
-    """Serve a live preview for the block, and say where; None: without one.  Raises ConfigError."""
+    """Serve a live preview during the block and print its address; without a port, yield None.  Raises ConfigError."""
     if port is None:
         yield None
         return
     with Live(port) as live:
-        terminal.print_message(live.text)  # not in the log, which others may read: its address is a secret
+        terminal.print_message(live.text)  # not in the log, which others may read: the address is secret
         yield live
 
 
 def run_matrix(
     experiment: Experiment, state: RunState, device: str | Device | None, start: Start, live: Live | None = None
 ) -> None:
-    """Run every cell in its folder, and write compare.html; a resumed matrix leaves finished cells alone.
+    """Run every cell in its folder and write compare.html; a resumed matrix skips finished cells.
 
     state: the folder before the run.
-
-    A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
-    Interrupted stops the whole.
+    A failed cell does not stop the others; at the end a ClsplatError is raised with the exit code of the first failure.
+    Interrupted stops the whole matrix.
     """
     out = state.out
-    before, done = read_cells(experiment, out, start)
+    states, done = read_cells(experiment, out, start)
     with open_matrix(experiment, state, start) as (status, failures):
         status.enter("running")
         for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
@@ -253,20 +252,18 @@ def run_matrix(
             try:
                 with failures.kept(cell.name):
                     if cell.name not in done:
-                        run_pipeline(cell.pipeline, before[cell.name], device, start, live)
-            except Interrupted as stopped:
-                raise Interrupted(
-                    f"stopped in {title}; `clsplat resume {shell_quote(out)}` goes on with it"
-                ) from stopped
+                        run_pipeline(cell.pipeline, states[cell.name], device, start, live)
+            except Interrupted as error:
+                raise Interrupted(f"stopped in {title}; `clsplat resume {shell_quote(out)}` continues it") from error
             status.note(done=number, failed=failures.texts())
             status.refresh()
 
 
 @contextmanager
 def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
-    """Hold the folder of a matrix while its cells run; at the end write compare.html.
+    """Lock the folder of a matrix while its cells run; at the end write compare.html.
 
-    Raises a ClsplatError with the exit code of the first cell that is among the failures at the end.
+    Raises a ClsplatError with the exit code of the first failed cell.
     """
     check_matrix_folder(state)
     count, failures, out = len(experiment.cells), Failures("cells"), state.out
@@ -281,9 +278,9 @@ def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterat
 
 
 def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[str, RunState], set[str]]:
-    """Return the folders of the cells, by name, and the names of the cells that a resumed matrix leaves alone.
+    """Return the state of each cell's folder, by name, and the names of the cells that a resumed matrix skips.
 
-    Raises ConfigError where one was run with other settings.
+    Raises ConfigError if a cell was run with other settings.
     """
     states = {cell.name: RunState.read(out / cell.name) for cell in experiment.cells}
     resumed = experiment.cells if start == "resume" else []
@@ -293,25 +290,25 @@ def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[st
 
 
 def check_matrix_folder(state: RunState) -> None:
-    """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
+    """Raise ConfigError if the folder holds a single run, or unrelated files with the names that a matrix writes."""
     outputs.check_names(state, MATRIX_FILES)
     outputs.require_inside(state.out, [state.out / PREPARED, state.out / UNDISTORTED])  # cells share them
     out = state.out
     if PIPELINE in state.names and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
-        raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
+        raise ConfigError(f"{out}: holds a single run, not a matrix; give another folder")
 
 
 def describe_matrix(experiment: Experiment, state: RunState, device: str | Device | None, start: Start) -> str:
-    """What would run, a line for each cell.
+    """Return what would run, one line per cell.
 
-    Raises a ClsplatError with the exit code of the first cell that the run would refuse.
+    Raises a ClsplatError with the exit code of the first cell that could not run.
     """
     check_matrix_folder(state)
     run_folder.check_run_folder(state, start)
     describe.check_unused(state.out)
     cells, done = read_cells(experiment, state.out, start)
     lines, refusals = [], Failures("cells")
-    read = cache(read_run_scene)  # each distinct scene once
+    read = cache(read_run_scene)  # read each distinct scene once
     for cell in experiment.cells:
         progress = "done" if cell.name in done else "unfinished" if (state.out / cell.name).exists() else ""
         try:
@@ -326,7 +323,7 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
 
 
 def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:
-    """Write the page that compares the cells that have finished.  Raises what `write_comparison` raises."""
+    """Write the page that compares the finished cells.  Raises what `write_comparison` raises."""
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:

@@ -98,7 +98,7 @@ def test_a_whole_run_that_is_done_is_left_alone(copy, monkeypatch, caplog):
     written = (copy / "status.json").read_bytes()
     with caplog.at_level("INFO", "clsplat"):
         clsplat.resume(copy)
-    assert f"{copy}: up to date: its outputs are whole" in caplog.text
+    assert f"{copy}: up to date: its outputs are complete" in caplog.text
     assert (copy / "status.json").read_bytes() == written
 
 

@@ -171,7 +171,7 @@ def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
         raise Interrupted("stopped at step 2")
 
     monkeypatch.setattr(runner, "execute", interrupted)
-    words = f"stopped in cell 1 of 4: steps=4-opacity=0.1-seed=0; `clsplat resume {tmp_path / 'run'}` goes on with it"
+    words = f"stopped in cell 1 of 4: steps=4-opacity=0.1-seed=0; `clsplat resume {tmp_path / 'run'}` continues it"
     with pytest.raises(Interrupted, match=re.escape(words)):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path / "run"), None, "new")
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
