@@ -42,7 +42,7 @@ def test_a_key_has_the_content_of_the_model_that_a_folder_holds(few_steps, tiny_
     (one / "point_cloud.ply").write_bytes(b"another")
     assert from_model(one, tiny_scene, tmp_path / "notes") != key
     (one / "point_cloud.ply").unlink()
-    with pytest.raises(DataError, match="one: holds no model; expected a file, or the folder of a finished run"):
+    with pytest.raises(DataError, match="one: has no model; expected a file, or the folder of a finished run"):
         from_model(one, tiny_scene, tmp_path / "notes")
 
 
@@ -52,8 +52,8 @@ def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatc
     def refuse(path):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("clsplat.pipeline.input_files.model_at", refuse)
-    with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); give another file"):
+    monkeypatch.setattr("clsplat.pipeline.input_files.model_path", refuse)
+    with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); check its permissions"):
         content_of(few_steps)
     assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
 
@@ -88,8 +88,8 @@ def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, stor
     for folder, text in ((tmp_path, b"of the sweep"), (tmp_path / "elsewhere", b"of the worker")):
         (folder / "m.ply").write_bytes(text)
     monkeypatch.chdir(tmp_path)
-    options = [f"scene.path={os.path.relpath(tiny_scene)}", "init.source=model", "init.file=m.ply"]
-    cell = CellRun.from_json(CellRun.of("x", load("smoke", options), "s", "b").json())
+    overrides = [f"scene.path={os.path.relpath(tiny_scene)}", "init.source=model", "init.file=m.ply"]
+    cell = CellRun.from_json(CellRun.of("x", load("smoke", overrides), "s", "b").json())
     monkeypatch.chdir("elsewhere")
     placed = load(str(write(tmp_path / "cell.yaml", cell.text))).settings
     assert Path(placed.stages[0].file) == tmp_path / "m.ply"
@@ -99,7 +99,7 @@ def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, stor
     (tmp_path / "m.ply").write_bytes(b"another")
     outcome = run_cell(replace(cell, spec={**cell.spec, "bits": "c"}), store, command(WRITES), options)
     assert (outcome.state, outcome.exit_code) == ("failed", 3)
-    assert f"{tmp_path / 'm.ply'} is not what it was where the sweep began" in outcome.message
+    assert f"{tmp_path / 'm.ply'} differs from the file with which the sweep started" in outcome.message
 
 
 def test_a_file_that_changes_while_a_cell_runs_fails_it(store, options, tmp_path):

@@ -263,7 +263,7 @@ def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
 
 def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
     """Of transparent photographs, and as splats of a model that has none."""
-    transparent = "the photographs have transparency: what is learned and exported as a sky is the color that"
+    transparent = "the photographs are transparent, so the sky would learn the color that clsplat puts behind them"
     nothing = "export.sky: splats has no effect: the model has no sky"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
     for scene, key, said in (
@@ -310,7 +310,7 @@ def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
             SkyModule.check_saved({}, {**behind, name: table})
     with pytest.raises(DataError, match="not finite float32 numbers"):
         SkyModule.check_saved({}, {**behind, "moment2": behind["moment2"] * np.nan})
-    with pytest.raises(DataError, match="another sky"):
+    with pytest.raises(DataError, match="its sky has the tables texels, biases; expected texels, moment1"):
         SkyModule.check_saved({}, {"texels": behind["texels"], "biases": behind["biases"]})
 
 
