@@ -1,7 +1,7 @@
-/* What a camera makes of light: y = f(v c) of every pixel c, with the falloff v of its lens and the curve f of each
- * channel, and back.
+/* Camera response y = f(v c) of every pixel c, with the falloff v of the lens and the curve f of each channel; forward
+ * and backward.
  *
- * v = 1 + a q + b q^2 + c q^3; q is the squared distance from a center; 1 is that of a corner from the middle.
+ * v = 1 + a q + b q^2 + c q^3; q is the squared distance from a center, 1 at a corner of the image.
  * The slope of f is piecewise linear between NODES places from 0 to 1, and constant beyond them; f(0) = 0.
  * A fourth plane is copied.  Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.
  * One group of TEAM items = one row; each sum is written once.  Deterministic. */
@@ -10,9 +10,9 @@
 #define NODES 5
 #define SUMS (5 + 3 * NODES)  // derivatives by the center, by a, b, c, and by the slopes of each channel
 
-/* What the camera makes of an image; or, back, the gradient by the image from that by what the camera made of it, and
- * the sums of a row that give the derivatives.  numbers: a, b, c, then the slopes of each channel; center: px; per_px:
- * px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
+/* Forward: the response to an image.  Backward: the gradient with respect to the image, from that with respect to the
+ * response, and the row sums that give the derivatives.  numbers: a, b, c, then the slopes of each channel; center:
+ * px; per_px: px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void camera_response(
     __global const float *restrict image, __global const float *restrict gradient,  // [channels,H',stride] 3 or 4

@@ -100,13 +100,13 @@ def test_a_renderer_draws_the_moment_of_a_view(finished, scene):
 def test_view_without_a_time_shows_the_first_moment_and_says_so(finished, scene, caplog):
     from clsplat.render import motion
 
-    motion._tell_of_the_first.cache_clear()
+    motion._warn_of_first_timestamp.cache_clear()
     model, view = load(finished), clsplat.read_scene(scene).split("test")[0]
     renderer = Renderer(model)
     found = [renderer.render(replace(view, time=time)).image for time in (None, 0.0, None)]
     np.testing.assert_array_equal(found[0], found[1])
     assert [record.message for record in caplog.records].count(caplog.records[-1].message) == 1
-    assert "first moment" in caplog.text
+    assert "first timestamp" in caplog.text
 
 
 def test_a_scene_that_stands_still_is_refused(tiny_scene, tmp_path):

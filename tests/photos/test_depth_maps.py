@@ -118,5 +118,5 @@ def test_a_training_takes_them_and_notices_that_they_changed(yard, tmp_path):
     write_map(tmp_path / "maps" / yard.views[0].name, ground(yard, yard.views[0]), bits=8)
     assert contents(asked) != before
     two = losses.replace("%s}]", f"{folder}}}, {{type: inverse_depth}}]")
-    with pytest.raises(ConfigError, match="given with two folders; expected one"):
+    with pytest.raises(ConfigError, match="is listed with two folders; keep one"):
         train(scene, tmp_path / "c", *TWO_DOZEN, f"optimize.losses={two}")

@@ -158,7 +158,7 @@ def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, mo
         map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
     assert "trying again" not in caplog.text
     used, more = list[Pairing](), list[int]()
-    monkeypatch.setattr(mapping_tool, "match_within", lambda database, pairing: used.append(pairing))
+    monkeypatch.setattr(mapping_tool, "match_database", lambda database, pairing: used.append(pairing))
     monkeypatch.setattr(mapping_tool, "match_pairs", lambda database, pairs, threads: more.append(len(pairs)))
     with pytest.raises(DataError):
         map_cameras(tmp_path / "matches", tmp_path / "cameras")
@@ -294,7 +294,7 @@ matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
 
 def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     """A reader in pycolmap's own process would release the locks of its writes."""
-    monkeypatch.setattr(progress, "WATCH", 0.01)
+    monkeypatch.setattr(progress, "FIRST_POLL", 0.01)
     heard: set[int] = set()
     with listening(lambda what, done, total, seconds_left: heard.add(done)):
         match_features(placed.parent / "features", tmp_path)

@@ -108,7 +108,7 @@ def test_check_and_the_page_of_the_viewer_name_it(rng, tmp_path):
     assert "box" not in pack(replace(boxed(rng), rendering=Rendering())).header
     stand = Viewpoint.from_points(boxed(rng).means, (), None)
     text = Page("a", {"a": pack(boxed(rng))}, stand).text()
-    assert "the pixel&#39;s box, drawn here as a blur of 0.0833333 px², keeps the energy" in text
+    assert "pixel box, drawn here as a blur of 0.0833333 px², normalized" in text
 
 
 def test_a_model_that_is_read_again_draws_as_the_run_did(tiny_scene, tmp_path):

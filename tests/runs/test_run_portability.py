@@ -123,7 +123,7 @@ def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
 def test_the_report_begins_with_pictures_and_cameras(done, tiny_scene):
     text = (done / "report.html").read_text()
     page = Page(text)
-    titles = ["The worst views", "Photographs", "Figures", "Training", "Settings"]
+    titles = ["The worst views", "Photographs", "Figures", "Settings"]
     places = [text.index(f"<h2>{title}</h2>") for title in titles]
     assert places == sorted(places)
     assert text.count(f"<h1>{tiny_scene.name}</h1>") == 1

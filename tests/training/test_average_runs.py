@@ -89,20 +89,20 @@ def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, 
 
 def test_an_average_that_nothing_adds_to_is_refused(tmp_path, pipeline):
     with pytest.raises(
-        ConfigError, match="which add_to_average makes at every 2 steps after step 30; the training ends"
+        ConfigError, match="which add_to_average makes every 2 steps after step 30, but the training ends"
     ):
         load(pipeline, ["optimize.add_to_average.start=30"])
     with pytest.raises(
-        ConfigError, match=r"the training ends before: set add_to_average\.every below 30"
+        ConfigError, match=r"the training ends earlier; set add_to_average\.every below 30"
     ):  # no edit follows the last step
         load(pipeline, ["optimize.add_to_average.every=30", "optimize.add_to_average.start=0"])
 
 
 def test_the_figures_of_the_error_are_those_of_all_overrides():
-    told = r"optimize\.steps=40: .* at every 50 steps after step 10; .* set add_to_average\.every below 40, or"
+    told = r"optimize\.steps=40: .* every 50 steps after step 10, .* set add_to_average\.every below 40, or"
     with pytest.raises(ConfigError, match=told):
         load("photos", ["optimize.steps=40", "add_to_average.start=10"])
-    with pytest.raises(ConfigError, match=r"optimize\.steps=40: .* after step 60; .*\.start earlier"):
+    with pytest.raises(ConfigError, match=r"optimize\.steps=40: .* after step 60, .*\.start earlier"):
         load("photos", ["optimize.steps=40", "add_to_average.every=20", "add_to_average.start=60"])
     load("photos", ["optimize.steps=40", "add_to_average.start=10", "add_to_average.every=20"])
     with pytest.raises(ConfigError, match=r"--set add_to_average\.start=-1: "):
@@ -174,5 +174,5 @@ def test_a_start_on_the_hull(tmp_path, pipeline):
 def test_photographs_without_transparency_have_no_hull(tmp_path, pipeline, caplog):
     scene = ball_scene(tmp_path / "scene", 3)
     run = train(scene, tmp_path / "run", *STILL, "init.source=hull", pipeline=pipeline)
-    assert "the photographs' silhouettes give 0 points only; starting from random ones" in caplog.text
+    assert "the visual hull gives only 0 points; starting from random ones" in caplog.text
     assert run.model.gaussians.count == 300

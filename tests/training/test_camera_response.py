@@ -74,7 +74,7 @@ def test_test_views_are_measured_as_their_camera_takes_them(ended, tmp_path):
     try:
         assert evaluate(ended.out)["test"]["1"]["psnr"] != pytest.approx(measured["psnr"], abs=1e-4)
         (ended.out / camera_response.FILE).write_text('{"photographs": {"a": {"center_x": 0}}}')
-        with pytest.raises(DataError, match="expected 17 finite numbers of each photograph"):
+        with pytest.raises(DataError, match="expected 17 finite numbers for each photograph"):
             evaluate(ended.out)
     finally:
         (tmp_path / camera_response.FILE).rename(ended.out / camera_response.FILE)

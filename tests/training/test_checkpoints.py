@@ -119,7 +119,7 @@ def test_a_run_that_has_lost_its_status_too_does_not_begin_again(killed_run, tin
     (killed_run / "status.json").unlink()
     if status is not None:
         (killed_run / "status.json").write_text(status)
-    with pytest.raises(OutputError, match=r"neither a readable status\.json nor a checkpoint, .*--restart"):
+    with pytest.raises(OutputError, match=r"both status\.json and the checkpoints of its run are lost; .*--restart"):
         train(tiny_scene, killed_run, *FEW, resume=True)
     assert (killed_run / "metrics.jsonl").read_bytes() == before
 

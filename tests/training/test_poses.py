@@ -93,7 +93,7 @@ def test_rates_begin_after_the_start_and_follow_the_visits():
     assert sum(at_step(seldom[1], step) for step in range(500, 2500, 50)) == pytest.approx(0.01, rel=0.1)
     assert at_step(CameraOptimizer().rates(600, 50)[1], 0) == pytest.approx(2e-3), "at most"
     assert at_step(often[0], 500) == pytest.approx(0.3 * 2e-4)
-    assert CameraOptimizer(turn=0.5).rates(30_500, 50)[0] == 0.5
+    assert CameraOptimizer(rotation=0.5).rates(30_500, 50)[0] == 0.5
     assert load("smoke").settings.training.modules == []
     assert load("smoke", ["optimize.modules.camera_optimizer={}"]).settings.training.modules == [CameraOptimizer()]
 

@@ -118,11 +118,11 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
     state = SkipBackwardState(SkipBackward(start=8), [View("a.png", Camera(40, 30, 1, 1, 1, 1), np.eye(3, 4))])
     for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
         camera = SimpleNamespace(width=width, height=30)
-        kept: list[Any] = []
+        saved: list[Any] = []
         now = SimpleNamespace(number=step, view=0, camera=camera, loss=float(step), skipped=False)
-        now.keep, now.kept = (
-            (lambda _, visit, kept=kept: kept.append(visit)),
-            (lambda _, kept=kept: (kept or [None])[0]),
+        now.save, now.saved = (
+            (lambda _, visit, saved=saved: saved.append(visit)),
+            (lambda _, saved=saved: (saved or [None])[0]),
         )
         state.after_losses(now)
         state.update(now)

@@ -21,13 +21,15 @@ def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
     assert settings.threshold(scalars, 10) is None, "not yet"
     assert settings.threshold({}, 11) is None
     assert settings.threshold(scalars, 11) == 2.0**-12 * 2**7 * (1 + 5 / 8), "bin 61 begins there"
-    assert settings.model_copy(update={"above": 2}).threshold(scalars, 11) == 2 * settings.threshold(scalars, 11)
+    assert settings.model_copy(update={"outlier_ratio": 2}).threshold(scalars, 11) == 2 * settings.threshold(
+        scalars, 11
+    )
     assert settings.model_copy(update={"quantile": 0.5}).threshold(scalars, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
 
 
 def test_all_pixels_count_where_no_few_differ_much_more():
     """Eight bins are an octave: 24 of them a factor of eight."""
-    settings = Transients(start=0, tail=8)
+    settings = Transients(start=0, tail_ratio=8)
     assert settings.threshold(distribution(_40=90, _64=10), 1) is None
     assert settings.threshold(distribution(_40=90, _65=10), 1) is not None
     assert settings.threshold(distribution(_40=995, _65=5), 1) is None, "beyond the 99 % quantile"
@@ -72,10 +74,10 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     workspace, planes = run.rasterizer.workspace, photograph.planes(run.rasterizer.workspace)
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
     residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colors, None)
-    settings = Transients(start=150, tail=0)
+    settings = Transients(start=150, tail_ratio=0)
     threshold = settings.threshold(run.modules["transients"].scalars, 151)
     assert threshold is not None
-    reach = max(1, round(settings.box * 40 / 2))
+    reach = max(1, round(settings.box_size * 40 / 2))
     left_out = mask_transients(workspace, photograph.camera, residuals, threshold, reach).get()[0, :40, :40] == 0
     inside = left_out[12:24, 10:22].copy()
     left_out[11:25, 9:23] = False

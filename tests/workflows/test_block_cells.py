@@ -93,10 +93,10 @@ def test_joined_models_are_their_rows_in_order(rng, tmp_path, monkeypatch):
 def test_models_that_do_not_fit_together_are_not_joined(rng, tmp_path):
     written(tmp_path / "a.ply", rng, 5)
     written(tmp_path / "b.ply", rng, 5, near=0.1)
-    with pytest.raises(DataError, match=r"b\.ply: has other properties, or another comment, than .*a\.ply"):
+    with pytest.raises(DataError, match=r"b\.ply: differs from .*a\.ply in properties or comments"):
         join_plys(tmp_path / "all.ply", [tmp_path / "a.ply", tmp_path / "b.ply"], lambda *_: None)
     (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-3])
-    with pytest.raises(DataError, match=r"b\.ply: its end is missing; train that block again"):
+    with pytest.raises(DataError, match=r"b\.ply: is truncated; train that block again"):
         join_plys(tmp_path / "all.ply", [tmp_path / "a.ply", tmp_path / "b.ply"], lambda *_: None)
     assert not (tmp_path / "all.ply").exists()
 
