@@ -90,12 +90,15 @@ def render_path(
     images that are not finite; OutputError if files cannot be written; and errors of the device.
     """
     from clsplat.runs import film
-    from clsplat.viewer.video.film import Wish
+    from clsplat.viewer.video.plan import VideoRequest
 
     load_plugins()
-    wish, place = Wish.of(str(path), frames, fps, size, times), film.FilmTarget(path_of(video), Path(out), kind)
+    request, place = (
+        VideoRequest.parse(str(path), frames, fps, size, times),
+        film.FilmTarget(path_of(video), Path(out), kind),
+    )
     extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha))
-    return film.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
+    return film.film(Path(model), path_of(scene), place, request, extras, downscale=downscale, device=device)
 
 
 def camera_path(
@@ -107,10 +110,10 @@ def camera_path(
     """
     import numpy as np
 
-    from clsplat.viewer.video.film import Wish, plan
+    from clsplat.viewer.video.plan import VideoRequest, plan_video
 
     points = np.empty((0, 3), np.float32) if scene.points is None else scene.points.positions
-    return plan(Wish.of(str(path), frames, None, size), scene, points).views
+    return plan_video(VideoRequest.parse(str(path), frames, None, size), scene, points).views
 
 
 def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: float = 30) -> int:
@@ -118,9 +121,9 @@ def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: fl
 
     Raises ConfigError for other suffixes and odd sizes, and ValueError for images of different sizes.
     """
-    from clsplat.viewer.video.encoding import write_all
+    from clsplat.viewer.video.encoding import write_video
 
-    return write_all(Path(file), images, fps)
+    return write_video(Path(file), images, fps)
 
 
 def write_cameras(

@@ -42,9 +42,9 @@ from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
-from clsplat.viewer.video.film import Film, Side, Wish, files, plan, shoot
-from clsplat.viewer.video.paths import Floats, nearest
-from clsplat.viewer.video.pictures import Canvas, Image, letterboxed
+from clsplat.viewer.video.frames import Canvas, Image, letterbox
+from clsplat.viewer.video.paths import Floats, nearest_view
+from clsplat.viewer.video.plan import Side, VideoPlan, VideoRequest, layer_files, plan_video, render_video
 
 LOG = logging.getLogger("clsplat")
 PHOTOGRAPH = "photograph"  # what --side may show, besides a model
@@ -71,7 +71,7 @@ def film(
     model: Path,
     scene: Path | None,
     place: FilmTarget,
-    wish: Wish,
+    request: VideoRequest,
     extras: Extras,
     *,
     downscale: float | None = None,
@@ -82,7 +82,7 @@ def film(
     Raises ClsplatError.
     """
     begun = time.perf_counter()
-    videos = files(place.video, extras.layers) if place.video else {}
+    videos = layer_files(place.video, extras.layers) if place.video else {}
     if place.kind not in KINDS:
         raise ConfigError(f"no kind '{place.kind}'; there are {', '.join(KINDS)}")
     if videos and place.kind != KINDS[0]:
@@ -90,10 +90,10 @@ def film(
     if extras.side and not videos:
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
     loaded = _read(model)
-    found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
+    found = _scene(model, scene, loaded, downscale, needed=not request.is_file or extras.side == PHOTOGRAPH)
     origin = found.origin if found else loaded.origin
     loaded = loaded.with_origin(origin)
-    made = plan(wish, found, points_of(loaded, found), moves=moves(loaded), origin=origin)
+    made = plan_video(request, found, points_of(loaded, found), moves=moves(loaded), origin=origin)
     background = loaded.rendering.background or (found.background if found else "black")
     opened = open_correct(device)
     canvas = Canvas(painter_of(loaded, opened, background))
@@ -102,7 +102,7 @@ def film(
         written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
     else:
         side = _side(extras.side, made, found, background, opened, origin)
-        shoot(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
+        render_video(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
         written = list(videos.values())
     return {
         "files": [str(path) for path in written],
@@ -135,7 +135,7 @@ def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | N
 
 
 def _side(
-    name: str | None, made: Film, scene: Scene | None, background: Background, device: Device, origin: Floats
+    name: str | None, made: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
     """Return what is shown next to a frame: the photo with the nearest camera, or another model."""
     if name is None:
@@ -150,10 +150,10 @@ def _side(
 
     @lru_cache(maxsize=4)
     def photograph(place: int) -> Image:
-        return letterboxed(load_photograph(taken[place], BACKGROUNDS[background])[:, :, :3], made.size)
+        return letterbox(load_photograph(taken[place], BACKGROUNDS[background])[:, :, :3], made.size)
 
     def side(view: View) -> Image:
-        return photograph(taken.index(nearest(view, taken, reach)))
+        return photograph(taken.index(nearest_view(view, taken, reach)))
 
     return side
 

@@ -45,8 +45,8 @@ from clsplat.stages.export import Export
 from clsplat.stages.render import image_paths
 from clsplat.stages.train_field import ExportField
 from clsplat.training.modules.base import apply_side_files, read_color_model
-from clsplat.viewer.video.film import require_motion, times_of
-from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
+from clsplat.viewer.video.frames import LAYERS, Canvas, layer_image, layer_values
+from clsplat.viewer.video.plan import parse_times, require_motion
 
 # Models on the host: Gaussians, or a field.
 
@@ -261,9 +261,9 @@ def write_pictures(
         found = canvas.layers(view, "depth" in layers)
         for layer, path in of_view.items():
             if kind == "png":
-                write_image(path, shown(found, layer, depths))
+                write_image(path, layer_image(found, layer, depths))
             else:
-                _write_array(path, values(found, layer))
+                _write_array(path, layer_values(found, layer))
     if film:
         _remove(out, {name for name, framed in rendered.items() if framed and name.endswith(f".{kind}")} - {*names})
     return paths
@@ -363,7 +363,7 @@ class ModelFile:
         time: of all views, in [0, 1], instead of their own.
         """
         views: Sequence[View] = self.scene.split(split)
-        if times := times_of(time):
+        if times := parse_times(time):
             require_motion(moves(self.loaded))
             views = [replace(view, time=times[0]) for view in views]
         if not views:

@@ -18,9 +18,9 @@ from clsplat.scene.view import View
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 from clsplat.viewer.video import encoding
-from clsplat.viewer.video.film import FPS, FRAMES, Film, Wish, plan, shoot, still
-from clsplat.viewer.video.paths import MAX_FRAMES, RATES, checked_size, size_of
-from clsplat.viewer.video.pictures import Canvas, letterboxed
+from clsplat.viewer.video.frames import Canvas, letterbox
+from clsplat.viewer.video.paths import MAX_FRAMES, RATES, check_size, size_of
+from clsplat.viewer.video.plan import FPS, FRAMES, VideoPlan, VideoRequest, plan_video, render_video, resize_view
 
 LOG = logging.getLogger("clsplat")
 KIND = "snapshot"  # of lines in metrics.jsonl
@@ -65,7 +65,7 @@ class Snapshot(Scheduled):
         return by_name[self.view]
 
     def run(self, run: Run) -> None:
-        view = still(self._view(run), checked_size(self.size) if self.size else None)
+        view = resize_view(self._view(run), check_size(self.size) if self.size else None)
         path = run.out / self.folder / f"step_{run.step:06d}.png"
         write_image(path, Canvas(run.painter()).picture(view))
         run.records.add(run.step, KIND, folder=self.folder, file=path.name)
@@ -98,9 +98,9 @@ class Timelapse(Stage):
         if not files:
             raise ConfigError(f"timelapse: {quote(self.folder)} has no snapshots; set 'folder' to that of snapshot")
         size = image_size(files[-1])
-        with encoding.opened(run.out / self.file, size, self.fps) as write:
+        with encoding.open_video(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
-                write(letterboxed(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all
+                write(letterbox(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all
         LOG.info("time-lapse of %d frames written to %s", len(files), run.out / self.file)
 
 
@@ -133,29 +133,29 @@ class Video(Stage):
         return None if size is None else size_of(size)
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
-        return None if key == "path" and not self._wish().of_a_file else super().input_path(key, scene)
+        return None if key == "path" and not self._request().is_file else super().input_path(key, scene)
 
-    def _wish(self) -> Wish:
-        return Wish.of(self.path, self.frames, self.fps, self.size, self.times)
+    def _request(self) -> VideoRequest:
+        return VideoRequest.parse(self.path, self.frames, self.fps, self.size, self.times)
 
-    def _plan(self, run: Run) -> Film:
+    def _plan(self, run: Run) -> VideoPlan:
         moves = run.gaussians is not None and run.model.gaussians.is_moving
-        return plan(self._wish(), run.scene.downscaled(run.downscale), _points(run), moves)
+        return plan_video(self._request(), run.scene.downscaled(run.downscale), _points(run), moves)
 
     def check(self) -> None:
-        self._wish()
+        self._request()
         encoding.check_encoder(Path(self.file))
 
     def run(self, run: Run) -> None:
-        film, path = self._plan(run), run.out / self.file
+        plan, path = self._plan(run), run.out / self.file
 
         def through(views: Sequence[View]) -> Iterator[View]:
             return counted(run.until_interrupted(views), "frames rendered", len(views))
 
         canvas = Canvas(run.painter())
         with listening(run.status.count):
-            shoot(canvas, film, {"color": path}, None, through)
-        LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
+            render_video(canvas, plan, {"color": path}, None, through)
+        LOG.info("video of %d frames written to %s, %.2f MB", len(plan.views), path, path.stat().st_size / 1e6)
 
 
 def _points(run: Run) -> NDArray[np.float32]:

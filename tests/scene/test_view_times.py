@@ -10,8 +10,8 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View
-from clsplat.viewer.video.camera_path import spread
-from clsplat.viewer.video.film import still
+from clsplat.viewer.video.camera_path import resample
+from clsplat.viewer.video.plan import resize_view
 
 CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)
 
@@ -39,11 +39,11 @@ def test_invalid_time_is_refused_with_name_and_expectation(time):
 def test_what_copies_a_view_keeps_its_time(tmp_path):
     view = moment(0.75)
     scene = make_scene(tmp_path, [view], set(), None)
-    copies = [view.resized(2), still(view, (20, 20)), *spread([view], 3), scene.with_alpha("mask").views[0]]
+    copies = [view.resized(2), resize_view(view, (20, 20)), *resample([view], 3), scene.with_alpha("mask").views[0]]
     copies += scene.downscaled(2).views
     assert [copy.time for copy in copies] == [0.75] * len(copies)
-    assert [between.time for between in spread([moment(0.25), view], 3)] == [0.25, 0.5, 0.75]
-    assert [between.time for between in spread([moment(None), view], 3)] == [None] * 3
+    assert [between.time for between in resample([moment(0.25), view], 3)] == [0.25, 0.5, 0.75]
+    assert [between.time for between in resample([moment(None), view], 3)] == [None] * 3
 
 
 def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):

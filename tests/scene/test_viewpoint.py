@@ -63,7 +63,7 @@ def test_all_take_the_same_way_for_up(case):
     up, points = up_direction(views), np.zeros((9, 3), np.float32)
     assert np.linalg.norm(up) == pytest.approx(1)
     assert np.degrees(np.arccos(min(1, up @ expected))) < degrees
-    np.testing.assert_allclose(Rig.of(views, points).up, up, atol=1e-12)
+    np.testing.assert_allclose(Rig.from_views(views, points).up, up, atol=1e-12)
     np.testing.assert_allclose(Viewpoint.from_points(points, views, views[0]).up, up, atol=1e-12)
 
 

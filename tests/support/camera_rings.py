@@ -29,4 +29,4 @@ def ring(angles, radius=3.0, height=1.0, target=(0.0, 0.0, 0.0)):
 
 def rig_of(views, rng=None):
     points = np.zeros((1, 3)) if rng is None else rng.normal(size=(500, 3)) * 0.3
-    return Rig.of(views, points)
+    return Rig.from_views(views, points)

@@ -72,13 +72,13 @@ def test_a_path_that_may_have_been_moved_is_said(views, tmp_path, caplog):
 
 
 def test_a_path_is_spread_over_other_numbers_of_frames(views):
-    many = camera_path.spread(views, 23)
+    many = camera_path.resample(views, 23)
     np.testing.assert_allclose(poses(many)[::2], poses(views), atol=1e-12)
     between = (views[0].position + views[1].position) / 2
     np.testing.assert_allclose(many[1].position, between, atol=1e-12)
-    assert len(camera_path.spread(views[:1], 4)) == 4
-    assert camera_path.spread(views, 12) == views
-    assert len(camera_path.spread(views, 1)) == 1
+    assert len(camera_path.resample(views[:1], 4)) == 4
+    assert camera_path.resample(views, 12) == views
+    assert len(camera_path.resample(views, 1)) == 1
 
 
 def test_another_size_keeps_the_vertical_field_of_view(views, tmp_path):
@@ -109,7 +109,7 @@ def test_another_size_keeps_the_lens(oblique):
 
 
 def test_between_two_views_the_lens_is_between_theirs(oblique):
-    assert lenses(camera_path.spread(oblique.views, 3)) == [(500, 400, cx, 200) for cx in (300, 325, 350)]
+    assert lenses(camera_path.resample(oblique.views, 3)) == [(500, 400, cx, 200) for cx in (300, 325, 350)]
 
 
 FAULTS = {

@@ -7,7 +7,7 @@ import pytest
 from clsplat.core.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.scene.images import image_size, read_image
-from clsplat.viewer.video.encoding import frames_of
+from clsplat.viewer.video.encoding import count_frames
 from tests.support.commands import clsplat as command
 from tests.support.runs import FEW, digest, train
 
@@ -46,8 +46,8 @@ def test_a_picture_every_so_many_steps_and_a_video_of_them(run):
     names = [path.name for path in sorted((run / "timelapse").iterdir())]
     assert names == [f"step_{step:06d}.png" for step in range(2, 13, 2)]
     assert {image_size(path) for path in (run / "timelapse").iterdir()} == {(40, 40)}
-    assert frames_of(run / "timelapse.webm") == 6
-    assert frames_of(run / "video.webm") == 5
+    assert count_frames(run / "timelapse.webm") == 6
+    assert count_frames(run / "video.webm") == 5
     last, render = (read_image(run / name) for name in ("timelapse/step_000012.png", "renders/test/r_001.png"))
     assert (last == render).all(), "the camera of the view, the model of the last step"
 

@@ -70,7 +70,7 @@ def test_a_failure_leaves_the_file_that_was_there(suffix, tmp_path):
 
 
 def test_a_file_that_lost_frames_is_no_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(encoding, "frames_of", lambda path: 3)
+    monkeypatch.setattr(encoding, "count_frames", lambda path: 3)
     with pytest.raises(OutputError, match="3 of 9 frames can be read back"):
         clsplat.write_video(tmp_path / "a.webm", pictures())
     assert not list(tmp_path.iterdir())
@@ -117,5 +117,5 @@ def test_a_file_that_is_no_webm_stays_as_it_is(tmp_path, rng):
     for length in (0, 1, 2, 7, 300):
         data = rng.integers(0, 256, length, dtype=np.uint8).tobytes()
         (tmp_path / "x").write_bytes(data)
-        webm.without_chance(tmp_path / "x")
+        webm.fix_track_ids(tmp_path / "x")
         assert len((tmp_path / "x").read_bytes()) == length

@@ -23,7 +23,7 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
 from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of
 from clsplat.scene.view import View
-from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, checked_rate, checked_size, even_size, placed
+from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, check_fps, check_size, even_size, placed
 
 LOG = logging.getLogger("clsplat")
 WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
@@ -86,7 +86,7 @@ def _of_cameras(path: Path) -> CameraPath:
     return CameraPath(frames, 30.0, size)
 
 
-def spread(views: Sequence[View], frames: int) -> list[View]:
+def resample(views: Sequence[View], frames: int) -> list[View]:
     """Return views at even places along a path, between two poses on the straight and the shortest turn.
 
     Times, where all views have one, are between those of the two.
@@ -131,7 +131,7 @@ def _size_and_rate(whole: JsonFrame) -> tuple[Size, float]:
     sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
     try:
-        return checked_size((width, height)), checked_rate(30.0 if fps is None else fps)
+        return check_size((width, height)), check_fps(30.0 if fps is None else fps)
     except ConfigError as error:
         raise DataError(f"{whole.where}: {error}; export the path again") from error
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.files import atomic_path, check_result_path
 from clsplat.metrics.images import to_8_bits
-from clsplat.viewer.video.paths import Size, checked_rate, checked_size
+from clsplat.viewer.video.paths import Size, check_fps, check_size
 
 # The numbers that FFmpeg draws by chance for the tracks of a WebM file.
 
@@ -27,7 +27,7 @@ UIDS = {0x73C5, 0x63C5}  # of a track, and of a track that a tag belongs to
 HEAD = 1 << 16  # bytes that hold all of them
 
 
-def without_chance(path: Path) -> None:
+def fix_track_ids(path: Path) -> None:
     """Give every track of a WebM file the number 1, in place, so that the same pictures give the same file."""
     with path.open("rb+") as file:
         head = file.read(HEAD)
@@ -82,7 +82,7 @@ def check_encoder(path: Path) -> None:
 
 
 @contextmanager
-def opened(path: Path, size: Size, fps: float) -> Iterator[Write]:
+def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
     """Yield a function that adds a picture; at the end of the block the file is there, whole and read back.
 
     size: of a picture, even numbers.  Raises OutputError; an earlier file then stays.
@@ -98,27 +98,27 @@ def opened(path: Path, size: Size, fps: float) -> Iterator[Write]:
 
             yield counted
         if suffix == ".webm":
-            without_chance(temporary)
-        if (found := frames_of(temporary)) != count:
+            fix_track_ids(temporary)
+        if (found := count_frames(temporary)) != count:
             raise OutputError(f"{path}: {found} of {count} frames can be read back; check the folder and its space")
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
 
 
-def write_all(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
+def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
     """Write pictures of one size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
 
     Raises ConfigError for a name, a rate or a size that no video can have, ValueError for pictures of several sizes.
     """
     check_file(path)
-    checked_rate(fps)
+    check_fps(fps)
     pictures = map(to_8_bits, images)
     first = next(pictures, None)
     if first is None:
         raise ValueError("a video needs at least one picture")
     height, width = first.shape[:2]
     count = 0
-    with opened(path, checked_size((width, height)), fps) as write:
+    with open_video(path, check_size((width, height)), fps) as write:
         for picture in chain([first], pictures):
             if picture.shape != (height, width, 3):
                 raise ValueError(f"picture {count} has shape {picture.shape}; expected {(height, width, 3)}")
@@ -127,7 +127,7 @@ def write_all(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> 
     return count
 
 
-def frames_of(path: Path) -> int:
+def count_frames(path: Path) -> int:
     """Return how many frames of a video can be decoded."""
     reader, count = cv2.VideoCapture(str(path)), 0
     try:

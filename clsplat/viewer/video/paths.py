@@ -38,7 +38,7 @@ class Rig:
     points: Floats  # [M, 3], the means of a model or the points of a scene
 
     @classmethod
-    def of(cls, views: Sequence[View], points: Floats) -> "Rig":
+    def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
         """Leave out cameras far away from all others, and points that are not finite.
 
         Raises DataError without a view.
@@ -202,7 +202,7 @@ RATES = 1, 240  # frames a second
 Size = tuple[int, int]  # width, height
 
 
-def checked_size(size: str | Size) -> Size:
+def check_size(size: str | Size) -> Size:
     """Return the size of a film, given as text such as 640x480 or as numbers.
 
     Raises ConfigError unless both are even, as codecs need them, and in bounds.
@@ -222,20 +222,20 @@ def checked_size(size: str | Size) -> Size:
 def size_of(text: str) -> str:
     """Return a size as it is.  Raises ValueError, as a validator does, where no film has it."""
     try:
-        checked_size(text)
+        check_size(text)
     except ConfigError as error:
         raise ValueError(str(error)) from error
     return text
 
 
-def checked_frames(frames: int) -> int:
+def check_frames(frames: int) -> int:
     """Return a number of frames.  Raises ConfigError where it is out of bounds."""
     if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
         raise ConfigError(f"frames {quote(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
     return frames
 
 
-def checked_rate(fps: float) -> float:
+def check_fps(fps: float) -> float:
     """Return a number of frames a second.  Raises ConfigError where it is out of bounds."""
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not RATES[0] <= fps <= RATES[1]:
         raise ConfigError(f"fps {quote(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
@@ -425,7 +425,7 @@ def _looking(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[Vi
     return named(positions, targets, ups, rig, size)
 
 
-def nearest(view: View, views: Sequence[View], reach: float) -> View:
+def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
     """Return the photograph's view whose camera is closest: `reach` of distance counts as much as a right angle.
 
     Of the moments of one camera it is the nearest.

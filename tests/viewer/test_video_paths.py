@@ -12,19 +12,19 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View
-from clsplat.viewer.video.film import Wish, plan
 from clsplat.viewer.video.paths import (
     PATHS,
     Rig,
     around,
-    checked_frames,
-    checked_rate,
-    checked_size,
+    check_fps,
+    check_frames,
+    check_size,
     even_size,
     like,
-    nearest,
+    nearest_view,
     order,
 )
+from clsplat.viewer.video.plan import VideoRequest, plan_video
 from tests.support.camera_rings import CAMERA, SIZE, UP, rig_of, ring
 from tests.support.data_sets import data_set
 
@@ -107,7 +107,7 @@ def facing(rng, count=20):
 
 def test_spiral_sways_no_farther_than_the_cameras(rng):
     views = facing(rng)
-    rig = Rig.of(views, rng.normal(size=(500, 3)) * 0.3 + (0, 5, 0))
+    rig = Rig.from_views(views, rng.normal(size=(500, 3)) * 0.3 + (0, 5, 0))
     found = PATHS["spiral"](rig, 50, SIZE)
     assert (np.abs(positions(found)).max(axis=0) <= np.abs(positions(views)).max(axis=0) + 0.05).all()
     assert np.ptp(positions(found)[:, 0]) > 0.3
@@ -124,7 +124,7 @@ def test_axes_that_are_almost_parallel_meet_amid_what_they_show(rng):
         for i, (p, s) in enumerate(zip(places, slopes, strict=True))
     ]
     ground = np.column_stack([rng.uniform(-4, 4, (800, 2)), rng.uniform(-0.2, 0.2, 800)])
-    rig = Rig.of(views, ground)
+    rig = Rig.from_views(views, ground)
     np.testing.assert_allclose(rig.focus, (0, 0, 0), atol=0.8)
     for view in PATHS["ellipse"](rig, 40, SIZE):
         assert view.position[2] > 2, "above the ground"
@@ -155,7 +155,7 @@ def test_a_walk_passes_near_the_views_and_looks_as_they_do(rng):
     assert gaps.max() < 0.15
     assert np.linalg.norm(np.diff(place, axis=0), axis=1).max() < 0.3, "no leaps"
     for view in found:
-        closest = nearest(view, views, 1.0)
+        closest = nearest_view(view, views, 1.0)
         assert view.world_to_camera[2, :3] @ closest.world_to_camera[2, :3] > 0.97
         assert view.world_to_camera[1, :3] @ closest.world_to_camera[1, :3] > 0.97
 
@@ -194,32 +194,32 @@ def test_sizes():
     wide = like(CAMERA, (400, 300))
     assert (wide.fx, wide.cx, wide.cy) == (360, 200, 150)
     assert around(CAMERA, (200, 150)) == CAMERA
-    assert checked_size("640x480") == checked_size((640, 480)) == (640, 480)
+    assert check_size("640x480") == check_size((640, 480)) == (640, 480)
 
 
 @pytest.mark.parametrize("size", ["641x480", "640", "10x9", "10000x10", "-2x4", (640, 480.0), (4,)])
 def test_bad_sizes_are_refused(size):
     with pytest.raises(ConfigError, match="even numbers"):
-        checked_size(size)
+        check_size(size)
 
 
 @pytest.mark.parametrize("frames", [0, 100_001, True, 2.5])
 def test_bad_numbers_of_frames_are_refused(frames):
     with pytest.raises(ConfigError, match="whole number from 1"):
-        checked_frames(frames)
+        check_frames(frames)
 
 
 @pytest.mark.parametrize("fps", [0, 241, float("nan"), True])
 def test_bad_rates_are_refused(fps):
     with pytest.raises(ConfigError, match="frames a second"):
-        checked_rate(fps)
+        check_fps(fps)
 
 
 def test_an_unknown_path_and_a_path_without_a_scene_are_refused():
     with pytest.raises(ConfigError, match="no path 'elipse'; there are ellipse, spiral, orbit, through, views"):
-        Wish.of("elipse", None, None, None)
+        VideoRequest.parse("elipse", None, None, None)
     with pytest.raises(ConfigError, match="needs the cameras of a scene"):
-        plan(Wish(), None, np.zeros((1, 3)))
+        plan_video(VideoRequest(), None, np.zeros((1, 3)))
 
 
 def test_a_path_of_a_scene_in_python(rng):

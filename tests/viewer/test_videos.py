@@ -10,8 +10,8 @@ import pytest
 import clsplat
 from clsplat.core.errors import ConfigError, DataError, NumericError
 from clsplat.scene.images import read_image
-from clsplat.viewer.video.film import Wish, plan
-from clsplat.viewer.video.pictures import Canvas, depth_picture, letterboxed
+from clsplat.viewer.video.frames import Canvas, depth_image, letterbox
+from clsplat.viewer.video.plan import VideoRequest, plan_video
 from tests.support.camera_paths import write_camera_path
 from tests.support.commands import clsplat as command
 from tests.support.pictures import decoded
@@ -40,7 +40,7 @@ def test_a_film_is_the_pictures_of_its_path(few_steps, tiny_scene, tmp_path):
     images = [renderer.render(view).image for view in views]
     assert np.mean([clsplat.metrics.psnr(a, b) for a, b in zip(images, single.values(), strict=True)]) > 30
 
-    made = plan(Wish.of("orbit", 6, 5, "64x48"), clsplat.read_scene(tiny_scene), model.means)
+    made = plan_video(VideoRequest.parse("orbit", 6, 5, "64x48"), clsplat.read_scene(tiny_scene), model.means)
     write_camera_path(tmp_path / "p.json", made.views, 5)
     again = clsplat.render_path(few_steps, video=tmp_path / "b.webm", path=str(tmp_path / "p.json"))
     assert (again["frames"], again["fps"]) == (6, 5)
@@ -172,7 +172,7 @@ def test_depth_and_coverage_are_pictures_and_arrays(few_steps, tmp_path):
 
 def test_depths_go_from_red_to_blue():
     depth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
-    ((near, middle, far, nothing),) = depth_picture(depth, np.ones((1, 4), np.float32), (1.0, 4.0)).astype(int)
+    ((near, middle, far, nothing),) = depth_image(depth, np.ones((1, 4), np.float32), (1.0, 4.0)).astype(int)
     assert near[0] > 80 + near[2]
     assert far[2] > far[0]
     assert middle[1] > max(middle[0], middle[2]) - 60
@@ -180,7 +180,7 @@ def test_depths_go_from_red_to_blue():
 
 
 def test_a_picture_stands_in_the_middle_of_its_box():
-    box = letterboxed(np.full((10, 20, 3), 7, np.uint8), (40, 40))
+    box = letterbox(np.full((10, 20, 3), 7, np.uint8), (40, 40))
     assert box.shape == (40, 40, 3)
     assert (box[10:30] == 7).all()
     assert (box[:10] == 0).all()

@@ -55,24 +55,24 @@ class Canvas:
         return float(min(near, far * (1 - SMALLEST_RANGE))), float(far)
 
 
-def shown(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
+def layer_image(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
     """Return one of LAYERS as 8 bits, RGB, [height, width, 3]."""
     if layer == "color":
         return to_8_bits(found.image)
     if layer == "alpha":
         return np.repeat(to_8_bits(found.alpha)[:, :, None], 3, axis=2)
     assert found.depth is not None
-    return depth_picture(found.depth, found.alpha, depths)
+    return depth_image(found.depth, found.alpha, depths)
 
 
-def values(found: Layers, layer: str) -> NDArray[np.float32]:
+def layer_values(found: Layers, layer: str) -> NDArray[np.float32]:
     """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
     array = {"color": found.image, "depth": found.depth, "alpha": found.alpha}[layer]
     assert array is not None
     return array
 
 
-def depth_picture(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
+def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
     """Return depths, [height, width], as colors from red (near) to blue (far), black where nothing is.
 
     The colors are even in inverse depth: what is near is told apart finely, as by the eye.
@@ -85,12 +85,12 @@ def depth_picture(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths
     return to_8_bits((colors / np.float32(255) * cover).astype(np.float32))
 
 
-def beside(image: Image, other: Image) -> Image:
+def side_by_side(image: Image, other: Image) -> Image:
     """Return two pictures of one height side by side."""
     return np.hstack([image, other])
 
 
-def letterboxed(image: Image, size: tuple[int, int]) -> Image:
+def letterbox(image: Image, size: tuple[int, int]) -> Image:
     """Return a picture in the middle of a black one of another size (width, height), as large as it fits."""
     width, height = size
     factor = min(width / image.shape[1], height / image.shape[0])
