@@ -68,7 +68,7 @@ def test_a_path_that_may_have_been_moved_is_said(views, tmp_path, caplog):
     write_camera_path(tmp_path / "p.json", views, 24)
     with caplog.at_level(logging.WARNING, "clsplat"):
         camera_path.read(tmp_path / "p.json")
-    assert "put dataparser_transforms.json beside the path" in caplog.text
+    assert "put dataparser_transforms.json next to the path" in caplog.text
 
 
 def test_a_path_is_spread_over_other_numbers_of_frames(views):

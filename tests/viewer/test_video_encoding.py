@@ -62,9 +62,9 @@ def test_an_encoder_is_silent(tmp_path, capfd):
 def test_a_failure_leaves_the_file_that_was_there(suffix, tmp_path):
     file = tmp_path / f"a{suffix}"
     file.write_bytes(b"old")
-    with pytest.raises(ValueError, match="picture 1 has shape"):
+    with pytest.raises(ValueError, match="image 1 has shape"):
         clsplat.write_video(file, [pictures()[0], pictures(1, (32, 48))[0]])
-    with pytest.raises(ValueError, match="at least one picture"):
+    with pytest.raises(ValueError, match="at least one image"):
         clsplat.write_video(file, [])
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {file.name: b"old"}
 
@@ -98,7 +98,7 @@ def test_mp4_without_pyav_says_how_to_get_it(tmp_path, monkeypatch):
 
 def test_opencv_without_an_encoder_says_what_else_there_is(tmp_path, monkeypatch):
     monkeypatch.setattr(encoding, "CODEC", "none")
-    with pytest.raises(OutputError, match=r"cannot write WebM.*or write pictures alone, into --out DIR"):
+    with pytest.raises(OutputError, match=r"cannot write WebM.*or write images with --out DIR"):
         clsplat.write_video(tmp_path / "a.webm", pictures())
 
 

@@ -86,7 +86,7 @@ def test_ellipse_facing_cameras_on_one_side_swings_there(rng):
 def test_an_orbit_says_what_no_photograph_shows(rng, caplog):
     with caplog.at_level(logging.WARNING, "clsplat"):
         PATHS["orbit"](rig_of(ring(np.linspace(-0.8, 0.8, 15)), rng), 4, SIZE)
-    assert "degrees from where no photograph was taken" in caplog.text
+    assert "degrees of the orbit were not photographed" in caplog.text
 
 
 def test_cameras_that_look_outwards_have_nothing_to_circle(rng):

@@ -1,4 +1,4 @@
-"""The moments of films: at one moment, as time runs, and at a fixed camera."""
+"""Timestamps of videos: one, a range, and at a fixed camera."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def plan_views(scene, path="ellipse", times=None, frames=5, moves=True):
     ("given", "expected"),
     [(None, None), (0.5, (0.5, 0.5)), ("0.5", (0.5, 0.5)), ("0..1", (0, 1)), ((1, 0.5), (1, 0.5)), ("1..0", (1, 0))],
 )
-def test_times_are_one_moment_or_two(given, expected):
+def test_times_are_one_or_two_timestamps(given, expected):
     assert parse_times(given) == expected
 
 
@@ -67,7 +67,7 @@ def test_a_fixed_camera_is_one_view_over_time(scene):
         plan_views(scene, "orbit:c3/1")
 
 
-def test_the_views_of_a_scene_keep_their_moments(scene):
+def test_views_of_a_scene_keep_their_timestamps(scene):
     assert [view.time for view in plan_views(scene, "views", frames=4)] == [0, 1, 0, 1]
     assert {view.time for view in plan_views(scene, "views", times=0.5)} == {0.5}
 
@@ -75,11 +75,11 @@ def test_the_views_of_a_scene_keep_their_moments(scene):
 def test_a_model_that_does_not_move_has_no_times(scene):
     still = replace(scene, views=tuple(replace(view, time=None) for view in scene.views))
     assert {view.time for view in plan_views(still, moves=False)} == {None}
-    with pytest.raises(ConfigError, match="the model does not move; leave the time out"):
+    with pytest.raises(ConfigError, match="the model does not move; omit the time"):
         plan_views(still, times=0.5, moves=False)
 
 
-def test_the_nearest_photograph_is_that_of_the_nearest_moment(scene):
+def test_nearest_photo_is_that_of_the_nearest_timestamp(scene):
     view = replace(scene.views[6], name="frame", time=0.9)
     assert nearest_view(view, scene.views, scene.extent).name == "c3/1"
     assert nearest_view(replace(view, time=0.1), scene.views, scene.extent).name == "c3/0"

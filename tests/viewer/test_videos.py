@@ -1,4 +1,4 @@
-"""Films of a model by command and by function: colors, depth, coverage, photographs and models beside."""
+"""Videos of a model by command and by function: colors, depth, coverage, and photos or models next to them."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ def pictures(folder):
     return {path.relative_to(folder).as_posix(): read_image(path) for path in sorted(folder.rglob("*.png"))}
 
 
-def test_a_film_is_the_pictures_of_its_path(few_steps, tiny_scene, tmp_path):
+def test_video_has_the_renders_of_its_path(few_steps, tiny_scene, tmp_path):
     options = {"path": "orbit", "frames": 6, "size": (64, 48), "fps": 5}
     told = clsplat.render_path(few_steps, video=tmp_path / "a.webm", **options)
     assert (told["frames"], told["seconds"], told["size"]) == (6, 1.2, [64, 48])
@@ -70,7 +70,7 @@ def test_a_path_of_a_file_needs_no_photographs_of_the_run(few_steps, tiny_scene,
         clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
 
 
-def test_the_pictures_of_a_film_stand_alone(few_steps, tiny_scene, tmp_path):
+def test_frames_can_be_written_as_images(few_steps, tiny_scene, tmp_path):
     out, options = tmp_path / "out", {"video": None, "out": tmp_path / "out", "size": (16, 16)}
     clsplat.render_path(few_steps, **options, frames=5, depth=True)
     clsplat.render_views(few_steps, out=out)
@@ -88,7 +88,7 @@ def test_the_pictures_of_a_film_stand_alone(few_steps, tiny_scene, tmp_path):
         clsplat.render_path(few_steps, **options, frames=3)
 
 
-def test_a_film_that_fails_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
+def test_failed_video_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
     clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=3, size=(16, 16))
     before = pictures(tmp_path / "out")
     monkeypatch.setattr(Canvas, "layers", lambda *_: (_ for _ in ()).throw(NumericError("no picture")))
@@ -140,7 +140,7 @@ def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
     assert not (tmp_path / "b_alpha.webm").exists()
 
 
-def test_the_photograph_of_the_nearest_camera_stands_beside(few_steps, tiny_scene, tmp_path):
+def test_photo_of_the_nearest_camera_is_shown_next_to_it(few_steps, tiny_scene, tmp_path):
     clsplat.render_path(few_steps, video=tmp_path / "a.webm", path="views", frames=10, side="photograph")
     found, _ = decoded(tmp_path / "a.webm")
     scene = clsplat.read_scene(tiny_scene)
@@ -150,7 +150,7 @@ def test_the_photograph_of_the_nearest_camera_stands_beside(few_steps, tiny_scen
         assert clsplat.metrics.psnr(frame[:, 40:], view.photograph(1.0)) > 24
 
 
-def test_another_model_stands_beside(few_steps, tmp_path):
+def test_another_model_is_shown_next_to_it(few_steps, tmp_path):
     clsplat.render_path(few_steps, video=tmp_path / "a.webm", frames=2, side=few_steps / "point_cloud.ply")
     for frame in decoded(tmp_path / "a.webm")[0]:
         assert np.abs(frame[:, :40].astype(int) - frame[:, 40:]).mean() < 3
@@ -194,7 +194,7 @@ def test_a_picture_stands_in_the_middle_of_its_box():
         ("--video", "x.avi"): "ends in .webm or .mp4",
     }.items(),
 )
-def test_a_command_that_makes_no_film_ends_in_a_line(options, message, few_steps, tmp_path):
+def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path):
     given = [tmp_path / word if word.startswith("x.") else word for word in options]
     shown = command("render", few_steps, "--out", tmp_path / "out", *given, expect=2).stderr
     assert message in shown
@@ -216,7 +216,7 @@ def test_a_command_that_makes_no_film_ends_in_a_line(options, message, few_steps
         ({"side": "no.ply"}, "no.ply"),
     ],
 )
-def test_what_makes_no_film_is_refused_before_any_work(options, message, few_steps, tmp_path, monkeypatch):
+def test_invalid_video_is_refused_before_any_work(options, message, few_steps, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ConfigError, DataError), match=message):
         clsplat.render_path(few_steps, **options)

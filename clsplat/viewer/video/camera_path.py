@@ -1,8 +1,8 @@
 """Camera paths in files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
-camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect,
-             render_time (0 to 1, of a scene that moves)
+camera_path  one entry per frame: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical),
+             aspect, render_time (0 to 1, in a scene that moves)
 """
 
 import logging
@@ -26,30 +26,30 @@ from clsplat.scene.view import View
 from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, check_fps, check_size, even_size, placed
 
 LOG = logging.getLogger("clsplat")
-WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
+WORLD = "dataparser_transforms.json"  # next to a path file: how nerfstudio transformed the scene
 MAX_BYTES = 1 << 27
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A path of a file."""
+    """A camera path from a file."""
 
     views: list[View]
     fps: float
     size: Size  # px
 
     def resized(self, size: Size) -> list[View]:
-        """Return the views at another size, with the vertical field of view and all else of the lens."""
+        """Return the views at another size, with the same vertical field of view."""
         scale = size[1] / self.size[1]
         return [replace(view, camera=placed(view.camera, size, scale)) for view in self.views]
 
 
 def read(path: Path, scene: Path | None = None) -> CameraPath:
-    """Read a camera_path.json, with its poses in the world of the scene in a folder.
+    """Read a camera path, with its poses in the coordinates of the scene in a folder.
 
-    nerfstudio moves and scales a scene, and says how in a file WORLD, which is looked for beside the path; without it
-    the poses are taken as they are, with a warning.
-    Raises DataError for another file, for damaged numbers and for a camera that is not perspective.
+    nerfstudio transforms a scene, and writes the transform to a file WORLD, which is expected next to the path;
+    without it the poses are used as they are, with a warning.
+    Raises DataError for other files, invalid numbers and cameras that are not perspective.
     """
     table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
     if isinstance(table, list):
@@ -64,12 +64,12 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
     move = _world(path, scene)
     views = []
-    for i, own in enumerate(frames):
-        frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", own)
+    for i, entry in enumerate(frames):
+        frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.where}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
-        matrix = {"transform_matrix": _rows(own.get("camera_to_world"))}
+        matrix = {"transform_matrix": _rows(entry.get("camera_to_world"))}
         pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
@@ -79,7 +79,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
 
 
 def _of_cameras(path: Path) -> CameraPath:
-    """The cameras of a cameras.json as frames, each fitted into the size of the first."""
+    """Read the cameras of a cameras.json as frames, each fitted into the size of the first."""
     views = camera_files.read_inria(path)
     size = even_size(views[0].camera)
     frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
@@ -87,9 +87,9 @@ def _of_cameras(path: Path) -> CameraPath:
 
 
 def resample(views: Sequence[View], frames: int) -> list[View]:
-    """Return views at even places along a path, between two poses on the straight and the shortest turn.
+    """Return evenly spaced views along a path, with positions, rotations (slerp) and lenses interpolated.
 
-    Times, where all views have one, are between those of the two.
+    Times are interpolated too if all views have one.
     """
     if frames == len(views):
         return list(views)
@@ -121,13 +121,13 @@ def resample(views: Sequence[View], frames: int) -> list[View]:
 
 
 def _camera(size: Size, fov: float) -> Camera:
-    """A camera with a vertical field of view in rad."""
+    """Return a camera with a vertical field of view in rad."""
     focal = size[1] / 2 / math.tan(fov / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
 def _size_and_rate(whole: JsonFrame) -> tuple[Size, float]:
-    """The size of the pictures, in even numbers, and how many a second: the usual ones where a file says none."""
+    """Return the frame size, in even numbers, and the frames per second; with defaults if the file has none."""
     sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
     try:
@@ -137,18 +137,18 @@ def _size_and_rate(whole: JsonFrame) -> tuple[Size, float]:
 
 
 def _rows(numbers: Any) -> Any:
-    """16 numbers as four rows; what is nothing of the kind stays."""
+    """Return 16 numbers as four rows; anything else is returned unchanged, for a later check."""
     if not isinstance(numbers, list) or len(numbers) != 16:
         return numbers
     return [numbers[i : i + 4] for i in range(0, 16, 4)]
 
 
 def _world(path: Path, scene: Path | None) -> Any:
-    """A function that takes poses, [3, 4] world to camera, to the world of the scene."""
+    """Return a function that transforms poses, [3, 4] world to camera, into the coordinates of the scene."""
     file = path.parent / WORLD
     if not file.is_file():
         LOG.warning(
-            "%s: its poses are taken as those of the scene; where nerfstudio has moved it, put %s beside the path",
+            "%s: its poses are used in the coordinates of the scene; if nerfstudio moved it, put %s next to the path",
             *(path, WORLD),
         )
         return lambda pose: pose
@@ -156,9 +156,9 @@ def _world(path: Path, scene: Path | None) -> Any:
     rotation, shift = matrix[:, :3], matrix[:, 3]
     before = _applied(scene)
 
-    @np.errstate(all="ignore")  # a pose that is not finite is refused
+    @np.errstate(all="ignore")  # poses that are not finite are rejected later
     def move(pose: Floats) -> Floats:
-        """x' = scale · (rotation x + shift) is nerfstudio's world."""
+        """Invert x' = scale · (rotation x + shift), nerfstudio's transform."""
         center = -pose[:, :3].T @ pose[:, 3]
         turned = pose[:, :3] @ rotation @ before[:, :3].T
         place = before[:, :3] @ (rotation.T @ (center / scale - shift)) + before[:, 3]
@@ -168,7 +168,7 @@ def _world(path: Path, scene: Path | None) -> Any:
 
 
 def _affine(file: Path) -> tuple[Floats, float]:
-    """The rotation with its shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
+    """Read the rotation and shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
@@ -178,7 +178,7 @@ def _affine(file: Path) -> tuple[Floats, float]:
 
 
 def _rigid(frame: JsonFrame, key: str) -> Floats:
-    """A rotation and a shift, [3, 4].  Raises DataError."""
+    """Read a rotation and a shift, [3, 4].  Raises DataError."""
     try:
         matrix = np.array(frame.value(key), np.float64)[:3]
     except (ValueError, TypeError, OverflowError, IndexError):
@@ -189,7 +189,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
 
 
 def _applied(scene: Path | None) -> Floats:
-    """What nerfstudio did to the poses of a scene's transforms.json before: a rotation and a shift, [3, 4]."""
+    """Read the transform, [3, 4], that nerfstudio had applied to the poses of a scene's transforms.json."""
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():
         return np.eye(3, 4)

@@ -1,4 +1,4 @@
-"""Files of video: WebM (VP8) by OpenCV, MP4 (H.264) by PyAV.  The same pictures give the same bytes."""
+"""Write videos: WebM (VP8) with OpenCV, MP4 (H.264) with PyAV.  The same images give the same bytes."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -18,17 +18,17 @@ from clsplat.core.files import atomic_path, check_result_path
 from clsplat.metrics.images import to_8_bits
 from clsplat.viewer.video.paths import Size, check_fps, check_size
 
-# The numbers that FFmpeg draws by chance for the tracks of a WebM file.
+# Random track IDs that FFmpeg writes into WebM files.
 
 SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS = 0x18538067, 0x1654AE6B, 0xAE, 0x1254C367, 0x7373, 0x63C0
 PARENTS = {SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS}
-CLUSTER = 0x1F43B675  # the first pictures: the tracks stand before them
-UIDS = {0x73C5, 0x63C5}  # of a track, and of a track that a tag belongs to
-HEAD = 1 << 16  # bytes that hold all of them
+CLUSTER = 0x1F43B675  # the first frames; the tracks come before them
+UIDS = {0x73C5, 0x63C5}  # TrackUID, and TagTrackUID
+HEAD = 1 << 16  # bytes; holds all of them
 
 
 def fix_track_ids(path: Path) -> None:
-    """Give every track of a WebM file the number 1, in place, so that the same pictures give the same file."""
+    """Set the UID of every track of a WebM file to 1, in place, so that the same images give the same file."""
     with path.open("rb+") as file:
         head = file.read(HEAD)
         for start, size in _uids(head, 0, len(head)):
@@ -37,7 +37,7 @@ def fix_track_ids(path: Path) -> None:
 
 
 def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
-    """Place and size of each number."""
+    """Yield the offset and size of each UID in EBML data."""
     while start + 2 <= end:
         kind, start = _number(data, start, marked=True)
         size, start = _number(data, start, marked=False)
@@ -51,29 +51,29 @@ def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 def _number(data: bytes, start: int, marked: bool) -> tuple[int, int]:
-    """A number whose leading zero bits tell how many bytes it has, with that mark or without it, and where it ends."""
+    """Read an EBML variable-length number, with or without its length marker; return it and the offset of its end."""
     length = 9 - data[start].bit_length() if start < len(data) else 1
     value = int.from_bytes(data[start : start + length], "big")
     return (value if marked else value & ((1 << (7 * length)) - 1)), start + length
 
 
 Image = NDArray[np.uint8]
-Write = Callable[[Image], None]  # one picture, RGB, [height, width, 3]
-CODEC = "VP80"  # as OpenCV sets them, VP9 has the same size and PSNR, and takes 4.5 times as long
-QUALITY = "18"  # of H.264, a constant rate factor: hardly a loss to see
-WITHOUT_TREE = "0"  # with x264's macroblock tree the bits differ from run to run where a processor has AVX-512
-BT709 = 1  # of colors, as FFmpeg numbers it
-WITHOUT = "or write pictures alone, into --out DIR, which any encoder reads"
+Write = Callable[[Image], None]  # writes a frame, RGB, [height, width, 3]
+CODEC = "VP80"  # with OpenCV's settings VP9 has the same size and PSNR, and takes 4.5 times as long
+QUALITY = "18"  # constant rate factor of H.264: visually almost lossless
+WITHOUT_TREE = "0"  # x264's macroblock tree gives other bits in each run on processors with AVX-512
+BT709 = 1  # FFmpeg's number of the color space
+WITHOUT = "or write images with --out DIR, which any encoder reads"
 
 
 def check_file(path: Path) -> None:
-    """Raise ConfigError where no video of this name can be written: its suffix, its encoder, or a file of a run."""
+    """Raise ConfigError if a video cannot be written: unknown suffix, no encoder, or a file of a run."""
     check_encoder(path)
     check_result_path(path, path.suffix.lower())
 
 
 def check_encoder(path: Path) -> None:
-    """Raise ConfigError where there is no encoder for the suffix of a video."""
+    """Raise ConfigError if there is no encoder for the suffix of a video."""
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ConfigError(f"{path}: expected the name of a video that ends in {' or '.join(WRITERS)}")
@@ -83,9 +83,9 @@ def check_encoder(path: Path) -> None:
 
 @contextmanager
 def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
-    """Yield a function that adds a picture; at the end of the block the file is there, whole and read back.
+    """Yield a function that writes a frame; at the end of the block the file is complete and was read back.
 
-    size: of a picture, even numbers.  Raises OutputError; an earlier file then stays.
+    size: of a frame, even numbers.  Raises OutputError; an earlier file then stays.
     """
     suffix, count = path.suffix.lower(), 0
     with atomic_path(path, suffix) as temporary:
@@ -99,36 +99,36 @@ def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
             yield counted
         if suffix == ".webm":
             fix_track_ids(temporary)
-        if (found := count_frames(temporary)) != count:
-            raise OutputError(f"{path}: {found} of {count} frames can be read back; check the folder and its space")
+        if (readable := count_frames(temporary)) != count:
+            raise OutputError(f"{path}: {readable} of {count} frames can be read back; check the folder and its space")
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
 
 
 def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
-    """Write pictures of one size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
+    """Write images of one size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
 
-    Raises ConfigError for a name, a rate or a size that no video can have, ValueError for pictures of several sizes.
+    Raises ConfigError for an invalid name, rate or size, and ValueError for no images and for images of several sizes.
     """
     check_file(path)
     check_fps(fps)
     pictures = map(to_8_bits, images)
     first = next(pictures, None)
     if first is None:
-        raise ValueError("a video needs at least one picture")
+        raise ValueError("a video needs at least one image")
     height, width = first.shape[:2]
     count = 0
     with open_video(path, check_size((width, height)), fps) as write:
         for picture in chain([first], pictures):
             if picture.shape != (height, width, 3):
-                raise ValueError(f"picture {count} has shape {picture.shape}; expected {(height, width, 3)}")
+                raise ValueError(f"image {count} has shape {picture.shape}; expected {(height, width, 3)}")
             write(picture)
             count += 1
     return count
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames of a video can be decoded."""
+    """Return the number of frames of a video that can be decoded."""
     reader, count = cv2.VideoCapture(str(path)), 0
     try:
         while reader.grab():
@@ -145,7 +145,7 @@ def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
     try:
         if not writer.isOpened():
             raise OutputError(
-                f"{path.parent}: OpenCV cannot write WebM (VP8) there; check the folder, and that OpenCV is that of "
+                f"{path.parent}: OpenCV cannot write WebM (VP8) there; check the folder, and that OpenCV is from "
                 f"pip, with FFmpeg; or write .mp4 with the extra clsplat[video], {WITHOUT}"
             )
 
@@ -166,7 +166,7 @@ def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
             stream.width, stream.height = size
             stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY, "mbtree": WITHOUT_TREE}
             context = stream.codec_context
-            context.thread_count = 1  # the bits depend on their number
+            context.thread_count = 1  # the bits depend on the number of threads
             context.colorspace = context.color_primaries = context.color_trc = BT709
 
             def write(image: Image) -> None:
@@ -196,9 +196,9 @@ def _av() -> ModuleType:
 
 @contextmanager
 def _without_remarks() -> Iterator[None]:
-    """Keep a remark of OpenCV's FFmpeg about the codec's name from the terminal: no setting turns it off."""
+    """Discard a message of OpenCV's FFmpeg about the codec's name, which no setting turns off."""
     try:
-        kept = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # closed
         yield
         return
@@ -207,5 +207,5 @@ def _without_remarks() -> Iterator[None]:
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)

@@ -1,4 +1,4 @@
-"""Pictures of the layers of a view, 8 bits a channel, and the canvas that they are drawn on."""
+"""Render the layers of views, and convert them to 8-bit images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +18,18 @@ LAYERS = ("color", "depth", "alpha")
 PROBES = 8  # views whose depths set the range of colors
 PROBE_SIDE = 240  # px
 OPAQUE = 0.5  # alpha of pixels that have a depth
-SHARES = 0.02, 0.98  # of these pixels lie before near, and before far
-SMALLEST_RANGE = 1e-3  # of far
+SHARES = 0.02, 0.98  # quantiles of the depths that give near and far
+MIN_RANGE = 1e-3  # relative to far
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """What paints a model, and the pictures of its views."""
+    """Renders the views of a model."""
 
     painter: Painter
 
     def layers(self, view: View, depth: bool = False) -> Layers:
-        """Render a view.  Raises NumericError where the picture is not finite."""
+        """Render a view.  Raises NumericError if the render is not finite."""
         found = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
         for values in found.arrays:
             require_finite(values, view)
@@ -40,7 +40,7 @@ class Canvas:
         return to_8_bits(self.layers(view).image)
 
     def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
-        """Return near and far, between which lie the depths of most pixels of some of the views, scene units."""
+        """Return near and far: the range of most depths in a sample of the views, scene units."""
         depths = []
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
@@ -52,7 +52,7 @@ class Canvas:
         if not len(all_depths):
             return 1.0, 2.0
         near, far = np.quantile(all_depths, SHARES)
-        return float(min(near, far * (1 - SMALLEST_RANGE))), float(far)
+        return float(min(near, far * (1 - MIN_RANGE))), float(far)
 
 
 def layer_image(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
@@ -75,7 +75,7 @@ def layer_values(found: Layers, layer: str) -> NDArray[np.float32]:
 def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
     """Return depths, [height, width], as colors from red (near) to blue (far), black where nothing is.
 
-    The colors are even in inverse depth: what is near is told apart finely, as by the eye.
+    Colors are linear in inverse depth, as near differences matter more to the eye.
     """
     near, far = depths
     with np.errstate(divide="ignore"):
@@ -86,12 +86,12 @@ def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: 
 
 
 def side_by_side(image: Image, other: Image) -> Image:
-    """Return two pictures of one height side by side."""
+    """Join two images of the same height."""
     return np.hstack([image, other])
 
 
 def letterbox(image: Image, size: tuple[int, int]) -> Image:
-    """Return a picture in the middle of a black one of another size (width, height), as large as it fits."""
+    """Scale an image to fit into a size (width, height), centered on black."""
     width, height = size
     factor = min(width / image.shape[1], height / image.shape[0])
     inner = max(1, min(width, round(image.shape[1] * factor))), max(1, min(height, round(image.shape[0] * factor)))

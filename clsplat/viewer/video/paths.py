@@ -1,4 +1,4 @@
-"""Camera paths about and through a scene, by name.
+"""Camera paths around and through a scene, by name.
 
 Each is a function of a rig, a number of frames and a size, and returns a view for each frame.
 """
@@ -20,34 +20,31 @@ from clsplat.scene.scene import outlier_cameras
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import nearest_to_axes, up_direction
 
-# What a camera path is made from: where the photographs were taken, what they look at, and which way is up.
+# The input of a camera path: the cameras of the photos, what they look at, and the up direction.
 
 Floats = NDArray[np.floating]
-MOST_POINTS = 20_000  # that are looked at for near and far
-SHARES = 0.05, 0.95  # of what a camera sees lies before near, and before far
-PARALLEL = 0.9  # length of the mean direction of view, from which on the axes hardly say where they meet
-BEYOND = 1.5  # times near and far: farther from what is seen they do not meet
-TOWARDS = 0.5  # share of the cameras that must have the focus before them
+MAX_POINTS = 20_000  # sampled to find near and far
+SHARES = 0.05, 0.95  # quantiles of the visible depths that give near and far
+PARALLEL = 0.9  # length of the mean view direction above which the axes are too parallel to give a focus
+DEPTH_MARGIN = 1.5  # of near and far; a focus of parallel axes outside these bounds is replaced
+MIN_FACING = 0.5  # share of the cameras that must have the focus in front of them
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene without those that strayed, and points of what they look at."""
+    """The cameras of a scene without outliers, and points that they look at."""
 
     views: Sequence[View]
     points: Floats  # [M, 3], the means of a model or the points of a scene
 
     @classmethod
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
-        """Leave out cameras far away from all others, and points that are not finite.
-
-        Raises DataError without a view.
-        """
+        """Omit outlier cameras and points that are not finite.  Raises DataError if there is no view."""
         if not views:
             raise DataError("a camera path needs the cameras of a scene; there is none")
         stray = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        step = -(-len(finite) // MOST_POINTS) or 1
+        step = -(-len(finite) // MAX_POINTS) or 1
         return cls([view for view, far in zip(views, stray, strict=True) if not far], finite[::step])
 
     @cached_property
@@ -57,53 +54,53 @@ class Rig:
 
     @cached_property
     def forwards(self) -> Floats:
-        """Directions of view, [V, 3]."""
+        """View directions, [V, 3], unit."""
         return np.stack([view.world_to_camera[2, :3] for view in self.views])
 
     @cached_property
     def ups(self) -> Floats:
-        """Upward axes of the images, [V, 3]."""
+        """Up vectors of the images, [V, 3]."""
         return np.stack([-view.world_to_camera[1, :3] for view in self.views])
 
     @cached_property
     def up(self) -> Floats:
-        """What is up, [3], unit."""
+        """The up direction of the scene, [3], unit."""
         return up_direction(self.views)
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3]; of axes that are almost parallel, one amid what they show.
+        """The point nearest to the optical axes, [3]; if they are almost parallel, the middle of what they see.
 
-        Raises DataError where most cameras look away from it.
+        Raises DataError if most cameras look away from it.
         """
         middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
         focus = nearest_to_axes(self.positions, self.forwards, middle)
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
         ahead = float(np.median(self._before(focus)))
-        if np.linalg.norm(forward) > PARALLEL and not near / BEYOND < ahead < far * BEYOND:
+        if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < ahead < far * DEPTH_MARGIN:
             focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
-        if (self._before(focus) > 0).mean() < TOWARDS:
+        if (self._before(focus) > 0).mean() < MIN_FACING:
             raise DataError(
-                "the cameras look away from each other, so that there is nothing to turn about; use the path through"
+                "the cameras look away from each other, so there is no center to orbit; use the path through"
             )
         return focus
 
     def _before(self, point: Floats) -> Floats:
-        """The depth of a point in each view, [V]."""
+        """Return the depth of a point in each view, [V]."""
         return np.asarray(((point - self.positions) * self.forwards).sum(axis=1))
 
     @cached_property
     def depths(self) -> tuple[float, float]:
-        """Near and far: between them lies most of what the cameras see, scene units."""
-        found = [self._seen(view) for view in self.views[:: -(-len(self.views) // 64)]]
-        depths = np.concatenate(found)
+        """Near and far: the range of most depths that the cameras see, scene units."""
+        sampled = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
+        depths = np.concatenate(sampled)
         if not len(depths):
             return 1.0, 10.0
         near, far = np.quantile(depths, SHARES)
         return float(near), float(far)
 
-    def _seen(self, view: View) -> Floats:
-        """Depths of the points in a view's image."""
+    def _visible_depths(self, view: View) -> Floats:
+        """Return the depths of the points in a view's image."""
         x, y, z = view.world_to_camera[:, :3] @ self.points.T + view.world_to_camera[:, 3:]
         c = view.camera
         with np.errstate(all="ignore"):
@@ -113,99 +110,99 @@ class Rig:
 
     @cached_property
     def camera(self) -> Camera:
-        """The camera whose field of view is the middle one."""
+        """The camera with the median field of view."""
         cameras = sorted((view.camera for view in self.views), key=lambda c: c.width * c.height / (c.fx * c.fy))
         return cameras[len(cameras) // 2]
 
 
 def unit(vectors: Floats) -> Floats:
-    """Return vectors, [..., 3], with length 1."""
+    """Normalize vectors, [..., 3]."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-# A walk through the views of a scene: their order, and a smooth curve along them.
+# A tour of the views of a scene: their order, and a smooth curve along them.
 
 Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
-LOOSENESS = 0.25  # of the median step between neighbors: how far the curve may pass from a view
-UP_WEIGHT = 0.1  # of the upward axes beside positions, times the distance
-MOST_VIEWS = 1000  # of those, evenly by name, that a walk visits
-ROUNDS = 20  # of shortening
+SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between neighbors
+UP_WEIGHT = 0.1  # of up vectors relative to positions, times the distance
+MAX_VIEWS = 1000  # that a tour visits, evenly sampled by name
+ROUNDS = 20  # of 2-opt
 
 
 def order(rig: Rig) -> Indices:
-    """Return the indices of the views by name, or from neighbor to neighbor where that way is shorter, [V]."""
+    """Return the indices of the views by name, or from neighbor to neighbor if that tour is shorter, [V]."""
     spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
     places = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
-    by_name = by_name[:: -(-len(by_name) // MOST_VIEWS)]
+    by_name = by_name[:: -(-len(by_name) // MAX_VIEWS)]
     between = scipy.spatial.distance.cdist(places[by_name], places[by_name])
-    ways = np.arange(len(by_name)), _shortened(_neighbors(between), between)
-    return np.asarray(by_name[min(ways, key=lambda way: _length(between, way))])
+    tours = np.arange(len(by_name)), _shorten(_nearest_neighbors(between), between)
+    return np.asarray(by_name[min(tours, key=lambda tour: _length(tour, between))])
 
 
-def smooth(places: Floats, frames: int, distance: float) -> Floats:
-    """Return a B-spline of degree 5 near the places at even steps, [frames, C].
+def smooth(poses: Floats, frames: int, distance: float) -> Floats:
+    """Return evenly spaced samples of a B-spline of degree 5 near the poses, [frames, C].
 
-    places: [V, C], positions, targets at a distance and upward axes.
+    poses: [V, C], positions, targets at a distance, and up vectors.
     """
     weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
-    scaled = places * weights
+    scaled = poses * weights
     steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
-    kept = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # no place twice
+    kept = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # no pose twice
     scaled = scaled[kept]
     if len(scaled) == 1:
-        return np.repeat(places[:1], frames, axis=0)
-    loose = len(scaled) * (LOOSENESS * float(np.median(steps[kept[1:]]))) ** 2
+        return np.repeat(poses[:1], frames, axis=0)
+    loose = len(scaled) * (SMOOTHING * float(np.median(steps[kept[1:]]))) ** 2
     curve, _ = scipy.interpolate.splprep(
         scaled.T, k=min(DEGREE, len(scaled) - 1), s=loose if len(scaled) > DEGREE else 0
     )
     return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
-def _neighbors(between: Floats) -> Indices:
-    """From the first view always on to the nearest that is left."""
-    way, left = [0], set(range(1, len(between)))
+def _nearest_neighbors(between: Floats) -> Indices:
+    """Return a tour that goes from the first view always to the nearest view not yet visited."""
+    tour, left = [0], set(range(1, len(between)))
     while left:
         rest = np.array(sorted(left))
-        way.append(int(rest[between[way[-1], rest].argmin()]))
-        left.remove(way[-1])
-    return np.array(way)
+        tour.append(int(rest[between[tour[-1], rest].argmin()]))
+        left.remove(tour[-1])
+    return np.array(tour)
 
 
-def _shortened(way: Indices, between: Floats) -> Indices:
-    """Turn parts of the way round as long as that makes it shorter (2-opt)."""
+def _shorten(tour: Indices, between: Floats) -> Indices:
+    """Reverse parts of a tour while that makes it shorter (2-opt), in place."""
     for _ in range(ROUNDS):
         changed = False
-        for i in range(len(way) - 2):
-            steps = np.append(between[way[i + 2 : -1], way[i + 3 :]], 0.0)  # nothing follows the last view
-            ends = np.append(between[way[i + 1], way[i + 3 :]], 0.0)
-            gain = between[way[i], way[i + 1]] + steps - between[way[i], way[i + 2 :]] - ends
+        for i in range(len(tour) - 2):
+            steps = np.append(between[tour[i + 2 : -1], tour[i + 3 :]], 0.0)  # nothing follows the last view
+            ends = np.append(between[tour[i + 1], tour[i + 3 :]], 0.0)
+            gain = between[tour[i], tour[i + 1]] + steps - between[tour[i], tour[i + 2 :]] - ends
             j = int(gain.argmax())
             if gain[j] > 1e-9:
-                way[i + 1 : i + 3 + j] = way[i + 1 : i + 3 + j][::-1].copy()
+                tour[i + 1 : i + 3 + j] = tour[i + 1 : i + 3 + j][::-1].copy()
                 changed = True
         if not changed:
             break
-    return way
+    return tour
 
 
-def _length(between: Floats, way: Indices) -> float:
-    return float(between[way[:-1], way[1:]].sum())
+def _length(tour: Indices, between: Floats) -> float:
+    return float(between[tour[:-1], tour[1:]].sum())
 
 
-# Cameras of the size of a film.
+# Cameras with the frame size of a video.
 
-SIDES = 16, 8192  # px of a picture's side, least and most
+SIDES = 16, 8192  # px, smallest and largest side of a frame
 MAX_FRAMES = 100_000
 RATES = 1, 240  # frames a second
 Size = tuple[int, int]  # width, height
 
 
 def check_size(size: str | Size) -> Size:
-    """Return the size of a film, given as text such as 640x480 or as numbers.
+    """Return a frame size, given as text such as 640x480 or as numbers.
 
-    Raises ConfigError unless both are even, as codecs need them, and in bounds.
+    Raises ConfigError unless both sides are even, as codecs require, and within bounds.
     """
     if isinstance(size, str):
         found = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
@@ -220,7 +217,7 @@ def check_size(size: str | Size) -> Size:
 
 
 def size_of(text: str) -> str:
-    """Return a size as it is.  Raises ValueError, as a validator does, where no film has it."""
+    """Return a size unchanged.  Raises ValueError, as validators do, if it is no valid frame size."""
     try:
         check_size(text)
     except ConfigError as error:
@@ -229,35 +226,35 @@ def size_of(text: str) -> str:
 
 
 def check_frames(frames: int) -> int:
-    """Return a number of frames.  Raises ConfigError where it is out of bounds."""
+    """Return a number of frames.  Raises ConfigError if it is out of bounds."""
     if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
         raise ConfigError(f"frames {quote(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
     return frames
 
 
 def check_fps(fps: float) -> float:
-    """Return a number of frames a second.  Raises ConfigError where it is out of bounds."""
+    """Return frames per second.  Raises ConfigError if they are out of bounds."""
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not RATES[0] <= fps <= RATES[1]:
         raise ConfigError(f"fps {quote(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
     return fps
 
 
 def even_size(camera: Camera) -> Size:
-    """Return the size of a camera's image, a pixel less where it is odd, inside the bounds of a film."""
+    """Return the size of a camera's image, rounded down to even sides within the bounds of a video."""
     shrink = min(1.0, SIDES[1] / max(camera.width, camera.height))
     width, height = (max(SIDES[0], int(side * shrink) // 2 * 2) for side in (camera.width, camera.height))
     return width, height
 
 
 def like(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another size that sees as much: its image shows as large an area, with the middle amid it."""
+    """Return a camera of another size whose image covers as large an area, centered."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
 
 
 def around(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another size whose image holds all of a camera's, in its middle."""
+    """Return a camera of another size whose image contains all of the original image, centered."""
     return placed(camera, size, fit(camera, size))
 
 
@@ -276,20 +273,20 @@ def fit(camera: Camera, size: Size) -> float:
 
 
 LOG = logging.getLogger("clsplat")
-WIDEST_GAP = math.radians(100)  # between neighbors on a ring about the focus: a wider one was never photographed
-SHARE = 90  # percentile of the cameras' distances that an ellipse and a spiral reach (Barron et al. 2022)
+WIDEST_GAP = math.radians(100)  # between neighbors on a ring around the focus; wider gaps count as not photographed
+SHARE = 90  # percentile of the cameras' offsets that gives the half axes (Barron et al. 2022)
 FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inverse depth (Mildenhall et al. 2019)
 TURNS = 2  # of a spiral
-SWAY = 0.3  # of its distance from what it looks at, at most: cameras that surround a scene give no front
-KEPT = 0.85  # of an arc that was photographed: at its ends half of what is seen was not
-MOMENT = 1e-3  # what the whole time of a scene counts beside a right angle: between the moments of one camera
-AGREEMENT = 0.5  # length of the mean direction of view: below it the cameras do not face one way
+SWAY = 0.3  # largest radius of a spiral relative to the distance of its target, as cameras may surround the scene
+ARC_SHARE = 0.85  # of a photographed arc; at its ends half of the image was not photographed
+TIME_WEIGHT = 1e-3  # of the whole duration relative to a right angle, to choose among the timestamps of one camera
+MIN_AGREEMENT = 0.5  # length of the mean view direction below which the cameras have no common front
 
 
 def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Circle the focus on an ellipse as wide as the cameras stand; where they stand on one side, swing before it.
+    """Circle the focus on an ellipse that fits the cameras; if they are all on one side, swing back and forth there.
 
-    The half axes are the 90th percentiles of the distances along the principal axes across the upward axis, as in
+    The half axes are the 90th percentiles of the offsets along the principal axes of the horizontal plane, as in
     Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
     """
     across, offsets, height = _ring(rig)
@@ -302,13 +299,13 @@ def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Turn once about the focus, on a circle of the cameras' median distance and height: a turntable for objects."""
+    """Circle the focus once at the cameras' median distance and height, like a turntable."""
     across, offsets, height = _ring(rig)
     radius = float(np.median(np.linalg.norm(offsets, axis=1)))
     taken = np.arctan2(offsets[:, 1], offsets[:, 0])
     if (unseen := _gap(taken)[0]) > WIDEST_GAP:
         LOG.warning(
-            "the orbit shows %.0f degrees from where no photograph was taken; the path ellipse keeps to the others",
+            "%.0f degrees of the orbit were not photographed; the path ellipse stays where photos were taken",
             math.degrees(unseen),
         )
     angles = taken[0] + 2 * np.pi * np.arange(frames) / frames
@@ -317,13 +314,13 @@ def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Sway about the mean of the cameras, two turns, and look at one point: for scenes that are faced from one side.
+    """Circle the mean of the cameras in two turns, looking at one point, for forward-facing scenes.
 
     Formulas of Local Light Field Fusion (Mildenhall et al. 2019).
     """
     forward, middle = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
-    if np.linalg.norm(forward) < AGREEMENT:
-        raise DataError("the cameras look in many directions, so that a spiral has no front; use ellipse or through")
+    if np.linalg.norm(forward) < MIN_AGREEMENT:
+        raise DataError("the cameras look in many directions, so a spiral has no front; use ellipse or through")
     forward = unit(forward)
     right = unit(np.cross(forward, rig.up))
     axes = np.stack([right, np.cross(forward, right), forward])
@@ -340,7 +337,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def through(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Fly along the views, by name or from neighbor to neighbor, whichever way is shorter, on a smooth curve."""
+    """Fly along the views on a smooth curve, by name or from neighbor to neighbor, whichever is shorter."""
     chosen = order(rig)
     distance = float(np.median(rig.depths))
     places = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[chosen]
@@ -349,19 +346,19 @@ def through(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def views(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Show the cameras of the photographs one after the other, with their own lenses; of more than `frames` some."""
+    """Return at most `frames` of the photos' cameras one after another, evenly chosen, with their own intrinsics."""
     chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
     return [replace(rig.views[i], camera=around(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen]
 
 
 def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Stay at the camera in the middle of all: a film of what moves."""
+    """Stay at the most central camera, for scenes that move."""
     middle = np.median(rig.positions, axis=0)
     return stay(rig.views[int(np.linalg.norm(rig.positions - middle, axis=1).argmin())], frames, size)
 
 
 def stay(view: View, frames: int, size: Size) -> list[View]:
-    """Return a view as often as there are frames, without its photograph's moment."""
+    """Repeat a view for all frames, without its timestamp."""
     still = replace(view, camera=around(view.camera, size), lens=None, mask_path=None, time=None)
     return [replace(still, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
 
@@ -377,7 +374,7 @@ PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
 
 
 def named(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
-    """Return views at positions that look at targets, [F, 3] each.  Raises DataError where one looks along its up."""
+    """Return views at positions that look at targets, [F, 3] each.  Raises DataError if one looks along up."""
     camera = like(rig.camera, size)
     try:
         return [
@@ -385,13 +382,13 @@ def named(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size)
             for i, (position, target, up) in enumerate(zip(positions, targets, ups, strict=True), 1)
         ]
     except ValueError as error:
-        raise DataError(f"the cameras of the scene give no such path: {error}; use another --path") from error
+        raise DataError(f"this path is impossible with these cameras: {error}; use another --path") from error
 
 
 def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
-    """Two axes across the upward one, [2, 3], and the cameras' offsets from the focus: along them, [V, 2], and up, [V].
+    """Return two horizontal axes, [2, 3], and the cameras' offsets from the focus along them, [V, 2], and up, [V].
 
-    The axes are the principal ones, so that an ellipse along them fits.
+    The axes are principal axes, so an ellipse along them fits.
     """
     offsets = rig.positions - rig.focus
     height = offsets @ rig.up
@@ -403,17 +400,17 @@ def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
 
 
 def _sweep(taken: Floats, frames: int) -> Floats:
-    """Angles of the frames: around once, or to and fro where an arc was never photographed.  taken: [V]."""
+    """Return the angles of the frames: once around, or back and forth if an arc was not photographed.  taken: [V]."""
     gap, begin = _gap(taken)
     turn = 2 * np.pi * np.arange(frames) / frames
     if gap < WIDEST_GAP:
         return np.asarray(taken[0] + turn)
     half = np.pi - gap / 2
-    return np.asarray(begin + half + KEPT * half * np.sin(turn))
+    return np.asarray(begin + half + ARC_SHARE * half * np.sin(turn))
 
 
 def _gap(taken: Floats) -> tuple[float, float]:
-    """The widest angle without a camera, and the angle of the camera behind it."""
+    """Return the widest angle without a camera, and the angle of the camera after it."""
     ring = np.sort(taken % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
     widest = int(gaps.argmax())
@@ -426,11 +423,11 @@ def _looking(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[Vi
 
 
 def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
-    """Return the photograph's view whose camera is closest: `reach` of distance counts as much as a right angle.
+    """Return the view whose camera is nearest; a distance of `reach` counts as much as a right angle.
 
-    Of the moments of one camera it is the nearest.
+    Among the views of one camera, the nearest in time is returned.
     """
     apart = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
     turned = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
     late = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
-    return views[int((apart + turned + MOMENT * late).argmin())]
+    return views[int((apart + turned + TIME_WEIGHT * late).argmin())]
