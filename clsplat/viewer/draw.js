@@ -1,48 +1,48 @@
-// WebGL2: textures of a model, one instanced quad for each splat, blended from back to front.
+// Draw models with WebGL2: textures of a model, one instanced quad per splat, blended from back to front.
 
 const QUAD = new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]);
 const MODES = ["splats", "points", "ellipsoids", "opacity"];
 
 function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
+  const handle = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
-    gl.attachShader(made, shader);
+    gl.attachShader(handle, shader);
     if (gl.getShaderParameter(shader, gl.COMPILE_STATUS) || gl.isContextLost()) continue;
     throw Error(gl.getShaderInfoLog(shader));
   }
-  gl.bindAttribLocation(made, 0, "corner");
-  gl.bindAttribLocation(made, 1, "id");
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw Error(gl.getProgramInfoLog(made));
-  const places = {};
-  return {made, at: name => places[name] ??= gl.getUniformLocation(made, name)};
+  gl.bindAttribLocation(handle, 0, "corner");
+  gl.bindAttribLocation(handle, 1, "id");
+  gl.linkProgram(handle);
+  if (!gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) throw Error(gl.getProgramInfoLog(handle));
+  const locations = {};
+  return {handle, at: name => locations[name] ??= gl.getUniformLocation(handle, name)};
 }
 
 function texture(gl, format, width, height, kind, type, data, filter = gl.NEAREST) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
+  const handle = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, handle);
   for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
   for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
   gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, kind, type, data);
-  return made;
+  return handle;
 }
 
-const moving = ({motions}) => motions ? {motions} : {}; // the texture, where there is one
+const motionTexture = ({motions}) => motions ? {motions} : {};
 
 class Painter {
   constructor(canvas) {
-    const wishes = {antialias: false, alpha: false, powerPreference: "high-performance"};
-    const gl = this.gl = canvas.getContext("webgl2", wishes);
-    if (!gl) throw Error("this browser has no WebGL2; switch on its hardware acceleration, or take another browser");
+    const attributes = {antialias: false, alpha: false, powerPreference: "high-performance"};
+    const gl = this.gl = canvas.getContext("webgl2", attributes);
+    if (!gl) throw Error("this browser has no WebGL2; enable hardware acceleration, or use another browser");
     // Hundreds of layers blended in 8 bits lose 10 dB; half floats lose nothing that an 8-bit image shows.
     this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    if (this.most < ROW) throw Error(`this device has textures of ${this.most} px; ${ROW} are needed`);
+    this.maxSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (this.maxSize < ROW) throw Error(`this device has textures of ${this.maxSize} px; ${ROW} are needed`);
     this.programs = {};
-    this.of(STANDS);
+    this.programsFor(STATIC_MODEL);
     this.present = program(gl, COVER, PRESENT);
     this.empty = gl.createVertexArray();
     this.quad = gl.createBuffer();
@@ -52,27 +52,28 @@ class Painter {
     gl.disable(gl.DEPTH_TEST);
   }
 
-  // The programs of models that stand still, or of those that move.
-  of(motion) {
+  // Return the shader programs for static or moving models, compiled on first use.
+  programsFor(motion) {
     return this.programs[motion] ??= {colors: program(this.gl, COVER, colors(motion)),
       splats: program(this.gl, splatVertex(motion), SPLAT_FRAGMENT)};
   }
 
-  // A texture that can be drawn to, with its framebuffer.
+  // Create a texture with a framebuffer to draw into it.
   surface(width, height, filter) {
     const gl = this.gl, format = this.half ? gl.RGBA16F : gl.RGBA8, type = this.half ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
-    const made = {width, height, texture: texture(gl, format, width, height, gl.RGBA, type, null, filter)};
-    made.frame = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made.texture, 0);
-    return made;
+    const surface = {width, height, texture: texture(gl, format, width, height, gl.RGBA, type, null, filter)};
+    surface.frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, surface.frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, surface.texture, 0);
+    return surface;
   }
 
-  // The textures of a model; data: of `unpacked`.
+  // Upload the textures of a model.  data: from `unpacked`.
   layer(header, data) {
     const gl = this.gl, rows = rowsOf(data.count, 1), words = gl.RGBA_INTEGER;
     const wide = splatsInRow(data.texels) * data.texels, high = rowsOf(data.count, data.texels);
-    const layer = {header, count: data.count, texels: data.texels, drawn: 0, ...this.of(data.motion ? MOVES : STANDS)};
+    const programs = this.programsFor(data.motion ? MOVING_MODEL : STATIC_MODEL);
+    const layer = {header, count: data.count, texels: data.texels, drawn: 0, ...programs};
     if (data.motion) {
       const {rows, wide} = data.motion, across = splatsInRow(wide) * wide;
       layer.motions = texture(gl, gl.RGBA32F, across, rowsOf(data.count, wide), gl.RGBA, gl.FLOAT, rows);
@@ -97,7 +98,7 @@ class Painter {
     return layer;
   }
 
-  // order: ids from back to front
+  // Upload the drawing order: ids from back to front.
   reorder(layer, order) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, layer.ids);
@@ -107,15 +108,15 @@ class Painter {
 
   bind(used, textures) {
     const gl = this.gl;
-    gl.useProgram(used.made);
-    Object.entries(textures).forEach(([name, one], unit) => {
+    gl.useProgram(used.handle);
+    Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, one);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(used.at(name), unit);
     });
   }
 
-  // What a program needs to know of the motion of a layer at a moment.
+  // Set the uniforms of a program for the motion of a layer at a timestamp.
   move(used, layer, moment) {
     if (!layer.motions) return;
     const {bends, turns} = layer.header.motion;
@@ -124,12 +125,12 @@ class Painter {
     this.gl.uniform1f(used.at("moment"), moment);
   }
 
-  // Compute the colors of the first splats, unless it was done for this place of the camera and this moment.
+  // Compute the colors of the first splats, unless they are known for this camera position and timestamp.
   shade(layer, eye, first, moment) {
     const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colors;
     if (key === layer.key) return;
     layer.key = key;
-    this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes, ...moving(layer)});
+    this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes, ...motionTexture(layer)});
     this.move(used, layer, moment);
     gl.uniform3fv(used.at("eye"), eye);
     gl.uniform1i(used.at("degree"), layer.header.degree);
@@ -142,7 +143,7 @@ class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Blend a layer into a surface of the size of `frame`: what `framed` of camera.js returns.
+  // Blend a layer into a surface of the size of `frame`, which `framed` of camera.js returns.
   blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5, moment = 0} = {}) {
     const gl = this.gl, used = layer.splats, {header} = layer, {width, height} = frame;
     this.shade(layer, frame.eye, first, moment);
@@ -152,14 +153,14 @@ class Painter {
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     const shapes = {tables: layer.tables, places: layer.places, sizes: layer.sizes, colors: layer.shown.texture};
-    this.bind(used, {...shapes, ...moving(layer)});
+    this.bind(used, {...shapes, ...motionTexture(layer)});
     this.move(used, layer, moment);
     gl.uniformMatrix3fv(used.at("rotation"), true, frame.rotation);
     gl.uniform3fv(used.at("translation"), frame.translation);
     gl.uniform4fv(used.at("intrinsics"), frame.intrinsics);
     gl.uniform4fv(used.at("limits"), frame.limits);
     gl.uniform2f(used.at("size"), width, height);
-    // A filter that compensates is meant for every resolution; one that does not belongs to that of training.
+    // A normalized filter suits every resolution; any other belongs to the resolution of training and is scaled.
     const wider = 1 + (1 - header.compensate) * (Math.max(1, frame.enlarged) ** 2 - 1);
     gl.uniform3f(used.at("filters"), header.near, header.variance * wider, header.compensate);
     gl.uniform1i(used.at("mode"), MODES.indexOf(mode));
@@ -181,7 +182,7 @@ class Painter {
     return this.target;
   }
 
-  // Show the target on an area of the canvas: left, bottom, width, height in px.
+  // Show the target on an area of the canvas.  area: left, bottom, width, height, px.
   show(area, background, frame = null) {
     const gl = this.gl, used = this.present;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
@@ -194,16 +195,17 @@ class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The target over a background as bytes RGBA, rows from the top.
+  // Return the target over a background as RGBA bytes, rows from the top.
   pixels(background) {
     const gl = this.gl, {width, height} = this.target, bytes = new Uint8Array(4 * width * height);
-    const made = texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null), frame = gl.createFramebuffer();
+    const target = texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    const frame = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
     this.show([0, 0, width, height], background, frame);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     gl.deleteFramebuffer(frame);
-    gl.deleteTexture(made);
+    gl.deleteTexture(target);
     const rows = new Uint8ClampedArray(bytes.length), row = 4 * width;
     for (let y = 0; y < height; y++) rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
     return rows;

@@ -149,7 +149,7 @@ async function open() {
   for (const [i, header] of info.models.entries()) {
     const script = find(`model${i}`), buffer = await inflated(script.textContent.trim());
     script.remove(); // its text is no longer needed
-    const data = unpacked(header, buffer, painter.most), points = new Float32Array(data.places.buffer);
+    const data = unpacked(header, buffer, painter.maxSize), points = new Float32Array(data.places.buffer);
     const opacities = Float32Array.from(data.sizes, word => data.tables[256 + (word >>> 24)]);
     const {positions} = data, motion = data.motion &&
       {rows: data.motion.rows, stride: 4 * data.motion.wide, bends: header.motion.bends};

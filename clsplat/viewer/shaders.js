@@ -1,4 +1,4 @@
-// The formulas of cl_kernels/gaussian.h, project.cl, harmonics.h and splat.h for a page.
+// GLSL versions of cl_kernels/gaussian.h, project.cl, harmonics.h and splat.h.
 
 const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -8,14 +8,14 @@ uniform usampler2D places; // position and quaternion of a splat
 float entry(int table, uint code) { return texelFetch(tables, ivec2(int(code), table), 0).x; }
 ivec2 spot(int i) { return ivec2(i & 4095, i >> 12); }`;
 
-// Where a splat is at the moment that is shown: what stands still is where it is.
-const STANDS = `
-vec4 moved(int i, vec3 mean) { return vec4(mean, 1); }  // its mean, and the factor of its opacity
+// Mean, opacity factor and quaternion of a splat at the current timestamp: of static models, unchanged.
+const STATIC_MODEL = `
+vec4 moved(int i, vec3 mean) { return vec4(mean, 1); }  // mean, opacity factor
 vec4 turned(int i, vec4 q) { return q; }`;
 
-// What moves has rows of velocity, time of its middle, log of its duration, coefficients of dt^2 and dt^3, and the
-// change of its quaternion (x, y, z, w), as far as there are some: cl_kernels/motion.cl.
-const MOVES = `
+// Moving models have rows of velocity, center time, log duration, optional coefficients of dt^2 and dt^3, and an
+// optional change of the quaternion (x, y, z, w), as in cl_kernels/motion.cl.
+const MOVING_MODEL = `
 uniform sampler2D motions;
 uniform int wide, bends, turns;  // texels of a row; number of coefficients; column of the turn, or 0
 uniform float moment;
@@ -40,7 +40,7 @@ vec4 turned(int i, vec4 q) {
 const COVER = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
 
-// Colors of all splats for one place of the camera: max(0, 1/2 + sum_k basis_k(d) sh_k), one texel each.
+// Colors of all splats for one camera position: max(0, 1/2 + sum_k basis_k(d) sh_k), one texel each.
 const colors = motion => HEAD + motion + `
 uniform usampler2D codes;
 uniform vec3 eye;
@@ -78,7 +78,7 @@ uniform sampler2D colors;
 uniform mat3 rotation;       // world to camera
 uniform vec3 translation;
 uniform vec4 intrinsics;     // fx, fy, cx, cy of the target, px
-uniform vec4 limits;         // of x/z and y/z in the linearized projection: least x, most x, least y, most y
+uniform vec4 limits;         // of x/z and y/z in the linearized projection: min x, max x, min y, max y
 uniform vec2 size;           // of the target, px
 uniform vec3 filters;        // near plane, screen variance in px^2, compensate
 uniform int mode;            // 0 splats, 1 points, 2 ellipsoids, 3 opacity
@@ -87,7 +87,7 @@ in uint id;
 in vec2 corner;
 out vec2 p;                  // in standard deviations, or in radii of a point
 flat out vec4 shade;
-vec3 ramp(float t) {         // from violet over green to yellow
+vec3 ramp(float t) {         // from violet through green to yellow
   vec3 middle = vec3(.13, .57, .55);
   return t < .5 ? mix(vec3(.27, .05, .40), middle, 2. * t) : mix(middle, vec3(.99, .91, .15), 2. * t - 1.);
 }

@@ -95,7 +95,7 @@ def test_a_browser_draws_each_photograph_at_its_moment(tmp_path):
         assert browser.run("[viewer.moment, viewer.photographs.chosen]") == [0.6, -1], "away from it"
         skips = [browser.key(key) or browser.run("viewer.moment") for key in "..,,,,"]
         assert skips == [1.0, 1.0, 0.6, 0.35, 0.0, 0.0], "from one moment of the photographs to the next"
-        assert "is of another moment" in browser.run("document.getElementById('caption').textContent")
+        assert "was taken at another time" in browser.run("document.getElementById('caption').textContent")
         browser.run("viewer.clock.to(0.25)")
         browser.rest()
         address = browser.run("location.hash")

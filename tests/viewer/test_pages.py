@@ -106,7 +106,9 @@ def test_values_are_escaped_and_charts_are_not():
     values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "cameras": []}
     chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
     seen = safe_charts([chart, ""]), [(HOSTILE, 3)]
-    page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, far="", lists=[], **values))
+    page = Page(
+        render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, points_per_view=seen, far="", lists=[], **values)
+    )
     assert page.elements["script"] == 0
     assert page.elements["svg"] == 1
     assert page.text.count(HOSTILE) == 8, "title twice, subtitle, verdict, a figure twice, a view, a chart"
@@ -141,7 +143,7 @@ def test_data_cannot_end_their_script():
 
 def test_name_that_is_not_unicode_shows_a_question_mark():
     page = render("inspect.html.j2", title="\udcff.png", subtitle="", state="ready", verdict="", findings=[],
-                  figures={}, cameras=[], far="", seen=None, lists=[])  # fmt: skip
+                  figures={}, cameras=[], far="", points_per_view=None, lists=[])  # fmt: skip
     assert "<title>?.png</title>" in page
 
 
