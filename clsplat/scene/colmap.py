@@ -1,4 +1,4 @@
-"""Read COLMAP folders: choose the model, find its photographs, and make pinhole cameras."""
+"""Read COLMAP folders: choose a model, find its photographs, and create pinhole cameras."""
 
 import logging
 import math
@@ -25,7 +25,7 @@ from clsplat.scene.scene import PointCloud, Scene, Tracks, every_nth, make_scene
 from clsplat.scene.times_file import add_times
 from clsplat.scene.view import View
 
-# Records of a COLMAP model, binary or text: camera models, cameras and images.
+# Define the records of a COLMAP model: camera models, cameras and images.
 
 # Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
 PARAMETERS = {
@@ -39,7 +39,7 @@ REMEDY = "copy or export the model again"
 
 
 class CameraRecord(NamedTuple):
-    """A line of `cameras`; `where` is its place, for messages."""
+    """A camera; `where` is its position in the file, for messages."""
 
     where: str
     model: str
@@ -49,9 +49,9 @@ class CameraRecord(NamedTuple):
 
 
 class ImageRecord(NamedTuple):
-    """A line of `images`: quaternion (w, x, y, z) and translation, world to camera.
+    """An image: its name, camera id, and world-to-camera quaternion (w, x, y, z) and translation.
 
-    `points` are the ids of the 3D points that its 2D points show, `places` where, [K, 2] px.
+    `points` are the ids of the 3D points that the image shows, [K], and `pixels` their positions, [K, 2] px.
     """
 
     where: str
@@ -60,23 +60,23 @@ class ImageRecord(NamedTuple):
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
     points: NDArray[np.int64] = np.empty(0, np.int64)
-    places: NDArray[np.float64] = np.empty((0, 2))
+    pixels: NDArray[np.float64] = np.empty((0, 2))
 
     @property
     def observed(self) -> int:
-        """The number of its 2D points that show a 3D point."""
+        """The number of 2D points that belong to a 3D point."""
         return len(self.points)
 
 
 def parameter_count(where: str, model: str) -> int:
-    """Return the number of parameters of a camera model.  Raises DataError, starting with `where`, for others."""
+    """Return the number of parameters of a camera model.  Raises DataError, with `where`, for others."""
     if model not in PARAMETERS:
         raise DataError(f"{where}: unknown camera model {quote(model)}; expected one of {', '.join(PARAMETERS)}")
     return PARAMETERS[model]
 
 
 def decode(where: str, data: bytes) -> str:
-    """Return bytes as text.  Raises DataError, starting with `where`, when they are not UTF-8."""
+    """Decode UTF-8.  Raises DataError, prefixed with `where`, for other bytes."""
     try:
         return data.decode()
     except UnicodeDecodeError as error:
@@ -89,7 +89,7 @@ LARGEST_ID = 2**63 - 1
 
 
 def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
-    """Yield ids and cameras.  Raises DataError, as all functions here, when the file is damaged."""
+    """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
     for where, line in _lines(path):
         if line:
             layout = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
@@ -103,11 +103,11 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
     """Yield the registered images, in the order of the file."""
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     kinds = (int, *[float] * 7, int, str)
-    image: ImageRecord | None = None  # the line of its points may follow
+    image: ImageRecord | None = None  # its points may follow on the next line
     for where, line in _lines(path):
         if image and _is_points2d(line):
-            points, places = _points2d(line)
-            yield image._replace(points=points, places=places)
+            points, pixels = _points2d(line)
+            yield image._replace(points=points, pixels=pixels)
             image = None
         elif line:
             if image:
@@ -119,21 +119,21 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
 
 
 def _is_points2d(line: str) -> bool:
-    """Return whether a line holds 2D points, (X, Y, POINT3D_ID) each, or none; some writers omit such lines."""
+    """Return whether a line is empty or lists 2D points, (X, Y, POINT3D_ID); some writers omit these lines."""
     words = line.split()
     return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
 def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The ids of the 3D points in a line of 2D points, and their places, [K, 2] px."""
+    """Return the ids of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
     words = line.split()
     named = [i for i in range(2, len(words), 3) if words[i].isdecimal()]
-    places = [(_number(words[i - 2]), _number(words[i - 1])) for i in named]
-    return np.array([_id(words[i]) for i in named], np.int64), np.array(places, np.float64).reshape(-1, 2)
+    pixels = [(_number(words[i - 2]), _number(words[i - 1])) for i in named]
+    return np.array([_id(words[i]) for i in named], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
 
 
 def _number(word: str) -> float:
-    """A coordinate of a 2D point; NaN where it is none, as nothing but its error is known by it."""
+    """Return a coordinate of a 2D point; NaN if it is not a number, since only reprojection errors need it."""
     try:
         return float(word)
     except ValueError:
@@ -141,7 +141,7 @@ def _number(word: str) -> float:
 
 
 def points_text(path: Path) -> PointTable:
-    """Return all points with their errors."""
+    """Return all points with their reprojection errors."""
     kinds = (_id, float, float, float, _byte, _byte, _byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
     rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout) for where, line in _lines(path) if line]
@@ -151,7 +151,7 @@ def points_text(path: Path) -> PointTable:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield the place and the text of every line that is not a comment."""
+    """Yield the position and the text of every line that is not a comment."""
     text = decode(str(path), read_file(path)).lstrip("\ufeff")
     for number, line in enumerate(map(str.strip, text.split("\n")), start=1):
         if not line.startswith("#"):
@@ -169,7 +169,7 @@ def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]]
 
 
 def _id(word: str) -> int:
-    """The id of a point; those that COLMAP does not give are one."""
+    """Return the id of a point, clamped to the ids that COLMAP uses; -1: none."""
     return min(max(int(word), -1), LARGEST_ID)
 
 
@@ -186,53 +186,55 @@ POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("rgb", "u1", 3), ("err
 
 
 class _Binary:
-    """A binary file, read from front to back; each step first checks that the bytes exist."""
+    """A reader of binary files that checks that bytes exist before it reads them."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, read_file(path), 0
+        self.path, self.data, self.offset = path, read_file(path), 0
 
     @property
     def where(self) -> str:
-        return f"{self.path}: byte {self.at}"
+        return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, what: str) -> int:
-        """Pass over `size` bytes and return where they start."""
-        left = len(self.data) - self.at
+        """Skip `size` bytes and return the offset of the first."""
+        left = len(self.data) - self.offset
         if size > left:
             raise DataError(
                 f"{self.where}: expected {size} bytes of {what}, found {left}; truncated or damaged: {REMEDY}"
             )
-        self.at += size
-        return self.at - size
+        self.offset += size
+        return self.offset - size
 
-    def take(self, layout: str, what: str) -> tuple[Any, ...]:
+    def read(self, layout: str, what: str) -> tuple[Any, ...]:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), what))
 
     def count(self, stride: int, what: str) -> int:
-        """Take a number of records, of at least `stride` bytes each, and check that there is room for them."""
-        (count,) = self.take("<Q", f"the number of {what}")
-        self.at = self.skip(count * stride, f"{count} {what}")
+        """Read the number of records, and check that this many records of at least `stride` bytes can follow."""
+        (count,) = self.read("<Q", f"the number of {what}")
+        self.offset = self.skip(count * stride, f"{count} {what}")
         return int(count)
 
     def text(self, what: str) -> str:
-        """Take UTF-8 text up to the next zero byte."""
-        where, end = self.where, self.data.find(b"\0", self.at)
-        start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.at, what)
+        """Read UTF-8 text up to the next zero byte."""
+        where, end = self.where, self.data.find(b"\0", self.offset)
+        start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, what)
         return decode(where, self.data[start:end])
 
     def finish(self) -> None:
-        if self.at < len(self.data):
-            raise DataError(f"{self.where}: {len(self.data) - self.at} bytes follow the last record; damaged: {REMEDY}")
+        if self.offset < len(self.data):
+            raise DataError(
+                f"{self.where}: {len(self.data) - self.offset} bytes follow the last record; damaged: {REMEDY}"
+            )
 
 
 def cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
-    """Yield ids and cameras.  Raises DataError, as all functions here, when the file is damaged."""
+    """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
     file = _Binary(path)
     for _ in range(file.count(24, "cameras")):
         where = file.where
-        number, model, width, height = file.take("<IiQQ", "a camera")
+        number, model, width, height = file.read("<IiQQ", "a camera")
         name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
-        params = file.take(f"<{parameter_count(where, name)}d", "camera parameters")
+        params = file.read(f"<{parameter_count(where, name)}d", "camera parameters")
         yield number, CameraRecord(where, name, width, height, params)
     file.finish()
 
@@ -242,21 +244,21 @@ def images_binary(path: Path) -> Iterator[ImageRecord]:
     file = _Binary(path)
     for _ in range(file.count(73, "images")):
         where = file.where
-        _, *pose, camera = file.take("<I7dI", "an image")
+        _, *pose, camera = file.read("<I7dI", "an image")
         name = file.text("an image name")
         count = file.count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
-        found = np.frombuffer(file.data, POINT2D, count, start)
-        found = found[found["point"] >= 0]
-        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), found["point"], found["xy"])
+        points = np.frombuffer(file.data, POINT2D, count, start)
+        points = points[points["point"] >= 0]
+        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), points["point"], points["xy"])
     file.finish()
 
 
 def points_binary(path: Path) -> PointTable:
-    """Return all points with their errors."""
+    """Return all points with their reprojection errors."""
     file = _Binary(path)
     starts = np.empty(file.count(POINT.itemsize, "points"), np.int64)
-    for i in range(len(starts)):  # points differ in length by their tracks: a loop finds where they start
+    for i in range(len(starts)):  # records have different lengths because of their tracks
         starts[i] = file.skip(POINT.itemsize - 8, "a point")
         file.skip(8 * file.count(8, "track elements"), "track elements")
     file.finish()
@@ -267,17 +269,17 @@ def points_binary(path: Path) -> PointTable:
     return PointTable(path, table["position"], table["rgb"], table["error"], table["id"].astype(np.int64))
 
 
-# Read the three files of a COLMAP model, binary or text; damaged numbers are errors.
+# Read the three files of a COLMAP model, binary or text.
 
 
 def find_file(folder: Path, stem: str) -> Path | None:
-    """Return `stem`.bin or else `stem`.txt in a folder, or None."""
+    """Return `stem`.bin in a folder, otherwise `stem`.txt, or None."""
     files = (folder / f"{stem}.bin", folder / f"{stem}.txt")
     return next((file for file in files if file.is_file()), None)
 
 
 def read_cameras(folder: Path) -> dict[int, CameraRecord]:
-    """Return the cameras of a model by their ids.  Raises DataError, as all here, for a damaged file."""
+    """Return the cameras of a model by id.  Raises DataError, like all functions here, for a damaged file."""
     file = _require_file(folder, "cameras")
     cameras: dict[int, CameraRecord] = {}
     for number, camera in cameras_binary(file) if file.suffix == ".bin" else cameras_text(file):
@@ -294,7 +296,7 @@ def read_images(folder: Path) -> list[ImageRecord]:
 
 
 def read_point_table(folder: Path) -> PointTable | None:
-    """Return the points of a model with their errors, or None when it has no such file."""
+    """Return the points of a model with their reprojection errors, or None if the model has no such file."""
     file = find_file(folder, "points3D")
     if file is None:
         return None
@@ -314,10 +316,10 @@ logger = logging.getLogger("clsplat")
 class ColmapReader(Reader):
     """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
-    Of several models the reader takes the one with most images.  Every `holdout`-th view by name is for testing.
-    Photographs of cameras with distortion are undistorted when they are read.  Masks lie in the folder
-    `masks`: their names are those of the images with .png appended, or in place of the suffix.  With a file
-    `images/times.json`, a number for each image by name, the scene moves.
+    If there are several models, the reader takes the one with the most images.  Every `holdout`-th view by name is a
+    test view.  Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may
+    contain masks, named like the images, with .png appended or as the suffix.  With a file `images/times.json` that
+    gives each image a time, the scene is dynamic.
     """
 
     name = "COLMAP"
@@ -331,19 +333,19 @@ class ColmapReader(Reader):
         cameras = read_cameras(model)
         folder = image_folder(path)
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-        there = find_existing(path, [view.image_path for view in views], self.missing)
-        skipped = tuple(view.name for view, found in zip(views, there, strict=True) if not found)
-        views = add_times([view for view, found in zip(views, there, strict=True) if found], folder)
+        on_disk = find_existing(path, [view.image_path for view in views], self.missing)
+        skipped = tuple(view.name for view, exists in zip(views, on_disk, strict=True) if not exists)
+        views = add_times([view for view, exists in zip(views, on_disk, strict=True) if exists], folder)
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         return replace(scene, tracks=tracks and tracks.shifted(scene.origin), skipped=skipped)
 
     def list_parts(self, parts: Parts) -> None:
-        found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
-        found.sort(key=lambda model: -len(model[1]))  # `read` takes the first of the largest, and sorting is stable
-        parts.submodels = {str(folder.relative_to(parts.path)): len(images) for folder, images in found}
-        model, images = found[0]
+        models = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
+        models.sort(key=lambda model: -len(model[1]))  # stable: the first of the largest is used, as in `read`
+        parts.submodels = {str(folder.relative_to(parts.path)): len(images) for folder, images in models}
+        model, images = models[0]
         cameras = parts.attempt(read_cameras, model)
         parts.points = parts.attempt(read_point_table, model)
         parts.image_folder = folder = image_folder(parts.path)
@@ -357,28 +359,28 @@ class ColmapReader(Reader):
 
 
 def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
-    """Return a view for each image of the largest model, whether or not its file exists, and the points."""
+    """Return a view for each image of the largest model, whether or not the file exists, and the points."""
     model, images = _largest_model(path)
     cameras, folder, table = read_cameras(model), image_folder(path), read_point_table(model)
     return [view_of(image, cameras, folder) for image in images], table.cloud() if table else None
 
 
 def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
-    """Return which points each image shows, or None where no image names one; of `views` how far from their places."""
-    kept = table.kept()
-    positions, ids = table.positions[kept], table.ids[kept]
+    """Return which points each image shows, with reprojection residuals for `views`; None if no image lists points."""
+    finite = table.is_finite()
+    positions, ids = table.positions[finite], table.ids[finite]
     order = np.argsort(ids, kind="stable")
-    seen, missed, by_name = {}, {}, {view.name: view for view in views}
+    seen, residuals, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
         named, first = np.unique(image.points, return_index=True)
-        place = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
-        known = ids[order][place] == named if len(ids) else np.zeros(len(named), bool)
-        rows = seen[image.name] = order[place[known]] if len(ids) else np.empty(0, np.int64)
-        if len(rows) and len(image.places) and image.name in by_name:
-            missed[image.name] = reprojection_residuals(
-                by_name[image.name], positions[rows], image.places[first[known]]
+        nearest = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
+        known = ids[order][nearest] == named if len(ids) else np.zeros(len(named), bool)
+        rows = seen[image.name] = order[nearest[known]] if len(ids) else np.empty(0, np.int64)
+        if len(rows) and len(image.pixels) and image.name in by_name:
+            residuals[image.name] = reprojection_residuals(
+                by_name[image.name], positions[rows], image.pixels[first[known]]
             )
-    return Tracks(positions, seen, missed) if any(map(len, seen.values())) else None
+    return Tracks(positions, seen, residuals) if any(map(len, seen.values())) else None
 
 
 def find_models(path: Path) -> list[Path]:
@@ -394,17 +396,17 @@ def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
         raise DataError(f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse or .")
     best = max(models, key=lambda model: len(model[1]))
     if others := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
-        logger.info("%s: used with %d images, the most of all models; not used: %s", best[0], len(best[1]), others)
+        logger.info("%s: the largest model, with %d images, is used; not used: %s", best[0], len(best[1]), others)
     return best
 
 
 def image_folder(path: Path) -> Path:
-    """Return `images` beside `sparse` when `path` is `sparse` or one of its models, else `images` in `path`."""
+    """Return `images` next to `sparse` if `path` is `sparse` or one of its models, otherwise `images` in `path`."""
     return next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path) / "images"
 
 
 def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
-    """Check one image and its camera.  Raises DataError."""
+    """Return the view of an image.  Raises DataError if the image or its camera is invalid."""
     image_path = safe_join(folder, image.name, image.where)
     if image.camera not in cameras:
         raise DataError(
@@ -423,7 +425,7 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
-    """Check a camera.  Raises DataError for models that are not supported, and for invalid numbers."""
+    """Return the lens of a camera.  Raises DataError for unsupported models and invalid numbers."""
     if camera.model not in LENS_MODELS:
         raise DataError(
             f"{camera.where}: camera {number} is {camera.model}; expected one of {', '.join(LENS_MODELS)}: "
@@ -443,9 +445,9 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
 
 
 def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> NDArray[np.float64]:
-    """Return the pose [3, 4] of a quaternion of any length but zero and a translation in scene units.
+    """Return the pose [3, 4] of a quaternion, of any nonzero length, and a translation in scene units.
 
-    Raises ValueError when numbers are missing or not finite, or the quaternion is zero.
+    Raises ValueError if numbers are missing or not finite, or the quaternion is zero.
     """
     length = math.hypot(*quaternion)
     sizes = len(quaternion), len(translation)

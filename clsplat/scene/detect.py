@@ -1,4 +1,4 @@
-"""Find the reader of a dataset among the shipped ones and those of plug-ins."""
+"""Find the reader of a dataset among shipped readers and those of plug-ins."""
 
 from pathlib import Path
 
@@ -19,31 +19,31 @@ PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, 
 def readers() -> list[Reader]:
     """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition.
 
-    Raises ConfigError when two have the same name, or one has none.
+    Raises ConfigError if two have the same name, or one has none.
     """
 
-    def rank(found: type[Reader]) -> int:
-        """The rank of a shipped reader, or of the one that the class extends."""
-        return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(found, shipped)), len(PRECEDENCE))
+    def rank(kind: type[Reader]) -> int:
+        """Return the rank of a shipped reader, or of the one that the class extends."""
+        return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(kind, shipped)), len(PRECEDENCE))
 
-    found: dict[str, Reader] = {}
+    by_name: dict[str, Reader] = {}
     for reader in [kind() for kind in sorted(reader_classes(), key=rank)]:
-        if reader.name in found:
-            kinds = (type(found[reader.name]), type(reader))
-            places = " and ".join(f"{kind.__module__}.{kind.__name__}" for kind in kinds)
-            raise ConfigError(f"two readers have the name '{reader.name}': {places}; rename one")
-        found[reader.name] = reader
-    return list(found.values())
+        if reader.name in by_name:
+            kinds = (type(by_name[reader.name]), type(reader))
+            classes = " and ".join(f"{kind.__module__}.{kind.__name__}" for kind in kinds)
+            raise ConfigError(f"two readers have the name '{reader.name}': {classes}; rename one")
+        by_name[reader.name] = reader
+    return list(by_name.values())
 
 
 def format_names() -> str:
-    """Return the names of all formats as in `A, B or C`."""
+    """Return the names of all formats in the form `A, B or C`."""
     *others, last = (reader.name for reader in readers())
     return f"{', '.join(others)} or {last}"
 
 
 def find_reader(path: Path) -> Reader | None:
-    """Return the first reader whose format the dataset in a folder has, or None."""
+    """Return the first reader that matches the dataset in a folder, or None."""
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
@@ -53,18 +53,18 @@ def is_scene(path: Path) -> bool:
 
 
 def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
-    """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset has no split.
+    """Read the dataset in a folder; every `holdout`-th view is a test view if the dataset has no split.
 
-    A Split says more: test views by name, a validation fold, training views that are left out.
-    Raises DataError when its format is unknown or its files are damaged.
+    A Split can also name the test views, hold out a validation fold, and leave out training views.
+    Raises DataError if the format is unknown or files are damaged.
     """
     path = Path(path)
     if not path.is_dir():
-        found = "no such folder"
+        fault = "no such folder"
         if path.is_file():
             model = model_format(path)
-            found = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
-        raise DataError(f"{path}: {found}; expected the folder of a dataset")
+            fault = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
+        raise DataError(f"{path}: {fault}; expected the folder of a dataset")
     split = holdout if isinstance(holdout, Split) else Split(holdout)
     if reader := find_reader(path):
         reader.missing = split.missing

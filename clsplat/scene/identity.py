@@ -1,4 +1,4 @@
-"""What a scene is, whatever its folder is called: content hashes of its photographs, masks, cameras and points."""
+"""Identify a scene by hashes of its photographs, masks, cameras and points, independent of its folder."""
 
 import hashlib
 import json
@@ -24,79 +24,79 @@ from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_heade
 from clsplat.scene.scene import SPLITS, PointCloud, Scene
 from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
-# Decode every photograph and mask of a scene once, before training: a damaged one is found while it costs nothing.
+# Decode every photograph and mask of a scene before training, so that damaged files are found early.
 
-MAX_THREADS = 8  # each holds one photograph
+MAX_THREADS = 8  # each has one photograph in memory
 MAX_REMEMBERED = 1 << 24  # bytes: about 200 000 photographs
 MAX_NAMES = 3  # in a message
 
 
 @dataclass
 class ImageFile:
-    """What is known of an image file after decoding it."""
+    """The result of decoding an image file."""
 
-    digest: str = ""  # SHA-256 of its content; "" where it cannot be read
-    size: Size | None = None  # as stored; None where it cannot be decoded
-    orientation: int = 1  # of the EXIF data; 1: upright
+    digest: str = ""  # SHA-256 of its content; "" if it cannot be read
+    size: Size | None = None  # as stored; None if it cannot be decoded
+    orientation: int = 1  # from EXIF; 1: upright
     cut: bool = False  # its end is missing
-    fault: str = ""  # why it cannot be trained on, as training would say
+    fault: str = ""  # the error that training would report
 
 
 def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
-    """Check the photographs and masks of views as load_image does: do they decode, to the size of their camera?
+    """Decode the photographs and masks of views, and check that their sizes match the cameras, as load_image does.
 
-    They are read in threads; a file of several views is decoded once.  Views without a photograph are left out.
+    Files are read in threads, and a file that several views share only once.  Views without a photograph are skipped.
     """
     users: dict[Path, list[View]] = defaultdict(list)
     for view in views:
         for file in (view.image_path, view.mask_path, view.static_path):
             if file is not None and file != NO_FILE:
                 users[file].append(view)
-    found = {file: ImageFile() for file in users}
-    memory, count = Memory(), Count("photographs decoded", len(users))
+    files = {file: ImageFile() for file in users}
+    known, count = DecodedSizes(), Count("photographs decoded", len(users))
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "decoding")
     try:
-        futures = [pool.submit(_examine, file, users[file], found[file], memory) for file in users]
+        futures = [pool.submit(_examine, file, users[file], files[file], known) for file in users]
         for number, future in enumerate(as_completed(futures), 1):
             future.result()
             count.reach(number)
     finally:
         pool.shutdown(cancel_futures=True)
-        memory.save()
-    return found
+        known.save()
+    return files
 
 
-def require_decodable(place: Path, files: Mapping[Path, ImageFile]) -> None:
-    """Raise DataError, naming the first ones, when image files of the scene at `place` cannot be trained on."""
-    damaged = {file: found.fault.removeprefix(f"{file}: ") for file, found in files.items() if found.fault}
+def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
+    """Raise DataError if training cannot use image files of the scene at `path`."""
+    damaged = {file: result.fault.removeprefix(f"{file}: ") for file, result in files.items() if result.fault}
     if damaged:
         named = "; ".join(f"{file} ({fault})" for file, fault in list(damaged.items())[:MAX_NAMES])
         more = "; …" if len(damaged) > MAX_NAMES else ""
-        raise DataError(f"{place}: {len(damaged)} of {len(files)} image files cannot be trained on: {named}{more}")
+        raise DataError(f"{path}: {len(damaged)} of {len(files)} image files cannot be trained on: {named}{more}")
 
 
-def _examine(file: Path, views: list[View], found: ImageFile, memory: "Memory") -> None:
+def _examine(file: Path, views: list[View], result: ImageFile, known: "DecodedSizes") -> None:
     try:
         data = read_file(file, "an image", limit=MAX_BYTES)
-        found.digest = hashlib.sha256(data).hexdigest()
+        result.digest = hashlib.sha256(data).hexdigest()
         if header := parse_header(data, data[-TAIL_SIZE:], lambda: data):
-            found.orientation, found.cut = header.orientation, not header.complete
-        found.size = memory.size(found.digest, data, file)
+            result.orientation, result.cut = header.orientation, not header.complete
+        result.size = known.size(result.digest, data, file)
         for view in views:
-            needs_rotation(view, file, lambda upright: memory.size(found.digest, data, file, upright))
+            needs_rotation(view, file, lambda upright: known.size(result.digest, data, file, upright))
     except DataError as error:
-        found.fault = str(error)
+        result.fault = str(error)
 
 
-class Memory:
-    """Sizes of images that this version of the decoder has decoded, by content; of damaged ones nothing is kept.
+class DecodedSizes:
+    """A cache of the sizes of images that this version of the decoder has decoded, by content hash.
 
-    They lie in a file of lines in the user's cache folder; where it cannot be used, all images are decoded.
+    It is a text file in the user's cache folder; if that cannot be used, all images are decoded.
     """
 
     def __init__(self) -> None:
         self._known: dict[str, Size] = {}
-        self._fresh: dict[str, Size] = {}
+        self._new: dict[str, Size] = {}
         self.path: Path | None = None
         with suppress(DataError, OutputError):
             self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}.txt"
@@ -104,18 +104,18 @@ class Memory:
             self._known = dict(filter(None, map(_entry, lines)))
 
     def size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
-        """Return (width, height) of the content of `file`, decoding it unless that was done.  Raises DataError."""
+        """Return (width, height) of the content of `file`, decoding it if it is not cached.  Raises DataError."""
         key = f"{digest}-upright" if upright else digest
         if key not in self._known:
             height, width = decode_image(data, file, upright).shape[:2]
-            self._known[key] = self._fresh[key] = width, height
+            self._known[key] = self._new[key] = width, height
         return self._known[key]
 
     def save(self) -> None:
-        """Add what is new, in one write: lines of two processes do not mix, and half a line does not count."""
-        if self.path is None or not self._fresh:
+        """Append the new sizes in one write, so that lines of two processes do not mix."""
+        if self.path is None or not self._new:
             return
-        lines = "".join(f"{key} {width} {height}\n" for key, (width, height) in self._fresh.items())
+        lines = "".join(f"{key} {width} {height}\n" for key, (width, height) in self._new.items())
         with suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             full = self.path.exists() and self.path.stat().st_size >= MAX_REMEMBERED
@@ -124,21 +124,21 @@ class Memory:
 
 
 def _entry(line: bytes) -> tuple[str, Size] | None:
-    """The key and the size on a whole line, else None."""
+    """Return the key and the size on a complete line, otherwise None."""
     words = line.split()
     if len(words) != 3 or not line.endswith(b"\n") or not re.fullmatch(rb"\d{1,7} \d{1,7}", b" ".join(words[1:])):
         return None
     return words[0].decode(errors="replace"), (int(words[1]), int(words[2]))
 
 
-Row = dict[str, str]  # photograph, mask and camera of a view: hashes, "" where there is none; the time where it has one
+Row = dict[str, str]  # hashes of the photograph, mask and camera of a view, "" if there is none; its time if it has one
 
 
 @dataclass(frozen=True)
 class Identity:
-    """The views by split and name, in the order of the scene, and the points.
+    """Hashes of the views, by split and name in the order of the scene, and of the points.
 
-    Cameras and points count as they were read, so a file that was written again with the same numbers is the same.
+    Cameras and points are hashed as parsed, so rewriting a file with the same numbers changes nothing.
     """
 
     train: dict[str, Row]
@@ -148,7 +148,7 @@ class Identity:
 
     @classmethod
     def from_scene(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
-        """Return the identity of a scene whose image files were decoded."""
+        """Return the identity of a scene with decoded image files."""
         train, test, fold = (
             {view.name: _row(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
         )
@@ -156,26 +156,26 @@ class Identity:
 
     @property
     def digest(self) -> str:
-        """One hash of all that decides over the bits of a run: the order of the test views does not."""
+        """One hash of everything that affects the bits of a run; the order of the test views does not."""
         parts = [list(self.train.items()), sorted(self.test.items()), self.points]
         parts += [list(self.validation.items())] if self.validation else []
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def changes(self, before: "Identity") -> list[str]:
-        """Return what is another than it was, with counts and the first few names: 'the photographs of 2 views (…)'."""
-        found = []
+        """Return what changed, with counts and the first few names: 'the photographs of 2 views (…)'."""
+        changes = []
         old, new = before._rows, self._rows
         for part in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(part) != new[name].get(part)]
-            found += [f"the {part} of {_named(names)}"] if names else []
+            changes += [f"the {part} of {_named(names)}"] if names else []
         moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
-        gone, fresh = [name for name in old if name not in new], [name for name in new if name not in old]
-        found += [f"the split of {_named(moved)}"] if moved else []
-        found += [f"{_named(gone)}, gone"] if gone else []
-        found += [f"{_named(fresh)}, new"] if fresh else []
-        if not (moved or gone or fresh) and list(self.train) != list(before.train):
-            found.append("the order of the training views")
-        return found + (["the points"] if self.points != before.points else [])
+        removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
+        changes += [f"the split of {_named(moved)}"] if moved else []
+        changes += [f"{_named(removed)}, removed"] if removed else []
+        changes += [f"{_named(added)}, added"] if added else []
+        if not (moved or removed or added) and list(self.train) != list(before.train):
+            changes.append("the order of the training views")
+        return changes + (["the points"] if self.points != before.points else [])
 
     @property
     def _rows(self) -> dict[str, Row]:
@@ -190,12 +190,12 @@ class Identity:
 
     @classmethod
     def from_data(cls, data: Any) -> "Identity":
-        """Return what `data` returned.  Raises ValueError where it is damaged."""
+        """Return the identity from the result of `data`.  Raises ValueError if it is damaged."""
         try:
             train, test, points = dict(data["train"]), dict(data["test"]), str(data["points"])
-            found = cls(train, test, points, dict(data["validation"]))
-            if found.digest == data["digest"]:
-                return found
+            identity = cls(train, test, points, dict(data["validation"]))
+            if identity.digest == data["digest"]:
+                return identity
         except (KeyError, TypeError, ValueError):
             pass
         raise ValueError("damaged")
@@ -218,7 +218,7 @@ def _points_hash(points: PointCloud) -> str:
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:
-    """A hash of the values of arrays, in double precision and little-endian; -0 is 0."""
+    """Return a hash of arrays, as little-endian float64; -0 counts as 0."""
     state = hashlib.sha256(text.encode())
     for array in arrays:
         values = np.asarray(array, np.float64) + 0.0

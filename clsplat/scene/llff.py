@@ -15,7 +15,7 @@ from clsplat.scene.scene import Scene, every_nth, make_scene
 from clsplat.scene.view import View
 
 POSES_FILE = "poses_bounds.npy"
-MAX_BYTES = 1 << 24  # 136 bytes per image: 120 000 images
+MAX_BYTES = 1 << 24  # 136 bytes per image, 120 000 images
 LLFF_TO_OPENCV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64)  # from axes (down, right, back)
 logger = logging.getLogger("clsplat")
 
@@ -23,7 +23,7 @@ logger = logging.getLogger("clsplat")
 class LlffReader(Reader):
     """An LLFF scene: the i-th row of `poses_bounds.npy` belongs to the i-th image by name.
 
-    The file holds a focal length and no distortion, and no points.  Every `holdout`-th view is for testing.
+    The file contains focal lengths, but no distortion and no points.  Every `holdout`-th view is a test view.
     """
 
     name = "LLFF"
@@ -37,11 +37,11 @@ class LlffReader(Reader):
         rows, images = read_poses(file), image_files(path)
         if len(rows) != len(images):
             raise DataError(
-                f"{file}: holds {len(rows)} poses for {len(images)} images in {images[0].parent if images else path}; "
-                "expected one pose per image, in order of name: add the missing images or remove the others"
+                f"{file}: has {len(rows)} poses for {len(images)} images in {images[0].parent if images else path}; "
+                "expected one pose per image, by name: add the missing images or remove the extra ones"
             )
         views = [view_from_row(file, row, image) for row, image in zip(rows, images, strict=True)]
-        logger.info("%s: one focal length per image and no distortion; undistorted photographs are expected", file)
+        logger.info("%s: one focal length per image and no distortion; the photographs must be undistorted", file)
         return make_scene(path, views, every_nth([view.name for view in views], holdout), None)
 
     def list_parts(self, parts: Parts) -> None:
@@ -69,7 +69,7 @@ def read_poses(path: Path) -> NDArray[np.float64]:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the images of the dataset by name: of `images`, else of the largest `images_N`, else of its folder."""
+    """Return the images by name: of `images`, otherwise the largest `images_N`, otherwise the folder itself."""
     smaller = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
     for folder in (path / "images", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
         files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
@@ -79,12 +79,14 @@ def image_files(path: Path) -> list[Path]:
 
 
 def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
-    """Return the view of one row; the focal length follows the size of the image file.  Raises DataError."""
+    """Return the view of a row, with the focal length scaled to the image file.  Raises DataError."""
     matrix, header = row[:15].reshape(3, 5), read_header(image)
     height, width, focal = matrix[:, 4]
     scale = header.width / width if width > 0 else 0.0
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and focal * scale >= MIN_FOCAL):
-        raise DataError(f"{path}: {image.name} has a camera of {width:g} x {height:g} px with focal length {focal:g}")
+        raise DataError(
+            f"{path}: {image.name} has a camera of {width:g} x {height:g} px with focal length {focal:g}; export it again"
+        )
     if abs(header.height - height * scale) > 1.5:  # a resized image is rounded to whole pixels
         raise DataError(
             f"{path}: {image.name} is {header.width} x {header.height} px, its camera {width:g} x {height:g}; "

@@ -1,4 +1,4 @@
-"""Read videos of several fixed cameras: a folder of frames for each, beside the cameras of COLMAP or nerfstudio."""
+"""Read videos of several fixed cameras: a folder of frames per camera, next to COLMAP or nerfstudio cameras."""
 
 import logging
 import os
@@ -22,55 +22,54 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v"})  #
 
 
 class MulticameraReader(Reader):
-    """Videos of fixed cameras that ran together: frames in `videos/NAME`, cameras in `sparse` or transforms.json.
+    """Synchronized videos of fixed cameras: frames in `videos/NAME`, cameras in `sparse` or transforms.json.
 
-    A camera is that of the image `NAME.png` (of any suffix, in any folder), or of an image in a folder NAME.  Frames
-    are in order of name, in which 10 comes after 9; the i-th of each camera is of the same moment.  Every `holdout`-th
-    camera by name is for testing.
-    Where there is `static/NAME.png`, it is white in pixels of that camera that show nothing that moves.
+    The pose of camera NAME is that of the image `NAME.png` (with any suffix, in any folder), or of an image in a folder
+    NAME.  Frames are sorted by name, with 10 after 9; the i-th frames of all cameras have the same timestamp.  Every
+    `holdout`-th camera by name is a test camera.  A mask `static/NAME.png` is white in pixels that show no motion.
     """
 
     name = "multi-camera video"
-    expects = f"{VIDEOS}/ beside sparse/0 or {TRANSFORMS}"
+    expects = f"{VIDEOS}/ next to sparse/0 or {TRANSFORMS}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether something in `videos` has the name of a camera: other videos may be what a scene came from."""
+        """Return whether an entry of `videos` is named like a camera; other videos may be the source of a scene."""
         named = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
         return bool(named) and not named.isdisjoint(_camera_names(path))
 
     def read(self, path: Path, holdout: int) -> Scene:
         frames = _frames(path)
-        stations, points = _stations(path, frames)
-        test = every_nth(sorted(stations), holdout)
+        cameras, points = _camera_views(path, frames)
+        test = every_nth(sorted(cameras), holdout)
         views, held_out = list[View](), set[int]()
-        for number, (name, station) in enumerate(sorted(stations.items())):
-            count, still = len(frames[name]), path / STATIC / f"{name}.png"
+        for number, (name, camera) in enumerate(sorted(cameras.items())):
+            count, mask = len(frames[name]), path / STATIC / f"{name}.png"
             for i, file in enumerate(frames[name]):
                 held_out |= {len(views)} if number in test else set()
-                time, known = i / (count - 1), still if os.path.isfile(still) else None
-                view = replace(station, name=f"{name}/{file.name}", image_path=file, mask_path=None)
-                views.append(replace(view, time=time, static_path=known))
+                time, static = i / (count - 1), mask if os.path.isfile(mask) else None
+                view = replace(camera, name=f"{name}/{file.name}", image_path=file, mask_path=None)
+                views.append(replace(view, time=time, static_path=static))
         return make_scene(path, views, held_out, points)
 
 
 def names_of(image: str) -> tuple[str, str]:
-    """Return the names that the camera of an image may have: that of the image, and that of its folder."""
+    """Return the possible names of an image's camera: the name of the image, and that of its folder."""
     name = PurePosixPath(image)
     return name.stem, name.parent.name
 
 
 def _entries(path: Path) -> list[Path]:
-    """What `videos` of a dataset holds, by name; nothing where there is no such folder."""
+    """Return the entries of the folder `videos` by name; none if there is no such folder."""
     folder = path / VIDEOS
     return sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
 
 
 def _camera_names(path: Path) -> set[str]:
-    """The names that the cameras of a dataset may have; none where files are damaged, as another reader tells."""
+    """Return the possible names of a dataset's cameras; none if files are damaged, which another reader reports."""
     try:
         if (path / TRANSFORMS).is_file():
-            places = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
-            images = [view_name(place) for place in places if isinstance(place, str)]
+            paths = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
+            images = [view_name(file) for file in paths if isinstance(file, str)]
         else:
             images = [image.name for model in find_models(path) for image in read_images(model)]
     except DataError:
@@ -79,17 +78,17 @@ def _camera_names(path: Path) -> set[str]:
 
 
 def _frames(path: Path) -> dict[str, list[Path]]:
-    """The frames of each camera in order.  Raises DataError for videos without frames, and where numbers differ."""
+    """Return the sorted frames of each camera.  Raises DataError for missing frames and differing counts."""
     folders = _entries(path)
     frames = {
-        entry.name: sorted(filter(is_image, entry.iterdir()), key=_in_order) for entry in folders if entry.is_dir()
+        entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in folders if entry.is_dir()
     }
     empty = [name for name, files in frames.items() if not files]
     frames = {name: files for name, files in frames.items() if files}
-    packed = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
-    if packed:
+    videos = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
+    if videos:
         raise DataError(
-            f"{packed[0]}: is a video without a folder {packed[0].with_suffix('')} of its frames; "
+            f"{videos[0]}: is a video without a folder {videos[0].with_suffix('')} of its frames; "
             f"`clsplat data sync-frames {shell_quote(path)}` writes the frames of all cameras"
         )
     if not frames:
@@ -100,24 +99,24 @@ def _frames(path: Path) -> dict[str, list[Path]]:
             "images in each folder: add them, or remove the folder"
         )
     counts = {name: len(files) for name, files in frames.items()}
-    least, most = (of(counts, key=lambda name: counts[name]) for of in (min, max))
+    least, most = (select(counts, key=counts.__getitem__) for select in (min, max))
     if counts[least] != counts[most]:
         raise DataError(
             f"{path / VIDEOS}: {least} has {counts[least]} frames, {most} has {counts[most]}; expected the same "
-            "moments of every camera: cut the videos to one start and one end, and take frames at one rate"
+            "number of frames from every camera: trim the videos to the same start and end, and use the same frame rate"
         )
     if counts[least] < 2:
-        raise DataError(f"{path / VIDEOS}: has one frame a camera; expected two moments at least, in order of name")
+        raise DataError(f"{path / VIDEOS}: has one frame per camera; expected two or more, in order of name")
     return frames
 
 
-def _in_order(frame: Path) -> list[tuple[int, str]]:
-    """The key of a frame in the order of names, in which 10 comes after 9."""
+def _natural_order(frame: Path) -> list[tuple[int, str]]:
+    """Return a sort key for frames by name, with 10 after 9."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", frame.name)]
 
 
-def _stations(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View], PointCloud | None]:
-    """A view for each camera that has frames, and the points.  Raises DataError for a camera without a pose."""
+def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View], PointCloud | None]:
+    """Return a view for each camera with frames, and the points.  Raises DataError for a camera without a pose."""
     if (path / TRANSFORMS).is_file():
         transforms = Transforms(path / TRANSFORMS)
         first = next(iter(frames.values()))[0]
@@ -126,20 +125,20 @@ def _stations(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View
         points = transforms.points(Clock(0.0, 1.0))
     else:
         posed, points = camera_views(path)
-    stations: dict[str, View] = {}
+    cameras: dict[str, View] = {}
     for view in posed:
-        known = [name for name in names_of(view.name) if name in frames]
-        if not known:
+        name = next((name for name in names_of(view.name) if name in frames), None)
+        if name is None:
             continue
-        if known[0] in stations:
-            both = " and ".join((stations[known[0]].name, view.name))
-            raise DataError(f"{path}: {both} are both of the camera {known[0]}; expected one pose for each: keep one")
-        stations[known[0]] = view
-    if without := sorted(set(frames) - set(stations)):
+        if name in cameras:
+            both = f"{cameras[name].name} and {view.name}"
+            raise DataError(f"{path}: {both} are both poses of camera {name}; expected one pose per camera: remove one")
+        cameras[name] = view
+    if without := sorted(set(frames) - set(cameras)):
         raise DataError(
             f"{path}: {len(without)} of {len(frames)} cameras have no pose: {first_few(without)}; expected an image "
-            f"NAME.png of each among the cameras, or remove {VIDEOS}/{without[0]}"
+            f"NAME.png of each camera among the poses, or remove {VIDEOS}/{without[0]}"
         )
-    if len(posed) > len(stations):
-        LOG.info("%s: left out %d images of no camera in %s", path, len(posed) - len(stations), VIDEOS)
-    return stations, points
+    if len(posed) > len(cameras):
+        LOG.info("%s: left out %d images of cameras without frames in %s", path, len(posed) - len(cameras), VIDEOS)
+    return cameras, points

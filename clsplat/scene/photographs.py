@@ -1,4 +1,4 @@
-"""The photograph of a view for training: its colors and its mask."""
+"""Load the photograph of a view for training, and find masks in folders."""
 
 import hashlib
 import logging
@@ -18,10 +18,9 @@ from clsplat.scene.view import View, load_image, load_mask
 def load_photograph(
     view: View, background: tuple[float, float, float], undistorted: Path | None = None
 ) -> NDArray[np.uint8]:
-    """Return RGB, [H, W, 3], or with a mask RGB and 0 or 1, [H, W, 4].
+    """Return RGB, [H, W, 3], or RGB and a mask of 0 and 1, [H, W, 4].
 
-    The folder `undistorted` keeps undistorted photographs, so that each is undistorted once.
-    Raises DataError as load_image does.
+    undistorted: a folder that caches undistorted photographs.  Raises DataError like load_image.
     """
     if view.lens is None or undistorted is None:
         return _loaded(view, background)
@@ -35,7 +34,7 @@ def load_photograph(
 
 
 def _key(view: View, background: tuple[float, float, float]) -> str:
-    """A hash of the file, the lens, the size, and what is behind transparent pixels."""
+    """Return a hash of the file, the lens, the size, and the background of transparent pixels."""
     state = view.image_path.stat() if view.image_path.exists() else None
     file = state and (state.st_mtime_ns, state.st_size)
     parts = view.lens, view.camera, view.mask_path, view.alpha, background, file
@@ -47,42 +46,42 @@ def _loaded(view: View, background: tuple[float, float, float]) -> NDArray[np.ui
     return pixels if mask is None else np.dstack([pixels, mask.astype(np.uint8)])
 
 
-# Masks that something else has made of the photographs, found in a folder by their names.
-
 LOG = logging.getLogger("clsplat")
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image by name: with .png appended (COLMAP), or in place of its suffix; None without one."""
+    """Return the mask of an image: its name with .png appended (COLMAP) or as the suffix; None without one."""
     return next((file for file in _candidates(folder, name) if os.path.isfile(file)), None)  # never raises
 
 
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
     """Return the scene with the masks in a folder; without a folder, the scene.
 
-    A photograph without a mask counts whole.  Raises DataError where there is no such folder, where no photograph has a
-    mask there, and where the dataset has masks already.
+    All pixels of a photograph without a mask are used.  Raises DataError if the folder does not exist or contains no
+    mask of a photograph, and if the dataset already has masks.
     """
     if folder is None:
         return scene
-    own = next((view.mask_path for view in scene.views if view.mask_path), None)
-    if own is not None:
+    existing = next((view.mask_path for view in scene.views if view.mask_path), None)
+    if existing is not None:
         raise DataError(
-            f"{scene.path}: has masks of its own, such as {own}; expected a dataset without any beside scene.masks: "
-            "leave scene.masks out, or take those of the dataset away"
+            f"{scene.path}: the dataset already has masks, such as {existing}; remove scene.masks, "
+            "or the masks of the dataset"
         )
     views = tuple(replace(view, mask_path=find_mask(folder, view.name)) for view in scene.views)
     count, missing = len(views), [view.name for view in views if view.mask_path is None]
     if len(missing) == count:
-        fault = f"holds no mask of a photograph of {scene.path}" if folder.is_dir() else "no such folder"
+        fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
         names = " or ".join(str(file) for file in dict.fromkeys(reversed(_candidates(folder, missing[0]))))
         raise DataError(
             f"{folder}: {fault}; expected {names} for the first of {count}, white in pixels "
-            "that count: name the files so, or give another folder as scene.masks"
+            "to use: rename the files, or set scene.masks to another folder"
         )
     if missing:
         masked = f"{count - len(missing)} of {pluralize(count, 'photograph')}"
-        LOG.warning("%s: has masks of %s; the others count whole, such as %s", folder, masked, missing[0])
+        LOG.warning(
+            "%s: contains masks for %s; all pixels of the others are used, such as %s", folder, masked, missing[0]
+        )
     return replace(scene, views=views)
 
 

@@ -1,7 +1,7 @@
-"""Points from the photographs of a scene: a plane sweep over them (Collins 1996).
+"""Create points from the photographs of a scene by a plane sweep (Collins 1996).
 
 For every photograph and each of PLANES depths, the neighbors are projected onto the plane at that depth.  The surface
-lies at the depth where they agree best.  A pixel can become a point when its neighbors find the same depth.
+is at the depth where they agree best.  A pixel becomes a point if its neighbors find the same depth.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,29 +18,29 @@ Floats = NDArray[np.floating]
 Places = NDArray[np.integer]
 LONG_SIDE = 160  # px of the photographs that are compared
 PLANES = 64  # evenly spaced in inverse depth
-MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to what the cameras look at
+MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to the point that the cameras look at
 NEIGHBORS = 4  # photographs that each is compared with
 WINDOW = 5  # px
-MAX_COST_SHARE = 0.6  # of the best plane, by the mean of all planes
-MIN_VOTES = 2  # neighbors that find the depth of a point too
-MAX_DIFFERENCE = 1.5  # of agreeing depths, planes
+MAX_COST_RATIO = 0.6  # cost of the best plane / mean cost of all planes
+MIN_VOTES = 2  # neighbors that must confirm the depth of a point
+MAX_DIFFERENCE = 1.5  # planes between agreeing depths
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What a small photograph shows where its neighbors agree on the depth."""
+    """The surface in a downscaled photograph, in pixels where the neighbors agree on the depth."""
 
     view: View
     image: Floats  # [H, W, 3] float32, in [0, 1]
-    inverse: Floats  # [H, W], 1 / depth, 1 / scene units; 0 where they do not agree
-    step: float  # from one plane to the next, 1 / scene units
+    inverse: Floats  # [H, W] 1 / depth, 1 / scene units; 0 where the neighbors do not agree
+    step: float  # inverse depth between planes, 1 / scene units
 
     def is_new(self, points: Floats) -> NDArray[np.bool_]:
-        """Return which pixels, [H, W], show none of some points [M, 3], and nothing behind one.
+        """Return the pixels, [H, W], whose surface none of the points, [M, 3], covers or hides.
 
-        A pixel shows a point that lies in it, unless its depth is more than a plane nearer.
+        A point covers the pixel that it projects to, unless the surface there is more than a plane nearer.
         """
-        seen, row, column, depth = _pixels(self.view, points)
+        seen, row, column, depth = _project(self.view, points)
         nearest = np.zeros(self.inverse.shape)
         np.maximum.at(nearest, (row[seen], column[seen]), 1 / depth[seen])
         return np.asarray((nearest == 0) | (self.inverse > nearest + self.step))
@@ -52,32 +52,32 @@ def swept_points(
     load: Callable[[View], NDArray[np.uint8]],
     count: int,
     seed: int,
-    beside: Floats | None = None,
-    shown: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
+    existing: Floats | None = None,
+    allowed: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
     """Return at most `count` colored points on the surfaces that neighboring views agree on, perhaps none.
 
-    center: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  beside: points [M, 3]
-    that are there already; pixels that are not new beside them give none.  `shown` returns which pixels of a view may
-    give points, [H, W]; None: all.
+    center: the point that the cameras look at, [3].  load: returns the photograph of a view, [H, W, 3].  existing:
+    points, [M, 3]; pixels that show them give no new points.  allowed: returns the pixels of a view that may give
+    points, [H, W]; None: all.
     """
     positions, colors = [], []
     for surface in surfaces(views, center, load):
-        view, image, taken = surface.view, surface.image, surface.inverse > 0
-        if (may := shown(view)) is not None:
-            taken &= may
-        if beside is not None:
-            taken &= surface.is_new(beside)
-        rows, columns = np.nonzero(taken)
-        positions.append(_lifted(view, rows, columns, 1 / surface.inverse[taken]))
-        colors.append(image[taken])
-    everywhere, everything = np.concatenate(positions), np.concatenate(colors)
-    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
-    return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
+        view, image, mask = surface.view, surface.image, surface.inverse > 0
+        if (usable := allowed(view)) is not None:
+            mask &= usable
+        if existing is not None:
+            mask &= surface.is_new(existing)
+        rows, columns = np.nonzero(mask)
+        positions.append(_unproject(view, rows, columns, 1 / surface.inverse[mask]))
+        colors.append(image[mask])
+    all_positions, all_colors = np.concatenate(positions), np.concatenate(colors)
+    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(all_positions))[:count])
+    return PointCloud(all_positions[chosen].astype(np.float32), all_colors[chosen])
 
 
 def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
-    """Return what each view shows where its neighbors agree; arguments as of `swept_points`."""
+    """Return the surface that each view shows; arguments as for `swept_points`."""
     small = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
@@ -95,7 +95,7 @@ def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArr
 
 
 def _neighbors(i: int, views: Sequence[View]) -> list[int]:
-    """The views nearest to one, among those that look the same way within 60 degrees."""
+    """Return the nearest views among those whose directions differ by less than 60 degrees."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
     alike = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
     return sorted(alike, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
@@ -104,9 +104,9 @@ def _neighbors(i: int, views: Sequence[View]) -> list[int]:
 def _best_planes(
     i: int, views: Sequence[View], images: Sequence[Floats], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
-    """The plane of each pixel, [H, W], on which the better half of the neighbors differs least from it.
+    """Return the plane of each pixel, [H, W], on which the better half of the neighbors differs least from it.
 
-    0 where no plane stands out: flat colors, and what no neighbor shows.
+    0 where no plane is clearly the best: in uniform areas, and where no neighbor shows the surface.
     """
     view, image = views[i], images[i]
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
@@ -121,14 +121,11 @@ def _best_planes(
             differences.append(cv2.blur(np.minimum(np.abs(warped - image).sum(axis=2), 1), (WINDOW, WINDOW)))
         stacked = np.sort(np.stack(differences), axis=0) if differences else np.ones((1, *image.shape[:2]))
         costs[plane] = stacked[: -(-len(stacked) // 2)].mean(axis=0)
-    return np.where(costs.min(axis=0) < MAX_COST_SHARE * costs.mean(axis=0), costs.argmin(axis=0), 0)
+    return np.where(costs.min(axis=0) < MAX_COST_RATIO * costs.mean(axis=0), costs.argmin(axis=0), 0)
 
 
 def _homography(view: View, other: View, inverse_depth: float) -> Floats:
-    """Pixels of `view` to those of `other` for points on the plane at that depth before `view`, [3, 3].
-
-    OpenCV's pixels have whole centers, hence the halves.
-    """
+    """Return the homography from pixels of `view` to those of `other` for a plane at a depth in `view`, [3, 3]."""
     rotation = other.world_to_camera[:, :3] @ view.world_to_camera[:, :3].T
     translation = other.world_to_camera[:, 3] - rotation @ view.world_to_camera[:, 3]
     plane = rotation + np.outer(translation, [0, 0, inverse_depth])
@@ -137,20 +134,20 @@ def _homography(view: View, other: View, inverse_depth: float) -> Floats:
 
 
 def _calibration(view: View) -> Floats:
-    c = view.camera
+    c = view.camera  # OpenCV has pixel centers at integers, hence the halves
     return np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
 
 
-def _lifted(view: View, rows: Places, columns: Places, depth: Floats) -> Floats:
-    """World points [M, 3] of pixels at a depth."""
+def _unproject(view: View, rows: Places, columns: Places, depth: Floats) -> Floats:
+    """Return the world positions, [M, 3], of pixels at given depths."""
     c = view.camera
     rays = np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(depth))], axis=1)
     points: Floats = (rays * depth[:, None] - view.world_to_camera[:, 3]) @ view.world_to_camera[:, :3]
     return points
 
 
-def _pixels(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Places, Floats]:
-    """Which points [M, 3] lie in a photograph, their rows and columns, and their depths, 1 for those behind it."""
+def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Places, Floats]:
+    """Return which points, [M, 3], project into a view, their rows and columns, and their depths; 1 if behind it."""
     camera, pose = view.camera, view.world_to_camera
     x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
     ahead = z > 0
@@ -164,14 +161,14 @@ def _pixels(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Plac
 def _confirmed(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
-    """Which pixels, [H, W], lie where enough neighbors find a surface too, and not on the first or last plane."""
+    """Return the pixels, [H, W], whose depth enough neighbors confirm, and is not on the first or last plane."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
-    points = _lifted(views[i], rows, columns, 1 / inverse[planes[i].ravel()])
+    points = _unproject(views[i], rows, columns, 1 / inverse[planes[i].ravel()])
     votes = np.zeros(len(points), int)
     for j in near:
-        seen, row, column, depth = _pixels(views[j], points)
-        found = inverse[planes[j][row * seen, column * seen]]
-        votes += seen & (np.abs(found - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
+        seen, row, column, depth = _project(views[j], points)
+        other = inverse[planes[j][row * seen, column * seen]]
+        votes += seen & (np.abs(other - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
     middle = (planes[i] > 0) & (planes[i] < len(inverse) - 1)
     return np.asarray((votes >= MIN_VOTES).reshape(shape) & middle)

@@ -18,7 +18,7 @@ from clsplat.scene.view import Floats
 
 logger = logging.getLogger("clsplat")
 
-MAX_VALUE = 1e15  # of any number in a dataset: the squares of much larger ones overflow float32
+MAX_VALUE = 1e15  # of all numbers in a dataset; squares of much larger ones overflow float32
 BELOW_MAX = f"a number between -{MAX_VALUE:g} and {MAX_VALUE:g}"
 RGB = ("red", "green", "blue")
 TIME = "time"  # of a point, in the unit of the frames' times
@@ -27,47 +27,46 @@ TIMED_POINT = np.dtype([*POINT.descr, (TIME, "<f4")])
 
 
 class PointTable(NamedTuple):
-    """All points of a dataset, invalid ones too."""
+    """All points of a dataset, including invalid ones."""
 
     file: Path
     positions: Floats  # [M, 3]
     rgb: NDArray[Any]  # [M, 3], in 0..255
-    error: Floats = np.empty(0)  # [M], mean reprojection error in pixels, or [0]; COLMAP writes -1 or 0 for unknown
-    ids: NDArray[np.int64] = np.empty(0, np.int64)  # [M], by which images name them, or [0]
-    times: Floats = np.empty(0)  # [M], at which they were seen, in the unit of the frames' times, or [0]
+    error: Floats = np.empty(0)  # [M] mean reprojection error, px, or [0]; COLMAP writes -1 or 0 if unknown
+    ids: NDArray[np.int64] = np.empty(0, np.int64)  # [M] ids that images refer to, or [0]
+    times: Floats = np.empty(0)  # [M] in the unit of the frames' times, or [0]
 
-    def kept(self) -> NDArray[np.bool_]:
+    def is_finite(self) -> NDArray[np.bool_]:
         """Return which points are finite, [M]."""
         finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         return np.asarray(finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else finite)
 
     def cloud(self, clock: Clock | None = None) -> PointCloud:
-        """Return the points that are finite; log the number of the others.
+        """Return the finite points; log the number of the others.
 
-        clock: of the frames; without it the points have no times.  Raises DataError for times of another unit.
+        clock: of the frames; without it, points have no times.  Raises DataError for times in another unit.
         """
-        kept = self.kept()
-        if not kept.all():
-            logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
-        colors = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
-        moments = clock.of_points(self.file, self.times[kept]) if clock and len(self.times) else None
-        times = None if moments is None else np.asarray(moments, np.float32)
-        return PointCloud(self.positions[kept], colors, times)
+        finite = self.is_finite()
+        if not finite.all():
+            logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~finite):,}")
+        colors = np.asarray(self.rgb[finite], np.float32) / np.float32(255)
+        times = None
+        if clock and len(self.times):
+            times = np.asarray(clock.of_points(self.file, self.times[finite]), np.float32)
+        return PointCloud(self.positions[finite], colors, times)
 
 
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
-    """Read x y z and red green blue (uchar) of the vertices of a PLY file, and `time` by a clock as PointTable.cloud.
+    """Read positions, colors and, with a clock, times of the vertices of a PLY file.
 
-    Other properties are ignored.
-
-    Raises DataError when the file is damaged, big-endian, or lacks these properties, and where times are of another
-    unit.
+    The vertices need x y z and uchar red green blue; other properties are ignored.  Raises DataError if the file is
+    damaged, big-endian or lacks these properties, or if times are in another unit.
     """
     return read_ply_table(path).cloud(clock)
 
 
 def read_ply_table(path: Path) -> PointTable:
-    """Return all points of a PLY file; raises as read_points_ply."""
+    """Return all points of a PLY file.  Raises DataError like read_points_ply."""
     data = read_file(path)
     header = parse_ply_header(path, data)
     if header.format == "binary_big_endian":
@@ -82,7 +81,7 @@ def read_ply_table(path: Path) -> PointTable:
 
 
 def write_points_ply(path: Path, points: PointCloud) -> None:
-    """Write points as binary little-endian PLY, with their times where they have some.  Raises OutputError."""
+    """Write points, with times if they have any, as binary little-endian PLY.  Raises OutputError."""
     kind = POINT if points.times is None else TIMED_POINT
     if points.positions.dtype == np.float64:  # world coordinates, which float32 may not hold
         kind = np.dtype([(name, "<f8" if name in "xyz" else kind[name]) for name in kind.names or ()])
@@ -119,7 +118,7 @@ def _read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
     for _ in range(header.lines_before):
         if not body.readline():
             break
-    # A number takes a digit and a blank, but the last blank may be missing.
+    # Each number needs a digit and a space, but the last space may be missing.
     _require(path, header.count, 2 * len(header.dtype.names or ()), len(data) - header.start - body.tell() + 1)
     if header.count == 0:
         return np.empty(0, header.dtype)

@@ -128,7 +128,7 @@ def list_frames(parts: Parts, *names: str) -> None:
         place = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, place) if place else None
         if parts.points and clock and len(parts.points.times):
-            parts.attempt(clock.of_points, place, parts.points.times[parts.points.kept()])
+            parts.attempt(clock.of_points, place, parts.points.times[parts.points.is_finite()])
 
 
 def view_name(file_path: str) -> str:

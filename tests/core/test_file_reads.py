@@ -132,7 +132,7 @@ def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeyp
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()
         os.mkfifo(tmp_path / "decoded" / f"opencv-{identity.cv2.__version__}.txt")
-        assert identity.Memory()._known == {}
+        assert identity.DecodedSizes()._known == {}
 
 
 def test_a_pipeline_that_is_no_text_is_not_copied(tmp_path):

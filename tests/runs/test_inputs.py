@@ -280,11 +280,11 @@ def test_every_change_is_named(scene, tmp_path):
     assert said(with_view(9, mask_path=other)) == f"the mask of 1 view ({opened.views[9].name})"
     assert said(with_view(1, world_to_camera=pose)) == f"the camera of 1 view ({opened.views[1].name})"
     assert said(with_view(1, camera=replace(train[1].camera, cx=3.0))) == f"the camera of 1 view ({train[1].name})"
-    assert said(replace(opened, train=opened.train[:-1])) == f"1 view ({train[-1].name}), gone"
+    assert said(replace(opened, train=opened.train[:-1])) == f"1 view ({train[-1].name}), removed"
     assert said(replace(opened, train=(*opened.train, opened.test[0]), test=opened.test[1:])) == (
         f"the split of 1 view ({test[0].name})"
     )
-    assert said(with_view(0, name="fresh")) == f"1 view ({train[0].name}), gone, 1 view (fresh), new"
+    assert said(with_view(0, name="fresh")) == f"1 view ({train[0].name}), removed, 1 view (fresh), added"
     assert opened.points is not None
     assert (
         said(replace(opened, points=PointCloud(opened.points.positions[1:], opened.points.colors[1:]))) == "the points"

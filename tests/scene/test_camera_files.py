@@ -256,8 +256,8 @@ def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_
     ]
     for name, one in (("a", scene), ("b", replace_cameras(scene, learned))):
         clsplat.write_cameras(one, tmp_path / name, "colmap", images="copy")
-    places = [[image.places for image in read_images(tmp_path / name / "sparse/0")] for name in "ab"]
-    np.testing.assert_allclose(places[1], places[0], atol=1e-9)
+    pixels = [[image.pixels for image in read_images(tmp_path / name / "sparse/0")] for name in "ab"]
+    np.testing.assert_allclose(pixels[1], pixels[0], atol=1e-9)
     (one, *_), found = scene.views, clsplat.read_scene(tmp_path / "b").tracks
     assert np.abs(found.residuals[one.name] - scene.tracks.residuals[one.name]).max() > 1, "px"
 

@@ -71,7 +71,7 @@ def test_they_do_not_replace_those_of_the_dataset(tmp_path):
     scene = write(tmp_path / "scene", tiny_model())
     masks_of(scene, scene / "masks")
     told = refusal(applied, scene, masks_of(scene, tmp_path / "elsewhere"))
-    assert told.startswith(f"{scene}: has masks of its own, such as {scene / 'masks'}")
+    assert told.startswith(f"{scene}: the dataset already has masks, such as {scene / 'masks'}")
     assert "leave scene.masks out" in told
 
 
@@ -94,7 +94,10 @@ def test_a_photograph_without_a_mask_counts_whole_and_is_named(tiny_scene, tmp_p
     first = read_scene(tiny_scene).views[0].name
     (masks / first).with_suffix(".png").unlink()
     assert load_mask(applied(tiny_scene, masks).views[0]) is None
-    assert f"{masks}: has masks of 9 of 10 photographs; the others count whole, such as {first}" in caplog.text
+    assert (
+        f"{masks}: contains masks for 9 of 10 photographs; all pixels of the others are used, such as {first}"
+        in caplog.text
+    )
 
 
 def test_a_folder_without_masks_of_these_photographs_is_refused(tiny_scene, tmp_path):
@@ -103,7 +106,7 @@ def test_a_folder_without_masks_of_these_photographs_is_refused(tiny_scene, tmp_
     assert told.startswith(f"{tmp_path / 'nowhere'}: no such folder; expected ")
     store(tmp_path / "others" / "x.png", np.zeros((40, 40), np.uint8))
     told = refusal(applied, tiny_scene, tmp_path / "others")
-    assert f"holds no mask of a photograph of {tiny_scene}; expected " in told
+    assert f"contains no mask for the photographs of {tiny_scene}; expected " in told
     assert str((tmp_path / "others" / first).with_suffix(".png")) in told
     assert "give another folder as scene.masks" in told
 

@@ -231,10 +231,10 @@ def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
 @pytest.mark.parametrize(
     ("counts", "posed", "message"),
     [
-        ({"a": 3, "b": 2}, (), "b has 2 frames, a has 3; expected the same moments of every camera"),
-        ({"a": 1, "b": 1}, (), "has one frame a camera; expected two moments"),
+        ({"a": 3, "b": 2}, (), "b has 2 frames, a has 3; expected the same number of frames from every camera"),
+        ({"a": 1, "b": 1}, (), "has one frame per camera; expected two"),
         ({"a": 2, "b": 2}, ("a",), "1 of 2 cameras have no pose: b"),
-        ({"a": 2}, ("a", "x/a"), "images/a.png and images/x/a.png are both of the camera a"),
+        ({"a": 2}, ("a", "x/a"), "images/a.png and images/x/a.png are both poses of camera a"),
         ({"a": 0}, ("a",), "has no folders of frames"),
         ({"a": 2, "b": 0}, (), "1 of 2 cameras have no frames: b"),
     ],

@@ -99,7 +99,7 @@ def before_a_sky(view):
 
 
 def swept(table, shown):
-    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, shown=shown)
+    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, allowed=shown)
 
 
 def test_pixels_lie_at_exact_depths(table):
@@ -152,7 +152,7 @@ def test_what_the_scene_lacks_is_added(rng):
     center, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
     alone = swept_points(views, center, load, 10**6, 0).positions
     left = alone[alone[:, 0] < 0].astype(np.float64)
-    new = swept_points(views, center, load, 10**6, 0, beside=left).positions
+    new = swept_points(views, center, load, 10**6, 0, existing=left).positions
     assert len(new) < 0.6 * len(alone)
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
