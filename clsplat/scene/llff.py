@@ -85,7 +85,7 @@ def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
     scale = header.width / width if width > 0 else 0.0
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and focal * scale >= MIN_FOCAL):
         raise DataError(
-            f"{path}: {image.name} has a camera of {width:g} x {height:g} px with focal length {focal:g}; export it again"
+            f"{path}: {image.name}: invalid camera, {width:g} x {height:g} px, focal length {focal:g}; export it again"
         )
     if abs(header.height - height * scale) > 1.5:  # a resized image is rounded to whole pixels
         raise DataError(

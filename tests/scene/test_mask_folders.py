@@ -72,7 +72,7 @@ def test_they_do_not_replace_those_of_the_dataset(tmp_path):
     masks_of(scene, scene / "masks")
     told = refusal(applied, scene, masks_of(scene, tmp_path / "elsewhere"))
     assert told.startswith(f"{scene}: the dataset already has masks, such as {scene / 'masks'}")
-    assert "leave scene.masks out" in told
+    assert "remove scene.masks" in told
 
 
 def test_the_folder_is_found_from_elsewhere(tiny_scene, tmp_path, monkeypatch):
@@ -108,7 +108,7 @@ def test_a_folder_without_masks_of_these_photographs_is_refused(tiny_scene, tmp_
     told = refusal(applied, tiny_scene, tmp_path / "others")
     assert f"contains no mask for the photographs of {tiny_scene}; expected " in told
     assert str((tmp_path / "others" / first).with_suffix(".png")) in told
-    assert "give another folder as scene.masks" in told
+    assert "set scene.masks to another folder" in told
 
 
 def test_a_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp_path):
