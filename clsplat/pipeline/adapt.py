@@ -73,10 +73,13 @@ class Photos(Adaptation):
         few = measures.photographs < FEW
         count = pluralize(measures.photographs, "training photo")
         has_alpha = measures.scene is not None and is_transparent(measures.scene)
+        lacks_points = measures.scene is not None and measures.scene.points is None
 
         why = "the hull of few silhouettes is too large, so points start at random"
         why = f"{count}: {why if few else 'points start in the hull of the silhouettes'}"
-        yield Decision(key="init.transparent", value="random" if few else "hull", reason=why, matters=has_alpha)
+        yield Decision(
+            key="init.transparent", value="random" if few else "hull", reason=why, matters=has_alpha and lacks_points
+        )
         yield Decision(key="init.count", value=100_000 if few else 60_000, reason=why, matters=False)
 
         dropout = {"probability": [[0, 0.0], [DROPOUT_UNTIL * training.steps // STEPS, 0.2]]} if few else None

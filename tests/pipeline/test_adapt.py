@@ -171,4 +171,5 @@ def test_a_run_looks_for_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, 
 def test_transparent_photos_have_reasons_of_their_own(tiny_scene, tmp_path):
     text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
     assert "8 training photos: at most 0.6 Gaussians per pixel" in text
-    assert "the hull of few silhouettes is too large" in text
+    assert "random colors behind transparent pixels" in text
+    assert "silhouettes" not in text, "the dataset has points"

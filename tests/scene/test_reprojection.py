@@ -134,7 +134,7 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
 )
 def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
     folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
-    caplog.set_level("INFO", "clsplat")
+    caplog.set_level("DEBUG", "clsplat")
     asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
     describe(asked, RunState.read(tmp_path / "run"), None, "new")
     assert f"model.background: off, since {reason}" in caplog.text

@@ -130,7 +130,8 @@ class Appearance(TrainingModule):
         return self._choose("off", f"{exposures.text}; not more than {missed}")
 
     def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
-        LOG.info("optimize.modules.%s: %s, since %s", self.type, chosen, reason)
+        level = logging.INFO if chosen == "on" else logging.DEBUG  # off changes nothing
+        LOG.log(level, "optimize.modules.%s: %s, since %s", self.type, chosen, reason)
         return self.model_copy(update={"chosen": chosen, "reason": reason})
 
     @classmethod

@@ -44,7 +44,7 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
     if not isinstance(background, Auto) or background.chosen is not None:
         return settings
     chosen, reason = ("off", conflict) if conflict else _choice(background, run)
-    LOG.info("model.background: %s, since %s", chosen, reason)
+    LOG.log(logging.INFO if chosen == "on" else logging.DEBUG, "model.background: %s, since %s", chosen, reason)
     decided = background.model_copy(update={"chosen": chosen, "reason": reason})
     return settings.model_copy(update={"background": decided})
 
