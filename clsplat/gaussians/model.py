@@ -1,4 +1,4 @@
-"""A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
+"""Define a model on the host: NumPy arrays in the units of model files, and the numbers for rendering."""
 
 import logging
 from collections.abc import Mapping
@@ -42,24 +42,24 @@ from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.scene import far_origin, position_text
 
-# The numbers with which a model is rendered, as its file says them.
+# The numbers for rendering a model, as stored in its file.
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """The numbers with which a model is rendered."""
+    """The numbers for rendering a model."""
 
-    near: float = NEAR  # scene units; nearer Gaussians are not drawn
+    near: float = NEAR  # scene units; nearer Gaussians are not rendered
     screen_variance: float = VARIANCE  # px², added to every splat
-    compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
-    background: Literal["black", "white"] | None = None  # None: what the scene says
-    alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
-    notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
-    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; screen_variance is for viewers
+    compensate: float = 0.0  # 1: opacities are reduced to conserve energy under that variance
+    background: Literal["black", "white"] | None = None  # None: the background of the scene
+    alpha: Literal["transparency", "mask"] = "transparency"  # meaning of the alpha channel of its photos
+    notes: Mapping[str, Any] = field(default_factory=dict)  # other values in the file
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box; screen_variance is then for viewers
 
     @classmethod
     def from_comment(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
-        """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
+        """Read the numbers from a file's comment; the defaults are those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate", "pixel_box")
         given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
@@ -71,23 +71,23 @@ class Rendering:
         )
 
     def comment(self) -> dict[str, Any]:
-        """What a model file says about rendering."""
+        """Return the values for a model file's comment."""
         numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
         known: dict[str, Any] = {"background": self.background} if self.background else {}
-        if self.pixel_box or "pixel_box" in self.notes:  # files of other models stay as they are
+        if self.pixel_box or "pixel_box" in self.notes:  # leaves files of other models unchanged
             known["pixel_box"] = self.pixel_box
         return {**self.notes, **numbers, **known, "alpha": self.alpha}
 
 
-# Where a run folder, or another path, has its model.
+# Paths of models.
 
-MODEL = "point_cloud.ply"  # of a run that does not name its own
+MODEL = "point_cloud.ply"  # default in a run folder
 
 
 def model_path(path: Path) -> Path:
-    """Return the model file that a path names: of a folder of SOG its meta.json, of a run folder its model."""
-    place = model_file(path)
-    return run_model(place) if place.is_dir() else place
+    """Return the model file of a path: for a SOG folder its meta.json, for a run folder its model."""
+    file = model_file(path)
+    return run_model(file) if file.is_dir() else file
 
 
 def run_model(folder: Path) -> Path:
@@ -96,37 +96,36 @@ def run_model(folder: Path) -> Path:
 
 
 def run_output(folder: Path, stage: str, default: str) -> Path:
-    """Return the file of the last stage of a name, as metrics.json of a run folder has it, else the default one."""
+    """Return the output of the last stage with this name, from a run's metrics.json, or the default file."""
     try:
         name = read_json(folder / METRICS)["files"][stage]
-    except (DataError, KeyError, TypeError):  # not finished
+    except (DataError, KeyError, TypeError):  # the run has not finished
         name = default
     return folder / (name if isinstance(name, str) and is_inside(name) else default)
 
 
 def raw_model(file: Path) -> Path:
-    """Return the PLY beside a model of a run that holds its world filter apart, where there is one, else the model."""
+    """Return the PLY with the separate world filter next to a run's model if it exists, else the model."""
     raw = file.with_name(f"{file.stem}_raw.ply")
     return raw if raw.is_file() else file
 
 
 Floats = NDArray[np.float32]
-WIDTHS = {  # of the tables
+WIDTHS = {  # allowed numbers of columns
     **{"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacity": (1,), "sh_base": (3,)},
     "sh_rest": tuple(3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)),
     "filter_variance": (1,),
     columns.MOTION: tuple(columns.WIDTHS),
 }
-NUMBERS = Rendering()  # of a model that says none
-MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
+NUMBERS = Rendering()  # the defaults
+MIN_LOGIT = -80.0  # of an opacity that the filter reduces to nothing; smallest value that kernels handle
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have.
+    """N Gaussians before activation, float32, with the same names as in pipelines, kernels, and checkpoints.
 
-    The arrays are copies of those that are given.
-    Raises ValueError, with the name of the table, where shapes do not fit.
+    The arrays are copied.  Raises ValueError, with the name of the table, if shapes do not match.
     """
 
     means: Floats  # [N, 3] scene units
@@ -135,12 +134,10 @@ class Model:
     logit_opacity: Floats  # [N, 1]
     sh_base: Floats  # [N, 3] band 0
     sh_rest: Floats  # [N, (K-1)*3] the other bands, coefficient-major
-    filter_variance: Floats | None = (
-        None  # [N, 1] scene units², the world filter where it is not yet part of the scales
-    )
+    filter_variance: Floats | None = None  # [N, 1] scene units², a world filter that is not baked into the scales
     rendering: Rendering = NUMBERS
-    sky: Sky | None = None  # behind the Gaussians, in place of a background of one color
-    motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/splats.py
+    sky: Sky | None = None  # behind the Gaussians, instead of a background color
+    motion: Floats | None = None  # [N, 5 or more] of moving Gaussians, see clsplat/formats/splats.py
     origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of the zero
 
     def __post_init__(self) -> None:
@@ -157,7 +154,7 @@ class Model:
         return len(self.means)
 
     def upload(self, device: Device) -> DeviceModel:
-        """Copy the model to a device, for the rasterizer."""
+        """Copy the model to a device for rendering."""
         numbers = self.rendering
         gaussians = Gaussians(device, self.tables())
         screen = numbers.screen_variance, numbers.compensate, numbers.pixel_box
@@ -165,17 +162,17 @@ class Model:
         return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen, sky=sky)
 
     def tables(self) -> dict[str, Floats]:
-        """The arrays by name; filter_variance and motion where there is one."""
+        """Return the arrays by name, including filter_variance and motion if present."""
         tables = {name: getattr(self, name) for name in (*PARAMETERS, "filter_variance", columns.MOTION)}
         return {name: table for name, table in tables.items() if table is not None}
 
     def at(self, time: float) -> "Model":
-        """Return the static model of a moment, from 0 to 1: the Gaussians that are there; a static one as it is.
+        """Return the static model at a time from 0 to 1, with the Gaussians visible then; a static model is unchanged.
 
-        Raises ValueError for another time, DataError where some are at no finite place then.
+        Raises ValueError for other times, and DataError if some positions are not finite.
         """
         if not 0 <= time <= 1:
-            raise ValueError(f"the time is {time:g}; expected one from 0, the first moment, to 1, the last")
+            raise ValueError(f"time is {time:g}; expected a number from 0 (start) to 1 (end)")
         if self.motion is None:
             return self
         tables: dict[str, Any] = dict(at_time(self.tables(), time))
@@ -188,7 +185,7 @@ class Model:
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of the spherical harmonics."""
+        """The SH degree."""
         return sh_degree_of(self.sh_rest.shape[1])
 
     @property
@@ -203,18 +200,18 @@ class Model:
 
     @property
     def colors(self) -> Floats:
-        """Colors of band 0, [N, 3]; in [0, 1] where they can be shown."""
+        """Colors of band 0, [N, 3]; values in [0, 1] can be displayed."""
         return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
 
     def __getitem__(self, chosen: Any) -> "Model":
-        """Return some of the Gaussians, by a mask [N], an array of indices, a slice, or one index."""
+        """Select Gaussians by a mask [N], an array of indices, a slice, or one index."""
         tables: dict[str, Any] = {name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()}
         return replace(self, **tables)
 
     def transformed(
         self, scale: float = 1.0, rotation: NDArray[np.floating] | None = None, translation: Any = (0, 0, 0)
     ) -> "Model":
-        """Return the model after x -> scale · rotation x + translation; colors turn with it.
+        """Return the model after x -> scale · rotation x + translation; view-dependent colors rotate with it.
 
         rotation: [3, 3]; translation: [3] scene units.  An origin moves in place of the means' zero.  Raises ValueError
         for a matrix that is not a rotation, and where the result is more than a model file holds.
@@ -243,7 +240,7 @@ class Model:
             tables = {name: table.astype(np.float32) for name, table in changed.items()}
         near = self.rendering.near * scale
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
-            raise ValueError("expected a smaller scale and translation: no model file holds so large numbers")
+            raise ValueError("use a smaller scale and translation; such numbers do not fit in a model file")
         sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
         return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky, origin=origin)
 
@@ -262,9 +259,9 @@ class Model:
         return replace(self, means=self.means + shift, origin=origin) if shift.any() else self
 
     def baked(self) -> "Model":
-        """Return the model with the world filter as part of its scales and opacities (Yu et al. 2024, eq. 9).
+        """Return the model with the world filter baked into scales and opacities (Yu et al. 2024, eq. 9).
 
-        So it looks the same in viewers that know no such filter.
+        It then looks the same in viewers without that filter.
         """
         if self.filter_variance is None:
             return self
@@ -279,7 +276,7 @@ class Model:
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
     def save(self, path: str | Path, options: Writing | None = None) -> str:
-        """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
+        """Write a file in the format of its name: .ply, .spz, .sog, .glb, and others (docs/formats.md).
 
         A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.  A
         sky is written beside it, as NAME_sky.json, which names the SHA-256 of the file: no other model takes it.
@@ -312,7 +309,7 @@ class Model:
         return replace(local, parameters={**local.parameters, "means": means})
 
     def to_splat_file(self) -> SplatFile:
-        """Return what a model file holds, with the arrays of the model."""
+        """Return the content of a model file; arrays are shared, not copied."""
         origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
         mode = "mip" if self.rendering.compensate else "default"
         return SplatFile(self.tables(), {**self.rendering.comment(), **origin}, mode)
@@ -381,7 +378,5 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
         try:
             model = model.transformed(scale, turn, shift)
         except ValueError as error:
-            raise DataError(
-                f"{path}: a node stretches or mirrors its Gaussians, or moves them too far: {error}"
-            ) from error
+            raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
     return replace(model, origin=origin) if origin.any() else model

@@ -1,4 +1,4 @@
-"""The colors behind the Gaussians by direction: a map on the host, on the device, and in a file beside a model's."""
+"""Store a sky: colors by direction behind the Gaussians, on the host, on the device, and in a file next to a model."""
 
 import json
 import logging
@@ -14,19 +14,19 @@ from clsplat.core.files import write_error, write_text
 from clsplat.core.reading import read_json, sha256
 from clsplat.opencl.device import Array, Device
 
-# The octahedral map: all directions in a square (Meyer et al. 2010), as cl_kernels/sky.cl describes it.
+# The octahedral map of all directions to a square (Meyer et al. 2010), as in cl_kernels/sky.cl.
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
 def signs(directions: NDArray[np.floating]) -> Floats:
-    """Return -1 for components below 0 and else 1, [..., 3]."""
+    """Return -1 for negative components and 1 for others, [..., 3]."""
     return np.where(directions < 0, -1.0, 1.0)
 
 
 def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
-    """Return where directions, [..., 3] of any length, lie between the centers of texels, [..., 2] from -0.5 on."""
+    """Map directions, [..., 3], to texel coordinates, [..., 2] from -0.5; texel centers are whole numbers."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
     below = np.minimum(directions[..., 2:], 0)
@@ -36,18 +36,20 @@ def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
 
 
 def texel_directions(side: int) -> Floats:
-    """Return the directions of the centers of all texels, unit vectors, [side * side, 3], row by row."""
+    """Return the unit directions of all texel centers, [side * side, 3], row by row."""
     centers = (2 * np.arange(side) + 1) / side - 1
     v, u = (axis.ravel() for axis in np.meshgrid(centers, centers, indexing="ij"))
     z = 1 - np.abs(u) - np.abs(v)
     fold = np.maximum(-z, 0)
-    found = np.stack([u - np.where(u < 0, -fold, fold), v - np.where(v < 0, -fold, fold), z], axis=1)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True), np.float64)
+    vectors = np.stack([u - np.where(u < 0, -fold, fold), v - np.where(v < 0, -fold, fold), z], axis=1)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float64)
 
 
 def texel_at(i: Integers, j: Integers, side: int) -> Integers:
-    """Return the numbers of texels in columns i and rows j, from -1 to `side`: beyond an edge the square goes on at the
-    mirrored place of the same edge."""
+    """Return the indices of texels in columns i and rows j, from -1 to `side`.
+
+    Beyond an edge, the map continues at the mirrored position of the same edge.
+    """
     beyond = (i < 0) | (i >= side)
     i, j = np.clip(i, 0, side - 1), np.where(beyond, side - 1 - j, j)
     beyond = (j < 0) | (j >= side)
@@ -56,18 +58,18 @@ def texel_at(i: Integers, j: Integers, side: int) -> Integers:
 
 
 def neighbor_texels(side: int) -> Integers:
-    """Return the texels about each texel and itself, [side * side, 9]."""
+    """Return each texel's 3x3 neighborhood, [side * side, 9]."""
     j, i = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     return np.stack([texel_at(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
 
 
 def bilinear_texels(i: Integers, j: Integers, side: int) -> Integers:
-    """Return the four texels about places whose integer parts are i and j, from -1 to side - 1, [..., 4]."""
+    """Return the four texels around coordinates with integer parts i and j, from -1 to side - 1, [..., 4]."""
     return np.stack([texel_at(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
 
 
 def bilinear_weights(fractions: Floats) -> Floats:
-    """Return the bilinear weights of the four texels, [..., 4], of the fractional parts of places, [..., 2]."""
+    """Return the bilinear weights of the four texels, [..., 4], for fractional parts [..., 2]."""
     a, b = fractions[..., 0], fractions[..., 1]
     return np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=-1)
 
@@ -111,19 +113,19 @@ class Sky:
 
     @property
     def side(self) -> int:
-        """Texels in a row."""
+        """The number of texels in a row."""
         return int(np.sqrt(len(self.texels)))
 
     def upload(self, device: Device) -> DeviceSky:
-        """Copy it to a device."""
+        """Copy the sky to a device."""
         return DeviceSky(device.upload(np.ascontiguousarray(self.texels.T)), self.side)
 
     def rotated(self, rotation: NDArray[np.floating]) -> "Sky":
-        """Return the map of a scene that is turned by x -> rotation x, [3, 3]; colors between texels are bilinear."""
+        """Return the sky of a scene after x -> rotation x, [3, 3], with bilinear interpolation."""
         return Sky(sample_texels(self.texels, texel_directions(self.side) @ rotation).astype(np.float32))
 
     def write(self, path: Path, models: Mapping[str, str]) -> None:
-        """Write it as JSON, with the SHA-256 of the model files that it belongs to, by name; numbers keep their bits.
+        """Write the sky as JSON, with exact numbers and the SHA-256 of its model files by name.
 
         Raises OutputError.
         """
@@ -134,21 +136,21 @@ class Sky:
 
 
 def sky_path(model: Path) -> Path:
-    """Return the file that holds the sky of a model file, where it has one; of one as it was trained, `_raw`, too."""
+    """Return the path of the sky of a model file, also of a `_raw` model."""
     return model.with_name(f"{model.stem.removesuffix('_raw')}_sky.json")
 
 
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
-    """Write the sky of a model file, of that SHA-256, beside it; without a sky, let none that is there belong to it.
+    """Write the sky of a model file with this SHA-256 next to it; without a sky, remove the model from an existing one.
 
-    Other model files of the same stem stay with a sky that is the same.  Raises OutputError.
+    Other models of the same stem keep an identical sky.  Raises OutputError.
     """
     path = sky_path(model)
     try:
         before, models = _read(path) if path.is_file() else (None, {})
-    except DataError:  # which belongs to no model
+    except DataError:  # a damaged sky belongs to no model
         before, models = None, {}
-    others = {name: one for name, one in models.items() if name != model.name and (sky or one != digest)}
+    others = {name: known for name, known in models.items() if name != model.name and (sky or known != digest)}
     if sky:
         same = before is not None and np.array_equal(before.texels, sky.texels)
         sky.write(path, {**(others if same else {}), model.name: digest})
@@ -162,20 +164,20 @@ def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
 
 
 def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
-    """Return the sky of a model file; None without one, with a warning where one is expected or is of another model.
+    """Return the sky of a model file, or None; warn if it is missing but expected, or belongs to another model.
 
-    Raises DataError where its file is damaged.
+    Raises DataError if its file is damaged.
     """
     path = sky_path(model)
     if not path.is_file():
         if expected:
-            LOG.warning("%s: was trained with a sky, which is drawn where %s lies beside it", model, path.name)
+            LOG.warning("%s: was trained with a sky; put %s next to it to render the sky", model, path.name)
         return None
     sky, models = _read(path)
     if sha256(model) in models.values():
         return sky
     LOG.warning(
-        "%s: is the sky of another model than %s, or of one that was changed since; it is not drawn: copy or export "
+        "%s: the sky belongs to another model than %s, or the model has changed; it is not rendered; copy or export "
         "the model and its sky again",
         *(path, model.name),
     )
@@ -183,7 +185,7 @@ def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
 
 
 def _read(path: Path) -> tuple[Sky, dict[str, str]]:
-    """The sky in a file, and the SHA-256 of the models that it belongs to, by name.  Raises DataError."""
+    """Read a sky and the SHA-256 of its models by name.  Raises DataError."""
     data = read_json(path, "the sky of a model")
     side, texels, models = (data.get(key) if isinstance(data, dict) else None for key in ("side", "texels", "models"))
     if isinstance(side, bool) or not isinstance(side, int) or not SIDES[0] <= side <= SIDES[1]:
@@ -194,5 +196,5 @@ def _read(path: Path) -> tuple[Sky, dict[str, str]]:
         array = np.zeros(0, np.float32)
     if array.shape != (side * side, 3) or not np.isfinite(array).all():
         raise DataError(f"{path}: expected {side * side} texels of three finite numbers; export the model again")
-    known = models.items() if isinstance(models, dict) else ()
-    return Sky(array), {name: one for name, one in known if isinstance(one, str)}
+    items = models.items() if isinstance(models, dict) else ()
+    return Sky(array), {name: digest for name, digest in items if isinstance(digest, str)}

@@ -1,4 +1,4 @@
-"""The pipeline of a block, and that of the merged model: parts of one file, with other settings."""
+"""Derive the pipelines of blocks, of the merged model, and of the coarse model from one pipeline."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -21,45 +21,45 @@ from clsplat.workflows.partition import Block
 
 
 def require_divisible(pipeline: Pipeline) -> None:
-    """Raise ConfigError for a pipeline whose blocks would not fit together, or that does not start from a model."""
+    """Raise ConfigError if the blocks of a pipeline would not match, or if it does not start from a model."""
     settings, first = pipeline.settings, pipeline.stages[0]
     trainings = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
     faults = {
-        "prepare": (settings.prepare, "run it first, and give the folder of that run as --scene"),
-        "adapt": (settings.adapt, "each block would decide by its own photographs; write the settings out"),
-        "model.time": (settings.model.time, "a cell holds Gaussians at their own time, not at all times; leave it out"),
+        "prepare": (settings.prepare, "run it first and give its run folder as --scene"),
+        "adapt": (settings.adapt, "each block would decide by its own photos; write the settings explicitly"),
+        "model.time": (settings.model.time, "moving Gaussians leave their cells; leave it out"),
         "model.background": (settings.model.background, "each block would learn its own sky; leave it out"),
-        "scene.levels": (settings.scene.levels > 1, "a block has views of one size; set it to 1"),
+        "scene.levels": (settings.scene.levels > 1, "a block uses views of one size; set it to 1"),
         "scene.train": (settings.scene.train, "blocks choose their views; leave it out"),
-        "scene.validation": (settings.scene.validation != 0, "a block has no views to choose by; set it to 0"),
-        "scene.extent": (settings.scene.extent, "blocks have that of the whole scene; leave it out"),
+        "scene.validation": (settings.scene.validation != 0, "a block has no validation views; set it to 0"),
+        "scene.extent": (settings.scene.extent, "blocks use the extent of the whole scene; leave it out"),
         "optimize.modules": (
-            any("blocks" in one.conflicts for stage in trainings for one in stage.modules),
-            "some would differ from block to block; leave them out",
+            any("blocks" in module.conflicts for stage in trainings for module in stage.modules),
+            "some modules would differ between blocks; leave them out",
         ),
         "densify.budget": (
-            any(getattr(one.budget, "gaussians", None) for one in _densities(pipeline.stages)),
-            "it counts the Gaussians of the whole; give densify.max_gaussians, which blocks share",
+            any(getattr(stage.budget, "gaussians", None) for stage in _densities(pipeline.stages)),
+            "it counts all Gaussians; use densify.max_gaussians, which is split between blocks",
         ),
         "densify.per_pixel": (
-            any(one.per_pixel for one in _densities(pipeline.stages)),
-            "photographs of blocks differ; give densify.max_gaussians, which blocks share",
+            any(stage.per_pixel for stage in _densities(pipeline.stages)),
+            "blocks have different photos; use densify.max_gaussians, which is split between blocks",
         ),
-        "densify.inside": (any(one.inside for one in _densities(pipeline.stages)), "blocks set it; leave it out"),
+        "densify.inside": (any(stage.inside for stage in _densities(pipeline.stages)), "blocks set it; leave it out"),
     }
     for key, (is_set, remedy) in faults.items():
         if is_set:
-            raise ConfigError(f"{pipeline.path}: {key} is not for blocks: {remedy}")
+            raise ConfigError(f"{pipeline.path}: {key} cannot be used with blocks: {remedy}")
     if not (isinstance(first, Init) and first.source == "model" and trainings):
-        raise ConfigError(f"{pipeline.path}: expected `init: {{source: model}}` first, and a stage 'optimize'")
+        raise ConfigError(f"{pipeline.path}: start with `init: {{source: model}}`, and add a stage 'optimize'")
 
 
 def block_pipeline(
     pipeline: Pipeline, block: Block, start: Path, extent: float, share: Fraction = Fraction(1)
 ) -> Pipeline:
-    """Return the training of a block from its first Gaussians, up to its model, cropped to its cell.
+    """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: of the whole scene; share: of the pipeline's steps that are trained, with the rates of `_shared`.
+    extent: of the whole scene; share: fraction of the pipeline's steps to train, with the rates of `_shared`.
     """
     data, last, cell = pipeline.resolved(), _last(pipeline), block.box.model_dump()
     stages = [_growing(stage, block) for stage in _starting(data["stages"][:last], start)]
@@ -67,41 +67,40 @@ def block_pipeline(
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
     changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
     changed["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
-    found = checked(pipeline.path, Document(changed))
-    return found if share == 1 else replace(found, settings=_shared(found.settings, share))
+    block_file = checked(pipeline.path, Document(changed))
+    return block_file if share == 1 else replace(block_file, settings=_shared(block_file.settings, share))
 
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
-    """Return what comes after the training, for the merged model: it is measured, exported, shown."""
+    """Return the stages after training, for the merged model: evaluation, export, and reports."""
     data, last = pipeline.resolved(), _last(pipeline)
     stages = [*_starting(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
     return checked(pipeline.path, Document({**data, "stages": stages}))
 
 
 def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
-    """Return the pipeline of the coarse model with the photographs, filters and seed of that of the blocks."""
+    """Return the pipeline of the coarse model with the scene, filters, and seed of the block pipeline."""
     data = pipeline.resolved()
     same = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
     return checked(coarse.path, Document({**coarse.resolved(), **same}))
 
 
 def without_start(pipeline: Pipeline) -> Pipeline:
-    """Return the pipeline without the file of its first model."""
+    """Return the pipeline without the path of its initial model."""
     first, *others = pipeline.stages
     stages = [first.model_copy(update={"file": None}), *others]
     return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
 
 
 def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
-    """Settings with a share of the steps, and rates that are larger as its root is smaller.
+    """Return settings with a fraction of the steps, and learning rates divided by its square root.
 
-    Adam divides by the root of the mean square of gradients over steps.  Where a share p of the views show a
-    Gaussian, it has gradients in that share of the steps, and each moves it as 1 / √p.  In a block p is larger by
-    1 / share.
+    Adam divides gradients by their RMS over steps.  A Gaussian seen in a fraction p of the views has gradients in that
+    fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is larger by 1 / share.
     """
 
     def changed(training: Optimize) -> Optimize:
-        if training.update != "all":  # rows that are not seen keep their moments
+        if training.update != "all":  # rows outside the view keep their moments
             return training
         return training.model_copy(update={"rates": training.rates.times(float(share) ** -0.5)})
 
@@ -109,23 +108,23 @@ def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
 
 
 def _last(pipeline: Pipeline) -> int:
-    """The number of stages up to the last that changes the model."""
+    """Return the number of stages up to the last one that changes the model."""
     return max(i for i, stage in enumerate(pipeline.stages, 1) if stage.edits or isinstance(stage, Optimize))
 
 
 def _densities(stages: Iterable[Stage]) -> Iterator[Densify]:
     for stage in stages:
-        yield from (one for one in (stage, *getattr(stage, "during", ())) if isinstance(one, Densify))
+        yield from (inner for inner in (stage, *getattr(stage, "during", ())) if isinstance(inner, Densify))
 
 
 def _starting(stages: list[Any], file: Path) -> list[Any]:
-    """Stages of a resolved file whose first, `init`, reads this model."""
+    """Return stages of a resolved file with this model as the input of `init`."""
     first, *others = stages
     return [{"init": {**first["init"], "file": str(file.resolve())}}, *others]
 
 
 def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
-    """A stage of a resolved file that lets Gaussians grow in a block alone, up to its part of their number."""
+    """Return a stage of a resolved file with densification limited to a block and its share of Gaussians."""
     ((name, fields),) = stage.items()
     if name == "densify":
         limited = _limited(Densify.model_validate(fields), block).model_dump(mode="json")
@@ -136,11 +135,10 @@ def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 
 def _limited(densify: Densify, block: Block) -> Densify:
-    """The stage in a block: Gaussians grow in its cell, up to its share, by pairs, of the number of the whole."""
+    """Limit a densify stage to the cell of a block and its share, by pairs, of the number of Gaussians."""
     changed: dict[str, Any] = {"inside": block.growth}
     if densify.max_gaussians is not None:
         changed["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
         if min(schedule_values(changed["max_gaussians"])) < 1:
-            told = f"densify.max_gaussians: {block.name} has none of so few Gaussians"
-            raise ConfigError(f"{told}; expected more of them, or fewer --blocks")
+            raise ConfigError(f"densify.max_gaussians: {block.name} gets no Gaussians; raise it, or use fewer --blocks")
     return densify.model_copy(update=changed)

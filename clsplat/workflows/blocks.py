@@ -1,4 +1,4 @@
-"""A scene trained in blocks by one command: a coarse model, its partition, runs of blocks, the merged model."""
+"""Train a scene in blocks: a coarse model, its partition, runs of blocks, and the merged model."""
 
 import hashlib
 import json
@@ -59,26 +59,26 @@ from clsplat.workflows.finetune import claim_folder, is_trained, train_in_folder
 from clsplat.workflows.folder import COARSE, MERGED, RECORD
 from clsplat.workflows.partition import SIGHT, Block, Partition, Partitioner
 
-# How long the training of each block takes, roughly.
+# Estimates of the training time of blocks.
 
 
 def block_seconds(
     blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], units: int
 ) -> dict[str, list[float]]:
-    """Return the time of the training of each block, s: at least, with the Gaussians of its start, and at most.
+    """Return the minimum and maximum training time of each block, s, for its first and its most Gaussians.
 
-    pipelines: by the names of blocks; size: of a photograph, px; units: compute units of the device.
+    pipelines: by block name; size: of a photo, px; units: compute units of the device.
     """
-    found = {}
+    times = {}
     for block in blocks:
         ends = (step_seconds(units, size, count) for count in _counts(block, pipelines[block.name], size))
         steps = sum(training.steps for training in _trainings(pipelines[block.name]))
-        found[block.name] = [steps * each[end] for end, each in enumerate(ends)]
-    return found
+        times[block.name] = [steps * each[end] for end, each in enumerate(ends)]
+    return times
 
 
 def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
-    """The Gaussians that a block starts from, and the most that it may come to; without a setting that is a guess."""
+    """Return the first and the largest number of Gaussians of a block; without a limit, the latter is a guess."""
     first, pixels = int(block.start.sum()), size[0] * size[1]
     own = [max_gaussians(training, pixels) or block.pairs * MAX_PER_PIXEL * pixels for training in _trainings(pipeline)]
     return first, max(first, int(max(own)) + first - block.gaussians)
@@ -95,13 +95,13 @@ Steps = Literal["each", "shared"]
 
 @dataclass(frozen=True)
 class BlocksPlan:
-    """What is asked for."""
+    """The options of a training in blocks."""
 
     pipeline: str = "blocks"
     coarse: str = "blocks_coarse"  # a pipeline, or a model
     blocks: int = 4
     min_coverage: float = SIGHT  # fraction of a view's pixels above which it belongs to a block
-    steps: Steps = "each"  # of a block: those of the pipeline, or its share of them by its views
+    steps: Steps = "each"  # per block: all steps of the pipeline, or a share by its views
     overrides: list[str] = field(default_factory=list)
     coarse_overrides: list[str] = field(default_factory=list)
 
@@ -115,14 +115,16 @@ class BlocksPlan:
 
 
 class Blocks:
-    """The work in a folder."""
+    """A training in blocks in its folder."""
 
     def __init__(
         self, scene: Path, out: Path, plan: BlocksPlan, device: str | Device | None, execution: Execution | None = None
     ) -> None:
-        """execution: where blocks are trained; without it one after the other in this process."""
+        """execution: where blocks are trained; by default one after another in this process."""
         if execution is not None and not execution.has_store:
-            raise ConfigError("--on: blocks are trained as cells of a store; expected the key store, or another engine")
+            raise ConfigError(
+                "--on: blocks are trained as cells of a store; add the key `store`, or use another engine"
+            )
         self.out, self.plan, self.execution = out, plan, execution
         self._name = device if isinstance(device, str) else None
         where = [f"scene.path={as_setting(photographs_of(scene))}"]
@@ -131,17 +133,17 @@ class Blocks:
         self.given = _given(plan.coarse)
         self.coarse = None if self.given else coarse_pipeline(load(plan.coarse, plan.coarse_overrides), self.pipeline)
         if self.given and plan.coarse_overrides:
-            raise ConfigError("--set-coarse is for a coarse model that is trained; leave it out, or give a pipeline")
+            raise ConfigError(
+                "--set-coarse needs a coarse model that is trained; leave it out, or give a pipeline as --coarse"
+            )
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_correct(device, rasterizer.schedule, rasterizer.sort)
         self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
         if len(self.scene.original.downscales) > 1:
-            raise DataError(
-                f"{self.scene.original.path}: has each photograph in several sizes; expected one for blocks"
-            )
+            raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
     def question(self) -> dict[str, Any]:
-        """Return what the folder belongs to."""
+        """Return the inputs that identify the folder."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
         texts = {name: json.dumps(with_content_hashes(one), sort_keys=True) for name, one in pipelines.items()}
         digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
@@ -150,26 +152,26 @@ class Blocks:
         return {**asked, "photographs": self.scene.identity.digest, **model, **digests}
 
     def partition(self) -> Partition:
-        """Train the coarse model where that is not done, and cut it; write the manifest."""
+        """Train the coarse model if necessary, partition it, and write the manifest."""
         file = self.given
         if file is None and self.coarse is not None:
-            LOG.info("the coarse model")
+            LOG.info("training the coarse model")
             file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
         model = load_model(file).with_origin(self.scene.scene.origin)
-        photographs = Photographs(self.device, self.scene.background, budget=0)  # each is used once in a pass
+        photographs = Photographs(self.device, self.scene.background, budget=0)  # each photo is used once per pass
         work = Partitioner(model, self.scene.scene, self.device, photographs)
         found = work.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
         found.write(self.out)
         return found
 
     def plan_data(self, partition: Partition) -> dict[str, Any]:
-        """Return the manifest with the time that the training of each block takes, roughly."""
+        """Return the manifest with the estimated training time of each block."""
         pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
         sizes = sorted((view.camera.width, view.camera.height) for view in self.scene.scene.split("train"))
         units, size = self.device.info.units, sizes[len(sizes) // 2]
-        found, times = partition.data(), block_seconds(partition.blocks, pipelines, size, units)
-        return {**found, "blocks": [{**block, "seconds": times[block["name"]]} for block in found["blocks"]]}
+        data, times = partition.data(), block_seconds(partition.blocks, pipelines, size, units)
+        return {**data, "blocks": [{**block, "seconds": times[block["name"]]} for block in data["blocks"]]}
 
     def block_pipeline(self, block: Block, partition: Partition) -> Pipeline:
         """Return the pipeline of a block."""
@@ -177,10 +179,10 @@ class Blocks:
         return block_pipeline(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
 
     def train(self, partition: Partition) -> list[tuple[Block, Path]]:
-        """Train the blocks that are not done; return them with their models, in order.
+        """Train the unfinished blocks; return all blocks with their models, in order.
 
-        One in whose cell no Gaussian is left has no model.  One that fails does not stop the others; at the end an
-        error names the first, and has its exit code.
+        A block with no Gaussians left has no model.  A failed block does not stop the others; an error at the end names
+        the first failure and has its exit code.
         """
         files, failures = [], Failures("blocks")
         pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
@@ -195,21 +197,21 @@ class Blocks:
                     model = train_in_folder(pipelines[block.name], self.out / block.name, self.device)
                     files.append((block, raw_model(model)))
                 except EmptyRegionError:
-                    LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
+                    LOG.warning("%s: no Gaussians are left in its cell; continuing without it", block.name)
         if failures:
-            remedy = "when that is mended, the same command trains them, and leaves the others alone"
+            remedy = "fix that and run the same command again; finished blocks are kept"
             kept = shell_quote(self.out / COARSE)
-            other = f"other settings need another --out; --coarse {kept} keeps the coarse model there"
+            other = f"other settings need another --out; --coarse {kept} reuses the coarse model"
             whole = failures.whole(len(pipelines))
             error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
             error.exit_code = whole.exit_code
             raise error
         if not files:
-            raise EmptyRegionError("no Gaussian is left in any block; expected another pipeline, with another --out")
+            raise EmptyRegionError("no Gaussians are left in any block; use another pipeline and another --out")
         return files
 
     def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
-        """Train the blocks that are not done as cells of a store, and put their runs into the folders of blocks."""
+        """Train the unfinished blocks as cells of a store, and put their runs into the block folders."""
         cells = [
             MatrixCell(name, pipeline)
             for name, pipeline in pipelines.items()
@@ -220,20 +222,20 @@ class Blocks:
             Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
 
     def merge(self, parts: list[tuple[Block, Path]]) -> Path:
-        """Write the models of all blocks as one, in the order of their numbers; return its file."""
+        """Merge the models of all blocks in order; return the file."""
         file = self.out / f"{MERGED}.ply"
 
         def check(number: int, means: NDArray[np.float32]) -> None:
             block, path = parts[number]
             if not block.box.shifted(block.origin).holds(means).all():  # as the stage crop does
-                raise DataError(f"{path}: holds Gaussians outside its cell; remove its folder, and train it again")
+                raise DataError(f"{path}: has Gaussians outside its cell; remove its folder and train it again")
 
         count = join_plys(file, [path for _, path in parts], check)
         LOG.info("%s of %s merged", pluralize(count, "Gaussian"), pluralize(len(parts), "block"))
         return file
 
     def finish(self, file: Path) -> Path:
-        """Run what follows a training on the merged model; return its folder."""
+        """Run the stages after training on the merged model; return its folder."""
         run = self.out / MERGED
         train_in_folder(merged_pipeline(self.pipeline, file), run, self.device)
         return run
@@ -248,10 +250,10 @@ def train_in_blocks(
     only_plan: bool = False,
     execution: Execution | None = None,
 ) -> dict[str, Any]:
-    """Train a scene in blocks, in a folder; return the manifest, and beside it `run`, the folder of the merged model.
+    """Train a scene in blocks in a folder; return the manifest and `run`, the folder of the merged model.
 
-    What an earlier call has finished is left alone, and what it has begun goes on.  only_plan: stop after the
-    partition; execution: where blocks are trained as cells of a store.  Raises ClsplatError; one of a block names it.
+    Finished parts of an earlier call are kept, and interrupted ones resume.  only_plan: stop after the partition;
+    execution: where blocks are trained as cells of a store.  Raises ClsplatError, which names a failed block.
     """
     work = Blocks(scene, out, plan or BlocksPlan(), device, execution)
     with claim_folder(out, work.question(), RECORD, "a scene in blocks", "another --out"):
@@ -263,7 +265,7 @@ def train_in_blocks(
 
 
 def _given(coarse: str) -> Path | None:
-    """The file of a coarse model that is given; None for the name or the file of a pipeline.  Raises DataError."""
+    """Return the file if `coarse` is a model, or None if it is a pipeline.  Raises DataError."""
     path = Path(coarse)
     if path.is_dir() or (path.is_file() and detect(path)):
         require_model(path)
@@ -271,17 +273,17 @@ def _given(coarse: str) -> Path | None:
     return None
 
 
-# A partition, and the state of its runs, as tables in text.
+# Text tables of a partition and of the state of its runs.
 
-HEADINGS = ("block", "owns", "starts from", "views", "of these by place", "pairs", "MiB at first")
-GUESS = "memory and time are those of the beginning, up to the time with the most Gaussians; how many grow is a guess"
-TIME = "time, by growth"
+HEADINGS = ("block", "owns", "starts from", "views", "cameras inside", "pairs", "initial MiB")
+GUESS = "memory is that at the start; times range from no growth to an estimated maximum of Gaussians"
+TIME = "estimated time"
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return a manifest as lines of text; MiB are those on the device at the beginning of a training.
+    """Format a manifest as text; MiB are device memory at the start of training.
 
-    The time of a block goes from that of no growth to that of the most Gaussians.
+    The time of a block ranges from no growth to the most Gaussians.
     """
     whole = ["whole", *[f"{found['gaussians']:,}"] * 2, str(found["views"]), "", "100 %", _mib(found["memory"])]
     times = [one["seconds"] for one in found["blocks"] if "seconds" in one]
@@ -289,12 +291,12 @@ def table(found: dict[str, Any]) -> str:
         return text_table([HEADINGS, *map(_cells, found["blocks"]), whole])
     rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(found["blocks"], times, strict=True)]
     low, high = (sum(ends) for ends in zip(*times, strict=True))
-    total = [*whole, f"{minutes_text((low, high))}, one after the other"]
+    total = [*whole, f"{minutes_text((low, high))}, one after another"]
     return f"{text_table([[*HEADINGS, TIME], *rows, total])}\n{GUESS}"
 
 
 def status_table(found: dict[str, Any]) -> str:
-    """Return what `blocks_status` found as lines of text, a run a line."""
+    """Format the result of `blocks_status`, one line per run."""
     done = sum(part["state"] == "done" for part in found["parts"])
     lines = [f"{found['in_blocks']}: {found['state']}, {done} of {len(found['parts'])} runs are done"]
     for part in found["parts"]:
@@ -313,27 +315,27 @@ def _mib(size: int) -> str:
     return f"{size / 2**20:,.0f}"
 
 
-# The plan of a scene in blocks before anything is trained: by the dataset's points, each a Gaussian.
+# A plan before training, which treats each point of the dataset as a Gaussian.
 
 
 def plan_blocks(
     scene: Path, blocks: int, pipeline: str = "blocks", device: str | Device | None = None
 ) -> dict[str, Any]:
-    """Return the manifest of a partition by the scene's points, with the time of each block; nothing is kept.
+    """Return the manifest of a partition of the scene's points, with estimated times; nothing is written.
 
-    Raises ConfigError for a number of blocks out of bounds, DataError where the scene has no points, or too few.
+    Raises ConfigError for an invalid number of blocks, and DataError if the scene has no or too few points.
     """
     settings = load(pipeline, [f"scene.path={as_setting(photographs_of(scene))}", "init.file=points"]).settings
-    with log_level(logging.ERROR):  # it is read again, and told then
+    with log_level(logging.ERROR):  # it is read and logged again below
         original = read_run_scene(settings.scene, settings.scene.folder).original
         points = original.points
     if points is None or not len(points):
-        raise DataError(f"{scene}: has no points to cut by; `clsplat blocks --plan` trains a coarse model first")
-    with tempfile.TemporaryDirectory() as made:
-        model = Path(made, "points.ply")
+        raise DataError(f"{scene}: has no points to partition; `clsplat blocks --plan` trains a coarse model first")
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder, "points.ply")
         tables = from_points(points, Init().opacity, settings.model.sh_degree)
         Model(**tables, rendering=NUMBERS, sky=None, origin=original.origin).save(model)
-        work = Blocks(scene, Path(made), BlocksPlan(pipeline, str(model), blocks), device)
+        work = Blocks(scene, Path(folder), BlocksPlan(pipeline, str(model), blocks), device)
         try:
             return work.plan_data(work.partition())
         except DataError as error:

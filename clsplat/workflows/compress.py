@@ -1,4 +1,4 @@
-"""Look for the file that meets a target: a ladder of pruning shares by settings of the harmonics, all measured."""
+"""Compress a model to a target: search over pruning ratios and SH settings, measuring every file."""
 
 import json
 import logging
@@ -24,11 +24,11 @@ from clsplat.runs.model_file import ModelFile
 from clsplat.viewer.charts import Line, curve
 from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
-# The rungs of the ladder: a model with fewer and fewer Gaussians, each trained from the one before.
+# The pruning ladder: models with fewer and fewer Gaussians, each fine-tuned from the previous one.
 
-STAGES = ("init", "prune_least", "optimize", "take_average")  # of the recipe; what a rung writes is a PLY
+STAGES = ("init", "prune_least", "optimize", "take_average")  # of the recipe; each rung writes a PLY
 PALETTE = "palette_sh"
-# what trains the harmonics that a SOG holds, rounds them and other tables, and trains the last ones with them
+# stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded ones
 VECTORS = ("reduce_sh", PALETTE, "optimize", "take_average", "share_palette", PALETTE)
 FITTING = ("init", *VECTORS, "round_tables", "optimize", "take_average", "round_tables")
 FITTED, SOG = "fitted", "model.sog"
@@ -36,15 +36,15 @@ FITTED, SOG = "fitted", "model.sog"
 
 @dataclass(frozen=True)
 class Ladder:
-    """Where rungs are trained, and with what."""
+    """The folder and the fine-tuning of the rungs."""
 
     out: Path
     tuning: Tuning
 
     def rung(self, keep: float, before: float) -> Path:
-        """Prune from a share of the first model's Gaussians to another, and train; return the model's file.
+        """Prune from the fraction `before` of the original Gaussians to `keep`, and train; return the model's file.
 
-        What an earlier call has finished is left alone, and what it has begun goes on.
+        Finished work of an earlier call is kept, and interrupted work resumes.
         """
         if keep == 1:
             return self.tuning.source.file
@@ -56,28 +56,28 @@ class Ladder:
         return self.out / f"keep_{round(100 * keep):02d}"
 
     def fitted(self, file: Path, name: str, degree: int, quality: str) -> Path:
-        """Train a rung with the harmonics of a SOG of it; return that SOG."""
+        """Train a rung with the SH palette of a SOG; return that SOG."""
         values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
-        values |= {f"stages.{place}.quality": quality for place, name in enumerate(FITTING) if name == PALETTE}
+        values |= {f"stages.{i}.quality": quality for i, stage in enumerate(FITTING) if stage == PALETTE}
         pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
         return self.tuning.train(pipeline, self.out / FITTED / name, SOG)
 
     def pipeline(self, file: Path, keep: float) -> Pipeline:
-        """Return the recipe as it is run: to prune a model file to a share of it."""
+        """Return the recipe that prunes a model file to a fraction of its Gaussians."""
         return self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), "prune_least.keep": keep})
 
 
 def checked_keeps(keeps: Sequence[float]) -> list[float]:
-    """Return shares of the Gaussians, from many to few.  Raises ConfigError for what is no share, and for none."""
+    """Return fractions of the Gaussians in descending order.  Raises ConfigError for invalid or no fractions."""
     ordered = sorted(set(keeps), reverse=True)
     if not ordered or not all(0.01 <= keep <= 1 for keep in ordered):
-        raise ConfigError("--keep: expected shares of the Gaussians from 0.01 to 1, such as 1,0.7,0.5")
+        raise ConfigError("--keep: expected fractions of the Gaussians from 0.01 to 1, such as 1,0.7,0.5")
     if len({round(100 * keep) for keep in ordered}) < len(ordered):
-        raise ConfigError("--keep: expected shares that differ by a hundredth")
+        raise ConfigError("--keep: expected fractions that differ by at least 0.01")
     return ordered
 
 
-# What a compressed model may weigh, or lose.
+# Targets: a size, or a loss in PSNR.
 
 UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 EXPECTED = "expected a size such as 5MB, or a loss such as -0.1dB"
@@ -85,78 +85,78 @@ EXPECTED = "expected a size such as 5MB, or a loss such as -0.1dB"
 
 @dataclass(frozen=True)
 class Point:
-    """A file that was written and measured."""
+    """A file of the search with its measurements."""
 
     file: str  # in the folder of the search
-    keep: float  # share of the Gaussians
-    degree: int  # of the harmonics
+    keep: float  # fraction of the Gaussians
+    degree: int  # of the SH
     quality: str
     gaussians: int
     bytes: int
-    psnr: float  # dB, of the file as it is read back
+    psnr: float  # dB, of the file after reading it back
     ssim: float
 
 
 @dataclass(frozen=True)
 class CompressionTarget:
-    """A size, or a PSNR that is not to be missed."""
+    """A maximum size, or a maximum loss in PSNR."""
 
     text: str
     most: int | None = None  # bytes
-    change: float | None = None  # dB, of the PSNR of the model
+    change: float | None = None  # dB, change of the PSNR
 
     @classmethod
     def parse(cls, text: str) -> "CompressionTarget":
         """Read '5MB' (1 MB = 10^6 bytes; MiB = 2^20) or '-0.1dB'.  Raises ConfigError."""
-        found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
-        unit = found[2].lower() if found else ""
-        if found is None or unit not in (*UNITS, "db"):
+        match = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
+        unit = match[2].lower() if match else ""
+        if match is None or unit not in (*UNITS, "db"):
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
-        value = float(found[1])
+        value = float(match[1])
         if not math.isfinite(value * UNITS.get(unit, 1)):
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         if unit == "db":
             if value > 0:
-                raise ConfigError(f"--target {quote(text)}: a gain; {EXPECTED}")
+                raise ConfigError(f"--target {quote(text)}: is a gain; {EXPECTED}")
             return cls(text.strip(), change=value)
         if value * UNITS[unit] < 1:
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         return cls(text.strip(), most=int(value * UNITS[unit]))
 
     def is_met(self, point: Point, psnr: float) -> bool:
-        """Return whether a file meets the target; psnr: of the model that it was made from, dB."""
+        """Return whether a file meets the target; psnr: of the original model, dB."""
         if self.most is not None:
             return point.bytes <= self.most
         return point.psnr >= psnr + (self.change or 0)
 
     def best(self, points: Sequence[Point], psnr: float) -> Point | None:
-        """Return the best file for a size, or the smallest for a PSNR; None where none meets the target."""
+        """Return the best file for a size, or the smallest for a loss; None if no file meets the target."""
         met = [point for point in points if self.is_met(point, psnr)]
         if self.most is not None:
             return max(met, key=lambda point: (point.psnr, -point.bytes), default=None)
         return min(met, key=lambda point: (point.bytes, -point.psnr), default=None)
 
     def nearest(self, points: Sequence[Point]) -> Point:
-        """Return the file that misses the target least."""
+        """Return the file closest to the target."""
         smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
         return best if self.most is None else smallest
 
     @property
     def remedy(self) -> str:
-        """What to do where no file meets it."""
+        """What to do if no file meets the target."""
         if self.most is not None:
-            return "give a larger size, or a smaller share of the Gaussians with --keep"
-        return "allow a larger loss, or train for longer with --steps"
+            return "give a larger size, or smaller fractions with --keep"
+        return "allow a larger loss, or train longer with --steps"
 
     def ends(self, rung: Sequence[Point], psnr: float) -> bool:
-        """Return whether files of fewer Gaussians cannot be better: all of these fit, or none is good enough."""
+        """Return whether fewer Gaussians cannot help: all files of this rung fit, or none is good enough."""
         met = [self.is_met(point, psnr) for point in rung]
         return all(met) if self.most is not None else not any(met)
 
 
-# The rate–distortion curve of a search, and its table, as text and as a page that opens offline.
+# The rate–distortion curve and table of a search, as text and as an offline page.
 
-HEADINGS = ("Gaussians", "share", "degree", "quality", "MB", "of the model", "PSNR, dB", "change, dB", "SSIM")
+HEADINGS = ("Gaussians", "kept", "SH degree", "quality", "MB", "of the model", "PSNR, dB", "change, dB", "SSIM")
 
 
 def cells(point: Point, source: Point) -> list[str]:
@@ -175,7 +175,7 @@ def cells(point: Point, source: Point) -> list[str]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return the record of a search as lines of text; a star marks the file that was chosen."""
+    """Format the record of a search as text; a star marks the chosen file."""
     source, points = Point(**found["source"]), [Point(**point) for point in found["points"]]
     chosen = found["chosen"] and Point(**found["chosen"])
     marks = ["", "", *("*" if point == chosen else "" for point in points)]
@@ -193,11 +193,11 @@ def page(
     model: str,
     result: str = "",
 ) -> str:
-    """Return the page on a search for a model's file; `result`: the name of the one that it wrote."""
+    """Return the HTML page of a search; `result`: the name of the file that it wrote."""
     return render(
         "compress.html.j2",
         title=f"{scene} · {source.file}, compressed to {target.text}",
-        subtitle=f"{model}; PSNR and SSIM of {split} views, of every file as it is read back",
+        subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
         verdict=_verdict(target, source, chosen),
         curves=safe_charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
@@ -208,7 +208,7 @@ def page(
 
 def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> str:
     if chosen is None:
-        return f"No file meets the target {target.text} so far."
+        return f"No file has met the target {target.text} so far."
     return (
         f"{chosen.file}: {chosen.bytes / 1e6:.3g} MB, {chosen.bytes / source.bytes:.1%} of the model, "
         f"{chosen.psnr:.2f} dB, {chosen.psnr - source.psnr:+z.2f} dB"
@@ -216,7 +216,7 @@ def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> 
 
 
 def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) -> list[Line]:
-    """A line for each share of the Gaussians, and the target."""
+    """Return a line per fraction of the Gaussians, and the target."""
     shares = dict.fromkeys(point.keep for point in points)
     lines = [
         Line(sorted((p.bytes / 1e6, p.psnr) for p in points if p.keep == keep), f"{keep:.0%} of the Gaussians")
@@ -231,9 +231,9 @@ def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) ->
 
 LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
-KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
-SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # of the harmonics: degree, quality
-    "sog": ((3, "high"), (3, "balanced"), (3, "small")),  # a palette of a lower degree is hardly smaller
+KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # fractions of the Gaussians
+SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # SH degree and quality
+    "sog": ((3, "high"), (3, "balanced"), (3, "small")),  # lower degrees hardly make the palette smaller
     "spz": ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small")),
 }
 RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
@@ -241,14 +241,14 @@ RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
 
 @dataclass
 class Search:
-    """A search in its folder: what was measured so far."""
+    """A search in its folder, with all measurements so far."""
 
     out: Path
     target: CompressionTarget
-    question: dict[str, Any]  # what is compressed, and how
-    source: Point  # the model itself
-    split: str  # views that are measured
-    scene: str  # its name on pages
+    question: dict[str, Any]  # inputs and options that identify the search
+    source: Point  # the original model
+    split: str  # name of the measured views
+    scene: str  # name on pages
     points: list[Point] = field(default_factory=list)
 
     @property
@@ -268,7 +268,7 @@ class Search:
         }
 
     def write(self, result: str = "") -> None:
-        """Write what was measured, as JSON and as a page, which leads to the file of the result."""
+        """Write the measurements as JSON and as a page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
         measured = self.target, self.source, self.points, self.chosen, self.split
         write_text(self.out / PAGE, page(*measured, self.scene, self.question["model"], result))
@@ -285,12 +285,12 @@ def compress(
     steps: int | None = None,
     device: Any = None,
 ) -> dict[str, Any]:
-    """Look for a file that meets a target; write it, a page and a record; return the record.
+    """Find a file that meets a target; write it, a page, and a record; return the record.
 
-    From one share of the Gaussians to the next the model is pruned and trained for some steps.  Each rung is written
-    with several settings of its harmonics, and every file is read back and measured.  The search goes down until files
-    of fewer Gaussians cannot be better.  A search that was interrupted goes on.
-    Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
+    The model is pruned and fine-tuned from one fraction of the Gaussians to the next.  Each rung is written with
+    several SH settings, and every file is read back and measured.  The search stops when fewer Gaussians cannot help.
+    An interrupted search resumes.
+    Raises ConfigError for a target that no file meets, after writing the page, and OutputError if another process
     searches in `out`.
     """
     wanted, shares = CompressionTarget.parse(target), checked_keeps(keeps)
@@ -303,7 +303,7 @@ def compress(
     require_static(source.file, first.to_splat_file(), form)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
     question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
-    size = model_bytes(source.file)  # which a damaged model has not: before the folder is made
+    size = model_bytes(source.file)  # fails for a damaged model, before the folder is created
     with claim_folder(out, question, RECORD, "a search", "another --out"):
         warn_about_losses(_result(out, form), first.to_splat_file())
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
@@ -315,13 +315,15 @@ def compress(
             search.points += rung
             search.write()
             before = keep
-            if wanted.ends(rung, whole.psnr) and keep < 1:  # after the model itself: a trained rung can be better
+            if (
+                wanted.ends(rung, whole.psnr) and keep < 1
+            ):  # not at 1: a fine-tuned rung can be better than the original
                 break
         return _finished(search, form)
 
 
 def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
-    """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
+    """Write a rung with each SH setting, read the files back, and measure them."""
     points, model = [], load(source)
     for degree, quality in _settings(form, model.sh_degree):
         name = f"keep_{round(100 * keep):02d}_degree_{degree}_{quality}"
@@ -339,21 +341,21 @@ def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer:
 
 
 def _settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
-    """Those of a model of this degree that differ: without harmonics there is one."""
+    """Return the distinct settings for a model of this degree; there is one for degree 0."""
     lower = ((min(most, degree), quality) for most, quality in SETTINGS[form])
     return dict.fromkeys((most, quality if most else "balanced") for most, quality in lower)
 
 
 def _finished(search: Search, form: Format) -> dict[str, Any]:
-    """Write the chosen file under its own name.  Raises ConfigError where there is none."""
+    """Copy the chosen file to the result.  Raises ConfigError if there is none."""
     chosen, psnr = search.chosen, search.source.psnr
     file = _result(search.out, form)
     if chosen is None:
         near = search.target.nearest(search.points)
         raise ConfigError(
-            f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
+            f"--target {search.target.text}: no file meets it; the closest, {search.out / near.file}, has "
             f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; {search.target.remedy}"
-            + (f"; {file.name} there is of another target" if file.exists() else "")
+            + (f"; the existing {file.name} is for another target" if file.exists() else "")
         )
     _copy(search.out / chosen.file, file)
     search.write(file.name)
@@ -365,7 +367,7 @@ def _result(out: Path, form: Format) -> Path:
 
 
 def _copy(source: Path, file: Path) -> None:
-    """Copy a model file, and the sky beside it."""
+    """Copy a model file and its sky."""
     with open_hashed(file) as output:
         output.write(read_file(source))
     write_sky_file(read_sky_file(source), file, output.sha256)

@@ -1,4 +1,4 @@
-"""A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
+"""Fine-tune a model file on the photos of its scene, by stages of the recipe `compress`."""
 
 import json
 import logging
@@ -40,27 +40,27 @@ from clsplat.sweeps.store import CellAttempt, readable_checkpoints
 
 LOG = logging.getLogger("clsplat")
 RECIPE, TRAINING = "compress", "optimize"
-LEAST = 20  # steps: each training of the recipe has some to average then
+MIN_STEPS = 20  # so that each training of the recipe has steps to average
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """With which photographs models are trained, as one is rendered, and how long."""
+    """The photos, rendering settings, and number of steps for fine-tuning."""
 
-    name: str  # of the pipelines that are run
+    name: str  # name of the pipelines
     source: ModelSource
     model: Model
-    steps: int | None  # None: those of the recipe
+    steps: int | None  # None: steps of the recipe
     device: Device
 
     def pipeline(self, stages: Sequence[str], values: Mapping[str, Any], **export: str) -> Pipeline:
-        """Return stages of the recipe, in its order, and one that writes the model, with other values by place."""
+        """Return some stages of the recipe, in order, plus an export, with values set by key path."""
         path = find(RECIPE)
         data = read_yaml(path).data
         chosen = [*_choose_class(data["stages"], stages), {"export": {"file": MODEL, **export}}]
         document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
-        pipeline = checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
+        pipeline = checked(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
             return pipeline
         first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
@@ -95,38 +95,37 @@ class Tuning:
 
 
 def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
-    """Run a pipeline in a folder; return the file that it writes there.
+    """Run a pipeline in a folder; return the file that it writes.
 
-    What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
-    all checkpoints are damaged it begins anew.
+    A finished run is kept, an interrupted one resumes, and lost files are restored.  If all checkpoints are damaged,
+    the run starts over.
     """
     state = RunState.read(folder)
     if not state.is_whole(pipeline):
         is_whole = any(readable_checkpoints([CellAttempt(folder)]))
         if state.checkpoints and not is_whole:
-            LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
-        begun: Start = "resume" if is_whole else "restart"
-        start: Start = begun if path_exists(folder) else "new"
+            LOG.warning("%s: no checkpoint is intact; training starts over", folder)
+        start: Start = "new" if not path_exists(folder) else "resume" if is_whole else "restart"
         try:
             run_pipeline(pipeline, state, device, start)
         except Interrupted as error:
-            raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
+            raise Interrupted(f"stopped in {folder.name}; run the same command again to resume") from error
     return folder / file
 
 
 def is_trained(pipeline: Pipeline, folder: Path) -> bool:
-    """Whether a run of a pipeline has come to its end in a folder, with files that are whole."""
+    """Return whether a folder has a finished run of a pipeline with all files intact."""
     return RunState.read(folder).is_whole(pipeline)
 
 
 def require_steps(steps: int) -> None:
-    """Raise ConfigError for fewer steps than the recipe can be stretched to."""
-    if steps < LEAST:
-        raise ConfigError(f"--steps {steps}: expected a number of at least {LEAST}")
+    """Raise ConfigError for fewer steps than the recipe needs."""
+    if steps < MIN_STEPS:
+        raise ConfigError(f"--steps {steps}: expected at least {MIN_STEPS}")
 
 
 def _choose_class(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
-    """The stages of a file that have these names, in order; their steps count from the first of them on."""
+    """Return the stages with these names, in order; their steps are counted from the first of them."""
     chosen, left, skipped = [], iter(stages), 0
     for name in names:
         while not _is(stage := next(left), name):
@@ -136,7 +135,7 @@ def _choose_class(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
 
 
 def _earlier(training: Any, steps: int) -> Any:
-    """A training of a file so many steps earlier: cadences begin at steps of the whole run."""
+    """Shift the start steps of a training's inner stages, which count from the start of the run, by `steps`."""
     keys = training[TRAINING]
     during = [
         {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
@@ -147,27 +146,27 @@ def _earlier(training: Any, steps: int) -> Any:
 
 
 def _is(stage: Any, name: str) -> bool:
-    """Whether a stage of a file, which is its name where it has no settings, has this name."""
+    """Return whether a stage of a file, a name or a mapping, has this name."""
     return bool(stage == name or (isinstance(stage, dict) and name in stage))
 
 
-# The folder in which models are trained: it belongs to one question, and what was interrupted in it goes on.
+# A folder in which models are trained for one set of inputs, so that interrupted work can resume.
 
-WORDS = {"sha256": "the model's bytes"}  # for keys of a question, where they are no words
+WORDS = {"sha256": "the model's bytes"}  # descriptions of keys of a question
 
 
 @contextmanager
 def claim_folder(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
-    """Make the folder, with the question in its record, sweep it of what killed processes left, and hold it.
+    """Create and lock a folder, write the question to its record, and remove files of killed processes.
 
-    what: the question in a word, such as "a search"; remedy: what to give in the place of this folder.
-    Raises ConfigError where it holds something else, OutputError where another process uses it.
+    what: what the folder is for, such as "a search"; remedy: what to give instead of this folder.
+    Raises ConfigError if the folder belongs to something else, and OutputError if another process uses it.
     """
     _require_own(out, question, record, what, remedy)
     with raising_output_error(out):
         make_folder(out)
     with lock.lock_folder(out):
-        _require_own(out, question, record, what, remedy)  # again: another may have begun since
+        _require_own(out, question, record, what, remedy)  # again, because another process may have started
         remove_partial_files(out, border=PIPELINE)
         if not (out / record).exists():
             write_text(out / record, json.dumps(question, indent=1) + "\n")
@@ -175,53 +174,53 @@ def claim_folder(out: Path, question: dict[str, Any], record: str, what: str, re
 
 
 def _require_own(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> None:
-    """Raise ConfigError where a folder holds another question, or something else."""
+    """Raise ConfigError if a folder belongs to another question or has other files."""
     if not path_exists(out / record):
-        if path_exists(out) and not (out.is_dir() and all(_is_nobodys(path.name) for path in out.iterdir())):
-            raise ConfigError(f"{out}: holds something else than {what}; give {remedy}")
+        if path_exists(out) and not (out.is_dir() and all(_is_leftover(path.name) for path in out.iterdir())):
+            raise ConfigError(f"{out}: has other files than those of {what}; give {remedy}")
         return
     try:
         before = read_json(out / record)
     except DataError:
         before = None
     if not isinstance(before, dict):
-        raise ConfigError(f"{out / record}: is not the record of {what}; remove {out}, or give {remedy}")
+        raise ConfigError(f"{out / record}: is not the record of {what}; remove {out} or give {remedy}")
     differing = [WORDS.get(key, key) for key, value in question.items() if before.get(key) != value]
     if differing:
-        raise ConfigError(f"{out}: holds {what} that differs in {', '.join(differing)}; remove it, or give {remedy}")
+        raise ConfigError(f"{out}: has {what} that differs in {', '.join(differing)}; remove it or give {remedy}")
 
 
-def _is_nobodys(name: str) -> bool:
-    """Whether a file may be what a process leaves that was killed before its record: its lock, or a hidden file."""
+def _is_leftover(name: str) -> bool:
+    """Return whether a file may be left by a process killed before writing its record: a lock or a hidden file."""
     return name == LOCK or name[0] == "."
 
 
-# Models measured at the views of a scene, as they come from training and from files.
+# Measuring models at the views of a scene.
 
 
 class Measurer:
-    """Measures models at the test views of a scene; at its training views where it has no others."""
+    """Measures models at the test views of a scene, or at its training views if there are no test views."""
 
     def __init__(self, opened: ModelFile) -> None:
         self.opened = opened
         self.split = "test" if opened.scene.split("test") else "train"
         if self.split == "train":
             LOG.warning(
-                "%s: has no test views; the training views are measured; scene.holdout keeps some for it",
+                "%s: has no test views, so the training views are measured; scene.holdout sets views aside for testing",
                 opened.scene.path,
             )
         self.rasterizer = Rasterizer(opened.device)
         self.photographs = Photographs(opened.device, opened.background)
 
     def identity(self) -> str:
-        """Return a hash of the photographs, cameras and points.  Raises DataError where a photograph is damaged."""
+        """Return a hash of the photos, cameras, and points.  Raises DataError if a photo is damaged."""
         scene = self.opened.scene
         files = decode_all(scene.views)
         require_decodable(scene.path, files)
         return Identity.from_scene(scene, files).digest
 
     def figures(self, model: Model) -> tuple[float, float]:
-        """Return PSNR, dB, and SSIM."""
+        """Return PSNR in dB and SSIM."""
         views, placed = self.opened.scene.split(self.split), model.with_origin(self.opened.scene.origin)
         painter = SplatPainter(self.rasterizer, placed.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)

@@ -1,4 +1,4 @@
-"""What a folder holds, of a run, a store of cells or a scene in blocks: its state, and whether its files are whole."""
+"""Report the state of a folder, a run, a sweep store, or a scene in blocks, and verify its files."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,58 +17,66 @@ RECORD, COARSE, MERGED, MANIFEST = "blocks.json", "coarse", "merged", "partition
 
 
 def block_name(number: int) -> str:
-    """Return the name of the folder of a block, and of its first Gaussians."""
+    """Return the name of a block's folder and of its initial model."""
     return f"block_{number:02d}"
 
 
 def is_in_blocks(folder: Path) -> bool:
-    """Whether a folder holds a scene in blocks."""
+    """Return whether a folder is that of a scene in blocks."""
     return (folder / RECORD).is_file()
 
 
 def status_of(folder: Path) -> dict[str, Any]:
-    """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.  Raises DataError."""
+    """Return the state of a folder: a scene in blocks, a sweep store, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
     return store_status(folder) if is_store(folder) else run_status(RunState.read(folder))
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a scene in blocks as `verify_blocks`, and all else as `clsplat.runs.verify`."""
+    """Check a scene in blocks by `verify_blocks`, and anything else by `clsplat.runs.verify`."""
     return verify_blocks(Path(pipeline)) if is_in_blocks(Path(pipeline)) else verify.check(pipeline)
 
 
 def blocks_status(out: Path) -> dict[str, Any]:
-    """Return the `state` of a scene in blocks, and `parts`: what `run_status` returns, and the name, of each run.
+    """Return the `state` of a scene in blocks, and `parts`: the name and `run_status` of each run.
 
-    The state is that of the merged model; before it is done running, failed, or unfinished.
-    Raises DataError where the record is damaged.
+    The state is `done` when the merged model is done; before that running, failed, or unfinished.
+    Raises DataError if the record is damaged.
     """
     parts = [{"name": name, **_status(out / name)} for name in _parts(out)]
     states = [part["state"] for part in parts]
-    going = any(state not in (*END_STATES, "killed", "waiting", "unknown") for state in states)
-    state = "done" if states[-1] == "done" else "running" if going else "failed" if "failed" in states else "unfinished"
+    is_running = any(state not in (*END_STATES, "killed", "waiting", "unknown") for state in states)
+    state = (
+        "done"
+        if states[-1] == "done"
+        else "running"
+        if is_running
+        else "failed"
+        if "failed" in states
+        else "unfinished"
+    )
     return {"in_blocks": str(out), "state": state, "parts": parts}
 
 
 def verify_blocks(out: Path) -> dict[str, Any]:
-    """Return what `verify` returns, of all runs of a scene in blocks and of the files beside them, with a `remedy`."""
+    """Verify all runs of a scene in blocks and the files next to them; return the same as `verify`, with a `remedy`."""
     state = blocks_status(out)["state"]
     objects = list(_objects(out, state == "done"))
     return {
         "run": str(out),
         "state": state,
-        "whole": all(one["whole"] for one in objects),
+        "whole": all(entry["whole"] for entry in objects),
         "objects": objects,
-        "remedy": f"run its `clsplat blocks … --out {shell_quote(out)}` again, which makes again what is lost",
+        "remedy": f"run its `clsplat blocks … --out {shell_quote(out)}` again to restore lost files",
     }
 
 
 def _parts(out: Path) -> list[str]:
-    """The folders of its runs, in the order in which they are trained."""
+    """Return the run folders in the order of training."""
     record = read_json(out / RECORD)
     if not (isinstance(record, dict) and type(record.get("blocks")) is int):
-        raise DataError(f"{out / RECORD}: expected the number of blocks; remove {out}, or put that file back")
+        raise DataError(f"{out / RECORD}: the number of blocks is missing; restore that file, or remove {out}")
     return [*([COARSE] if COARSE in record else []), *map(block_name, range(record["blocks"])), MERGED]
 
 
@@ -80,13 +88,13 @@ def _status(folder: Path) -> dict[str, Any]:
 
 
 def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
-    """What is found of each file; those that a scene that is done has must be there."""
+    """Yield the result for each file; all files must exist when the scene is done."""
 
     def manifest(path: Path) -> str:
-        found = read_json(path)
-        if not (isinstance(found, dict) and isinstance(found.get("blocks"), list)):
-            raise DataError("expected the blocks, and what they hold")
-        return f"of {len(found['blocks'])} blocks"
+        data = read_json(path)
+        if not (isinstance(data, dict) and isinstance(data.get("blocks"), list)):
+            raise DataError("has no list of blocks")
+        return f"of {len(data['blocks'])} blocks"
 
     parts = _parts(out)
     looks: dict[str, Callable[[Path], str]] = {MANIFEST: manifest}
@@ -96,6 +104,6 @@ def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
             yield verify.check_file(out, name, look)
     for part in parts:
         if (state := RunState.read(out / part)).phase:
-            yield from ({**one, "file": f"{part}/{one['file']}"} for one in verify.verify(state)["objects"])
+            yield from ({**entry, "file": f"{part}/{entry['file']}"} for entry in verify.verify(state)["objects"])
         elif done:
             yield {"file": part, "whole": False, "detail": "is missing"}

@@ -1,4 +1,4 @@
-"""Levels of detail of a model: each merged from the one before, trained where photographs are there, and written."""
+"""Build levels of detail of a model: merge Gaussians level by level, and fine-tune them if there are photos."""
 
 import logging
 import math
@@ -24,9 +24,9 @@ from clsplat.runs.model_file import ModelFile, photographs_of, run_of
 from clsplat.scene.detect import read_scene
 from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
-# The training of levels: what is asked for, and run folders beside the folder of the levels.
+# Options and training of levels.
 
-MAX_LEVELS = 12  # levels; halves of a million Gaussians are 500 then
+MAX_LEVELS = 12  # a million Gaussians halved 11 times are 500
 STEPS = 500
 STAGES = ("init", "optimize", "take_average")  # of the recipe
 RECORD = "lod.json"
@@ -34,89 +34,89 @@ RECORD = "lod.json"
 
 @dataclass(frozen=True)
 class LodPlan:
-    """What is asked for."""
+    """The options of levels of detail."""
 
     levels: int = 4
-    keep: float = 0.5  # share of the Gaussians of the level before
-    steps: int | None = None  # of training each level; 0: none; None: STEPS where there are photographs
-    downscale: float | None = None  # divisor of their size in this training; None: as the model was trained
+    keep: float = 0.5  # fraction of the Gaussians of the previous level
+    steps: int | None = None  # to train each level; 0: none; None: STEPS if there are photos
+    downscale: float | None = None  # divisor of the image size in training; None: as the model was trained
 
     def __post_init__(self) -> None:
         if not 1 <= self.levels <= MAX_LEVELS:
             raise ConfigError(f"--levels {self.levels}: expected 1 to {MAX_LEVELS}")
         if not 0.01 <= self.keep < 1:
             raise ConfigError(
-                f"--keep {self.keep:g}: expected a share of the Gaussians from 0.01 to below 1, such as 0.5"
+                f"--keep {self.keep:g}: expected a fraction of the Gaussians from 0.01 to below 1, such as 0.5"
             )
         if self.steps:
             require_steps(self.steps)
         if self.downscale is not None and not 1 <= self.downscale < math.inf:
             raise ConfigError(f"--downscale {self.downscale:g}: expected a divisor of at least 1")
         if self.downscale is not None and self.steps == 0:
-            raise ConfigError(f"--downscale {self.downscale:g}: belongs to a training; expected --steps above 0")
+            raise ConfigError(f"--downscale {self.downscale:g}: needs training; set --steps above 0")
 
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """One level; PSNR in dB, before it is quantized, where there are photographs."""
+    """One level, with its PSNR in dB before quantization if there are photos."""
 
     model: Model
-    merged_psnr: float | None = None  # before it was trained
+    merged_psnr: float | None = None  # before training
     psnr: float | None = None
 
 
 class LevelTrainer:
     """Trains and measures levels."""
 
-    def __init__(self, opened: ModelFile, place: Path, plan: LodPlan) -> None:
-        self.place, self.plan, self.source = place, plan, opened.source
+    def __init__(self, opened: ModelFile, folder: Path, plan: LodPlan) -> None:
+        self.folder, self.plan, self.source = folder, plan, opened.source
         self.steps = STEPS if plan.steps is None else plan.steps
         self.measurer = Measurer(opened)
         self.tuning = Tuning("lod", opened.source, opened.gaussians, self.steps, opened.device)
 
     def locked(self) -> AbstractContextManager[None]:
-        """Hold the folder of the training in a block, where anything is trained."""
+        """Lock the training folder during a block, if anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
         question: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
         question |= {"keep": self.plan.keep, "steps": self.steps, "downscale": self.plan.downscale}
         question["photographs"] = self.measurer.identity()
-        return claim_folder(self.place, question, RECORD, "the training of levels", "the name of another folder")
+        return claim_folder(self.folder, question, RECORD, "the training of levels", "the name of another folder")
 
     def measured(self, model: Model) -> DetailLevel:
-        """Return a level that is not trained."""
+        """Measure a level without training."""
         psnr = self.measurer.figures(model)[0]
         return DetailLevel(model, psnr, psnr)
 
     def train(self, number: int, model: Model) -> DetailLevel:
-        """Return a level after its training."""
+        """Train and measure a level."""
         merged = self.measured(model)
         if not self.steps:
             return merged
-        file = self.place / f"level_{number}.ply"
+        file = self.folder / f"level_{number}.ply"
         model.save(file)
         size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
         pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
-        found = load(self.tuning.train(pipeline, self.place / f"level_{number}"))
-        return DetailLevel(found, merged.psnr, self.measured(found).psnr)
+        trained = load(self.tuning.train(pipeline, self.folder / f"level_{number}"))
+        return DetailLevel(trained, merged.psnr, self.measured(trained).psnr)
 
 
-NEIGHBORS = 8  # of a Gaussian, among which its partner is
-BLOCK = 1 << 16  # pairs whose costs are computed together
-LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # beyond which numbers that follow from them leave float64
+NEIGHBORS = 8  # candidates for merging with a Gaussian
+BLOCK = 1 << 16  # pairs per batch of costs
+LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # limits that keep derived numbers within float64
 Tables = dict[str, Floats]
 
 
 def decimate(model: Model, keep: float = 0.5) -> Model:
-    """Return a model with a share of the Gaussians, one at least, of which neighbors are merged.
+    """Reduce a model to a fraction of its Gaussians, at least one, by merging neighbors.
 
-    A world filter is baked.  Raises ConfigError for what is no share, DataError for values that are not finite.
+    A world filter is baked.  Raises ConfigError for an invalid fraction, and DataError for values that are not finite.
     """
     if not 0 < keep <= 1:
-        raise ConfigError(f"--keep {keep:g}: expected a share of the Gaussians above 0, up to 1")
+        raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
     plain = model.baked()
     if bad := int(not_finite(plain.tables()).sum()):
-        raise DataError(f"{bad} Gaussians hold values that are not finite; drop them with `clsplat convert`")
+        raise DataError(f"{bad} Gaussians have values that are not finite; drop them with `clsplat convert`")
     target = min(len(plain), max(1, int(keep * len(plain) + 0.5)))
     if target == len(plain):
         return plain
@@ -129,7 +129,7 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
 
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
-    """Return pairs of rows, the cheapest first, of which none shares a row: one at least, where there are two rows."""
+    """Return disjoint pairs of rows, cheapest first; at least one pair if there are two rows."""
     one, two = _neighbors(tables["means"])
     cost = pair_cost(tables, one, two)
     order = np.lexsort((two, one, np.where(np.isfinite(cost), cost, np.inf)))
@@ -145,8 +145,8 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
-    """Return what merging changes, [pairs]; symmetric in the pair up to rounding."""
-    mass, size = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows: once, not for each block
+    """Return the cost of merging each pair, [pairs]; symmetric up to rounding."""
+    mass, size = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
     return np.concatenate([_block_cost(tables, mass, size, first[block], second[block]) for block in blocks])
 
@@ -162,24 +162,25 @@ def _block_cost(tables: Tables, mass: Floats, size: Floats, first: Rows, second:
 
 
 def _neighbors(means: Floats) -> tuple[Rows, Rows]:
-    """Pairs of a row and one of its nearest neighbors, the lower row first, each once and in ascending order.
+    """Return pairs of a row and one of its nearest neighbors, lower row first, unique and in ascending order.
 
-    Of rows in one place, each has the next one, and the first one has neighbors in other places.
+    Rows at the same position form a chain, and only its first row has neighbors at other positions.
     """
-    places, first, place = np.unique(means, axis=0, return_index=True, return_inverse=True)
-    found = cKDTree(places).query(places, k=min(NEIGHBORS + 1, len(places)))[1].reshape(len(places), -1)
-    one, two = first[np.repeat(np.arange(len(places)), found.shape[1])], first[found.ravel()]
-    by_place = np.argsort(place.ravel(), kind="stable")
-    same = np.diff(place.ravel()[by_place]) == 0
-    one = np.concatenate([one, by_place[:-1][same]])
-    two = np.concatenate([two, by_place[1:][same]])
+    positions, first, position = np.unique(means, axis=0, return_index=True, return_inverse=True)
+    count = len(positions)
+    nearest = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
+    one, two = first[np.repeat(np.arange(count), nearest.shape[1])], first[nearest.ravel()]
+    order = np.argsort(position.ravel(), kind="stable")
+    same = np.diff(position.ravel()[order]) == 0
+    one = np.concatenate([one, order[:-1][same]])
+    two = np.concatenate([two, order[1:][same]])
     count, apart = len(means), one != two
     pairs = np.unique(np.minimum(one, two)[apart].astype(np.int64) * count + np.maximum(one, two)[apart])
     return pairs // count, pairs % count
 
 
 def _settled(model: Model) -> Tables:
-    """The tables in float64, with what the formulas can hold."""
+    """Return the tables in float64, clipped to the range of the formulas."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
     tables["quats"] = unit(tables["quats"])
     tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
@@ -188,7 +189,7 @@ def _settled(model: Model) -> Tables:
 
 
 def _joined(tables: Tables, first: Rows, second: Rows) -> Tables:
-    """The tables with mixtures at the rows `first`, and without the rows `second`."""
+    """Return the tables with merged Gaussians at the rows `first`, without the rows `second`."""
     kept = np.ones(len(tables["means"]), bool)
     kept[second] = False
     mixtures = merge(tables, first, second, surface)
@@ -198,36 +199,36 @@ def _joined(tables: Tables, first: Rows, second: Rows) -> Tables:
 
 
 LOG = logging.getLogger("clsplat")
-FEW = 1_000_000  # Gaussians, below which PlayCanvas advises one SOG
+FEW = 1_000_000  # Gaussians; below, PlayCanvas recommends a single SOG
 
 
 def levels_of_detail(
     model: Path, folder: Path, scene: Path | None = None, plan: LodPlan | None = None, device: Any = None
 ) -> dict[str, Any]:
-    """Write the levels of a model as streamed SOG; return its `folder`, `bytes`, the `split` measured, and `levels`.
+    """Write levels of detail as streamed SOG; return its `folder`, `bytes`, the measured `split`, and `levels`.
 
-    Where photographs are known, each coarser level is trained before the next one is merged from it, in run folders in
-    FOLDER.training: what was interrupted goes on.  Raises ConfigError, DataError, OutputError.
+    With photos, each coarser level is trained before the next one is merged from it, in run folders in FOLDER.training;
+    interrupted training resumes.  Raises ConfigError, DataError, OutputError.
     """
     plan = plan or LodPlan()
     require_free(folder)
     opened, first = _opened(model, scene, plan, device)
     if not len(first):
-        raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
+        raise DataError(f"{model}: the model has no Gaussians to merge")
     require_static(model, first.to_splat_file(), "SOG")
     require_in_range(model, first.to_splat_file(), "SOG")
     if len(first) < FEW:
-        told = pluralize(len(first), "Gaussian")
-        LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
+        count = pluralize(len(first), "Gaussian")
+        LOG.warning("%s: has only %s; below a million a single SOG is better: `clsplat convert`", model, count)
     training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
-    with new_folder(folder) as place:
+    with new_folder(folder) as new:
         with training.locked() if training else nullcontext():
             levels = _levels(first, plan, training)
-        digest = write_lod(place, [level.model.to_splat_file() for level in levels])
-        write_sky_file(first.sky, place / LOD_META, digest)
+        digest = write_lod(new, [level.model.to_splat_file() for level in levels])
+        write_sky_file(first.sky, new / LOD_META, digest)
     if first.sky:
-        told = sky_path(folder / LOD_META).name
-        LOG.info("%s: the sky of the finest level is in %s, which clsplat alone draws", folder, told)
+        name = sky_path(folder / LOD_META).name
+        LOG.info("%s: the sky of the finest level is in %s, which only clsplat renders", folder, name)
     return {
         "folder": str(folder),
         "bytes": model_bytes(folder),
@@ -237,36 +238,36 @@ def levels_of_detail(
 
 
 def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
-    """The model with its photographs, or alone where there are none, and its Gaussians."""
+    """Return the model with its photos, or None without photos, and its Gaussians."""
     run = run_of(model) if scene is None else None
     if scene is None and run is None:
-        alone = _alone(model, plan, device, "no photographs are known")
-        LOG.info("%s: no photographs: merged alone", model)
-        return None, alone
+        gaussians = _without_photos(model, plan, device, "has no known photos")
+        LOG.info("%s: no photos: levels are merged without training", model)
+        return None, gaussians
     try:
         opened = ModelFile(model, scene, device)
     except DataError as error:
         if run is None or (fault := _fault_of_photographs(run)) is None:
             raise
         if plan.steps != 0:
-            raise DataError(f"{fault} (--scene DIR names another; --steps 0 needs none)") from error
-        alone = _alone(model, plan, device, "its photographs cannot be read")
-        LOG.warning("%s; levels are merged alone, and not measured", fault)
-        return None, alone
+            raise DataError(f"{fault} (give --scene DIR, or --steps 0 to merge without photos)") from error
+        gaussians = _without_photos(model, plan, device, "its photos cannot be read")
+        LOG.warning("%s; levels are merged without training and not measured", fault)
+        return None, gaussians
     return opened, opened.gaussians.baked()
 
 
-def _alone(model: Path, plan: LodPlan, device: Any, why: str) -> Model:
-    """The Gaussians of a model without photographs.  Raises ConfigError for what needs them."""
-    alone = load(model).baked()
+def _without_photos(model: Path, plan: LodPlan, device: Any, why: str) -> Model:
+    """Return the Gaussians of a model without photos.  Raises ConfigError for options that need photos."""
+    gaussians = load(model).baked()
     given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
     if names := ", ".join(name for name, value in given.items() if value):
-        raise ConfigError(f"{model}: {why}, needed for {names}; give --scene, or leave that out")
-    return alone
+        raise ConfigError(f"{model}: {why}, which {names} needs; give --scene, or leave that out")
+    return gaussians
 
 
 def _fault_of_photographs(run: Path) -> DataError | None:
-    """Why those of a run cannot be read."""
+    """Return why the photos of a run cannot be read, or None."""
     try:
         read_scene(photographs_of(run))
     except DataError as error:
@@ -284,19 +285,19 @@ def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[
 
 
 def _figures(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
-    """Counts, size and PSNR of a level that was written."""
+    """Return counts, size, and PSNR of a written level."""
     size = sum(file.stat().st_size for file in folder.glob(f"{number}_*/*"))
     figures = {"level": number, "gaussians": len(level.model), "bytes": size}
     return {**figures, "merged_psnr": level.merged_psnr, "psnr": level.psnr}
 
 
-# Levels of detail as a table in text.
+# A text table of levels of detail.
 
 HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return what `levels_of_detail` returns as lines of text."""
+    """Format the result of `levels_of_detail` as text."""
     used = len(HEADINGS) if found["split"] else 3
     return text_table([HEADINGS[:used], *(_cells(level)[:used] for level in found["levels"])])
 

@@ -1,4 +1,4 @@
-"""The partition of a scene by a coarse model: cells, the views and first Gaussians of each block, and the manifest."""
+"""Partition a scene by a coarse model: cells, views and initial Gaussians of each block, and the manifest."""
 
 import json
 import logging
@@ -23,93 +23,91 @@ from clsplat.scene.view import View
 from clsplat.training.memory import first_tables, plan
 from clsplat.workflows.folder import MANIFEST, block_name
 
-# Space cut into cells by the Gaussians of a coarse model: a kd-tree whose leaves hold equal shares of a weight.
+# Cells: the leaves of a kd-tree over the Gaussians of a coarse model, with equal shares of a weight.
 
 Floats = NDArray[np.float64]
-CORE = (0.01, 0.99)  # quantiles of the weight between which a cell has its size: a few Gaussians lie far away
-DIGITS = 9  # of a cut: more than single precision has
+CORE = (0.01, 0.99)  # weight quantiles that define the size of a cell, because a few Gaussians are far away
+DIGITS = 9  # of a cut; more than float32 has
 
 
 @dataclass(frozen=True)
 class PartitionCell:
-    """A part of space, and the size of what lies in it."""
+    """A region of space and the size of its content."""
 
     box: Box
     size: Floats  # [3] scene units, between quantiles of its Gaussians
 
     def grown(self, share: float) -> Box:
-        """Return the box with each of its bounds farther out by half of this share of its size."""
+        """Return the box extended on each side by half of this fraction of its size."""
         step = 0.5 * share * self.size
-        low = [None if one is None else _short(one - by) for one, by in zip(self.box.low, step, strict=True)]
-        high = [None if one is None else _short(one + by) for one, by in zip(self.box.high, step, strict=True)]
+        low = [None if b is None else _short(b - by) for b, by in zip(self.box.low, step, strict=True)]
+        high = [None if b is None else _short(b + by) for b, by in zip(self.box.high, step, strict=True)]
         return Box(low=low, high=high)
 
 
 def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
     """Return `count` cells, each with about the same share of the weights, [N], of Gaussians at `means`, [N, 3].
 
-    A cell of several shares is cut across its longest side.  Raises DataError where so many are not to be had.
+    Cells are split across their longest side.  Raises DataError if the model cannot be split into `count` cells.
     """
     if not len(means):
-        raise DataError("the model holds no Gaussians; expected one at least")
+        raise DataError("the model has no Gaussians to partition")
     weights = weights if weights.any() else np.ones(len(means))
     return _cut(means.astype(np.float64), weights, Box(), count)
 
 
 def assign_cells(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[np.int64]:
-    """Return the number of the cell in which each of the points, [N, 3], lies, [N].
+    """Return the index of the cell that contains each point of [N, 3], [N].
 
-    Raises DataError for points that are not numbers, which lie in none.
+    Raises DataError for points that are not finite.
     """
     owner = np.full(len(means), -1)
     for number, cell in enumerate(found):
         owner[cell.box.holds(means)] = number
     if (owner < 0).any():
         lost = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
-        raise DataError(f"{lost} of the coarse model have places that are not finite; train it again")
+        raise DataError(f"{lost} of the coarse model have positions that are not finite; train it again")
     return owner
 
 
 def quantile(values: Floats, weights: Floats, share: float) -> float:
-    """Return the first of the values, [N], up to which, in ascending order, this share of the weights lies."""
+    """Return the weighted quantile of values, [N]: the smallest value that reaches this fraction of the weights."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     return float(values[order[min(int(np.searchsorted(total, share * total[-1])), len(order) - 1)]])
 
 
 def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
-    """The cells of a box, in which these Gaussians lie."""
+    """Split a box with these Gaussians into cells."""
     bounds = np.array([[quantile(means[:, axis], weights, share) for axis in range(3)] for share in CORE])
     size = bounds[1] - bounds[0]
     if count == 1:
         return [PartitionCell(box, size)]
     axis, first = int(size.argmax()), count // 2
-    place = _short(quantile(means[:, axis], weights, first / count))
-    below = means[:, axis] < place
+    cut = _short(quantile(means[:, axis], weights, first / count))
+    below = means[:, axis] < cut
     if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
-        raise DataError(
-            f"the model cannot be cut: {pluralize(len(means), 'Gaussian')} for {count} blocks; give fewer --blocks"
-        )
+        raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; give fewer --blocks")
     parts = ((below, "high", first), (~below, "low", count - first))
     return [
         cell
         for chosen, side, shares in parts
-        for cell in _cut(means[chosen], weights[chosen], _with_bound(box, side, axis, place), shares)
+        for cell in _cut(means[chosen], weights[chosen], _with_bound(box, side, axis, cut), shares)
     ]
 
 
-def _with_bound(box: Box, side: str, axis: int, place: float) -> Box:
+def _with_bound(box: Box, side: str, axis: int, cut: float) -> Box:
     bounds = list(getattr(box, side))
-    bounds[axis] = place
+    bounds[axis] = cut
     return box.model_copy(update={side: bounds})
 
 
 def _short(value: float) -> float:
-    """The value with as many digits as files show."""
+    """Round a value to the digits stored in files."""
     return float(f"{value:.{DIGITS}g}")
 
 
-# Which views a block is trained on: those that stand in its cell, and those of which it makes a share.
+# The views of a block: those with cameras in its cell, and those of which it covers enough pixels.
 
 Why = Literal["place", "sight", "best"]
 
@@ -118,35 +116,35 @@ Why = Literal["place", "sight", "best"]
 class Membership:
     """Which of V views belong to which of B blocks."""
 
-    share: Floats  # [V, B] of a view's pixels that the Gaussians of a cell make, by their blending weight
-    inside: NDArray[np.bool_]  # [V, B] whether its camera stands in the cell
-    sight: float  # share above which a view belongs to a block
+    share: Floats  # [V, B] fraction of a view's pixels covered by a cell's Gaussians, by blending weight
+    inside: NDArray[np.bool_]  # [V, B] whether the camera is in the cell
+    sight: float  # fraction of pixels above which a view belongs to a block
 
     @property
     def view_blocks(self) -> NDArray[np.bool_]:
-        """The blocks of each view, [V, B]: one at least, that of which it shows most."""
+        """The blocks of each view, [V, B]; at least the one that it shows most of."""
         best = np.arange(self.share.shape[1]) == self.share.argmax(axis=1)[:, None]
         return np.asarray(best | self.inside | (self.share > self.sight))
 
     @property
     def chosen(self) -> NDArray[np.bool_]:
-        """The same, with the view that shows most of it for a block that has none."""
-        found = self.view_blocks
-        for block in np.flatnonzero(~found.any(axis=0)):
-            found[self.share[:, block].argmax(), block] = True
-        return found
+        """The blocks of each view, [V, B]; a block without views gets the view that shows most of it."""
+        blocks = self.view_blocks
+        for block in np.flatnonzero(~blocks.any(axis=0)):
+            blocks[self.share[:, block].argmax(), block] = True
+        return blocks
 
     def why(self, view: int, block: int) -> Why:
-        """Return the reason for which a view belongs to a block."""
+        """Return the reason why a view belongs to a block."""
         if self.inside[view, block]:
             return "place"
         return "sight" if self.share[view, block] > self.sight else "best"
 
 
 def count_pairs(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
-    """Return the (tile, Gaussian) pairs of N = `count` Gaussians over views, [N]: what their training costs.
+    """Return the number of (tile, Gaussian) pairs of `count` Gaussians over all views, [N], a proxy of training cost.
 
-    It is an estimate by the radius of a splat, which an image's sides bound.
+    It is estimated from the radius of each splat, bounded by the image size.
     """
     total = np.zeros(count)
     for look in looks:
@@ -157,9 +155,9 @@ def count_pairs(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
 
 
 def pixel_share(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the share of a view's pixels that the Gaussians of each block make, [B], and which are seen, [N].
+    """Return the fraction of a view's pixels covered by each block, [B], and which Gaussians are visible, [N].
 
-    owner: the block of each Gaussian, [N].  Pixels that a mask leaves out do not count.
+    owner: the block of each Gaussian, [N].  Masked pixels do not count.
     """
     weight = look.sum(WEIGHT)
     pixels = max(int(look.counted().sum()), 1)
@@ -168,21 +166,21 @@ def pixel_share(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tu
 
 LOG = logging.getLogger("clsplat")
 Bits = NDArray[np.bool_]
-NEAR_CELL, GROWTH = 0.2, 0.2  # shares of a cell's size by which it is grown: for cameras, and for growth of Gaussians
-SIGHT = 0.05  # share of a view's pixels
+NEAR_CELL, GROWTH = 0.2, 0.2  # fractions of a cell's size by which it is extended, for cameras and for densification
+SIGHT = 0.05  # fraction of a view's pixels
 
 
 @dataclass(frozen=True)
 class Block:
-    """One part of the scene."""
+    """One block of the scene."""
 
     number: int
     cell: PartitionCell
     gaussians: int  # of the coarse model that it owns
-    pairs: float  # share of those of the whole
-    start: Bits  # [N] the Gaussians that it starts from: its own, and those that its views see, or none
-    views: list[dict[str, Any]]  # name, why, share of pixels
-    memory: int  # bytes on the device at the beginning
+    pairs: float  # fraction of all pairs
+    start: Bits  # [N] initial Gaussians: its own, those that its views see, and those that no view sees
+    views: list[dict[str, Any]]  # name, why, and share of pixels
+    memory: int  # device memory at the start, bytes
     origin: NDArray[np.floating]  # [3] world coordinates of the zero of `cell`
 
     @property
@@ -201,7 +199,7 @@ class Block:
         return self.cell.grown(GROWTH).shifted(-self.origin)
 
     def data(self) -> dict[str, Any]:
-        """Return what the manifest says of it."""
+        """Return the block's entry in the manifest."""
         grown = {"cell": self.box, "growth": self.growth}
         return {
             "name": self.name,
@@ -216,13 +214,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Partition:
-    """All blocks, and what the whole scene is."""
+    """All blocks, and properties of the whole scene."""
 
     blocks: list[Block]
     model: Model  # the coarse one
     coarse: str  # SHA-256 of its file
     extent: float  # scene units
-    memory: int  # bytes on the device of the coarse model with all views
+    memory: int  # device memory of the coarse model with all views, bytes
     views: int
 
     def data(self) -> dict[str, Any]:
@@ -231,14 +229,14 @@ class Partition:
         return {"coarse": self.coarse, **whole, "blocks": [block.data() for block in self.blocks]}
 
     def write(self, folder: Path) -> None:
-        """Write the manifest and, beside it, the Gaussians from which each block starts."""
+        """Write the manifest and, next to it, the initial Gaussians of each block."""
         for block in self.blocks:
             self.model[block.start].save(folder / f"{block.name}.ply")
         write_text(folder / MANIFEST, json.dumps(self.data(), indent=1) + "\n")
 
 
 class Partitioner:
-    """A coarse model at the training views of a scene."""
+    """Partitions a coarse model by the training views of a scene."""
 
     def __init__(self, model: Model, scene: Scene, device: Device, photographs: Photographs) -> None:
         self.model, self.device, self.photographs = model, device, photographs
@@ -247,9 +245,9 @@ class Partitioner:
         self._rasterizer, self._uploaded = Rasterizer(device), model.upload(device)
 
     def partition(self, count: int, coarse: str, sight: float = SIGHT) -> Partition:
-        """Cut the model into `count` blocks.  coarse: SHA-256 of its file; sight: share of pixels of Membership.
+        """Split the model into `count` blocks.  coarse: SHA-256 of its file; sight: as in `Membership`.
 
-        Each view is rendered twice.  Raises DataError where so many blocks are not to be had.
+        Each view is rendered twice.  Raises DataError if the model cannot be split into that many blocks.
         """
         means, total = self.model.means, len(self.model)
         pairs = count_pairs(self._looks(self.views), total, int(self.device.tuning["TILE"]))
@@ -273,9 +271,9 @@ class Partitioner:
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
     def _members(self, owner: NDArray[np.int64], found: list[PartitionCell], sight: float) -> tuple[Membership, Bits]:
-        """The views of each block, and the Gaussians that these see, or no view sees, [B, N]."""
-        places = np.stack([view.position for view in self.views])
-        inside = np.stack([cell.grown(NEAR_CELL).holds(places) for cell in found], axis=1)
+        """Return the views of each block, and the Gaussians that they see or that no view sees, [B, N]."""
+        positions = np.stack([view.position for view in self.views])
+        inside = np.stack([cell.grown(NEAR_CELL).holds(positions) for cell in found], axis=1)
         shares, seen = np.zeros(inside.shape), np.zeros((len(found), len(owner)), bool)
         for view, look in enumerate(self._looks(self.views)):
             shares[view], visible = pixel_share(look, owner, len(found))
@@ -284,14 +282,14 @@ class Partitioner:
         for view, block in np.argwhere(members.chosen & ~members.view_blocks):
             (look,) = self._looks([self.views[view]])
             seen[block] |= pixel_share(look, owner, len(found))[1]
-        return members, seen | ~seen.any(axis=0)  # what is hidden from all views may come to light in any
+        return members, seen | ~seen.any(axis=0)  # Gaussians hidden from all views may become visible in any
 
     def _looks(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
         return RenderedView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
     def _listed(self, members: Membership, block: int) -> list[dict[str, Any]]:
-        """The views of a block, in the order of the scene, with reasons."""
+        """Return the views of a block, in scene order, with reasons."""
         return [
             {
                 "name": self.views[view].name,
@@ -302,7 +300,7 @@ class Partitioner:
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:
-        """Bytes on the device of a training that begins with so many Gaussians and these views."""
+        """Return the device memory, bytes, of a training that starts with these Gaussians and views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
         held = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))

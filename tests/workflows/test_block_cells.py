@@ -40,18 +40,18 @@ def test_cell_grows_by_half_the_share_on_each_bounded_side():
 
 
 def test_nothing_is_not_cut():
-    with pytest.raises(DataError, match="holds no Gaussians"):
+    with pytest.raises(DataError, match="has no Gaussians"):
         cells(np.zeros((0, 3)), np.zeros(0), 2)
 
 
 def test_equal_places_are_not_cut():
-    with pytest.raises(DataError, match="cannot be cut: 5 Gaussians for 2 blocks; give fewer --blocks"):
+    with pytest.raises(DataError, match="5 Gaussians cannot be split into 2 blocks; give fewer --blocks"):
         cells(np.ones((5, 3)), np.ones(5), 2)
 
 
 def test_a_gaussian_without_a_place_is_told():
     means = np.array([[0.0, 0, 0], [np.nan, 0, 0]])
-    with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have places that are not finite"):
+    with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have positions that are not finite"):
         assign_cells(means, cells(means[:1], np.ones(1), 1))
 
 

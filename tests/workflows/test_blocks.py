@@ -168,7 +168,7 @@ def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_sce
     for path in (out / "block_01" / "checkpoints").iterdir():
         path.write_bytes(b"damaged")
     train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
-    assert "block_01: no checkpoint is whole; it is trained again from the beginning" in caplog.text
+    assert "block_01: no checkpoint is intact; training starts over" in caplog.text
     assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
 
 
@@ -184,7 +184,7 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
     shutil.copytree(trained[0], out)
     monkeypatch.setattr("clsplat.workflows.blocks.train_in_folder", empty)
     train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
-    assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
+    assert "block_01: no Gaussians are left in its cell; continuing without it" in caplog.text
     parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]
     np.testing.assert_array_equal(clsplat.load(out / "merged").means, np.concatenate(parts))
 
@@ -210,7 +210,7 @@ def test_blocks_trained_in_a_store_are_those_trained_here(tiny_scene, few_steps,
     cells = clsplat.status(tmp_path / "store")["cells"]
     assert [(cell["name"], cell["state"]) for cell in cells] == [("block_00", "published"), ("block_01", "published")]
     on.write_text("engine: inline\n")
-    with pytest.raises(ConfigError, match="--on: blocks are trained as cells of a store; expected the key store"):
+    with pytest.raises(ConfigError, match="--on: blocks are trained as cells of a store; add the key `store`"):
         train(tiny_scene, few_steps, out, blocks=2, min_coverage=NEVER, on=on)
 
 
@@ -227,7 +227,7 @@ def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
     told = [Path(part.strip().split(" at ")[0].split(";")[0]).name for part in parts]
     assert told == ["block_00: done", "block_01: done", "block_02: unknown", "merged: waiting"]
     (out / "blocks.json").write_text("[]")
-    with pytest.raises(DataError, match=r"blocks.json: expected the number of blocks; remove .*"):
+    with pytest.raises(DataError, match=r"blocks.json: the number of blocks is missing; restore"):
         clsplat.status(out)
 
 
@@ -270,17 +270,23 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("model.background={type: envmap}", "model.background is not for blocks: each block would learn its own"),
-        ("model.time={degree: 1}", "model.time is not for blocks: a cell holds Gaussians at their own time"),
-        ("optimize.modules.exposure={}", "optimize.modules is not for blocks: some would differ"),
-        ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),
-        ("densify.inside={low: [0, null, null]}", "densify.inside is not for blocks: blocks set it; leave it out"),
+        (
+            "model.background={type: envmap}",
+            "model.background cannot be used with blocks: each block would learn its own",
+        ),
+        ("model.time={degree: 1}", "model.time cannot be used with blocks: moving Gaussians leave their cells"),
+        ("optimize.modules.exposure={}", "optimize.modules cannot be used with blocks: some modules would differ"),
+        ("scene.validation=4", "scene.validation cannot be used with blocks: a block has no validation views"),
+        (
+            "densify.inside={low: [0, null, null]}",
+            "densify.inside cannot be used with blocks: blocks set it; leave it out",
+        ),
         (
             "densify.budget={type: parabola, gaussians: 900}",
-            "densify.budget is not for blocks: it counts the",
+            "densify.budget cannot be used with blocks: it counts all",
         ),
-        ("densify.per_pixel=0.1", "densify.per_pixel is not for blocks: photographs of blocks differ"),
-        ("init.source=random", "expected `init: {source: model}` first, and a stage 'optimize'"),
+        ("densify.per_pixel=0.1", "densify.per_pixel cannot be used with blocks: blocks have different photos"),
+        ("init.source=random", "start with `init: {source: model}`, and add a stage 'optimize'"),
     ],
 )
 def test_what_blocks_cannot_share_is_refused(override, message, tiny_scene, few_steps, tmp_path):
@@ -297,7 +303,7 @@ def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
 
 def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
     write_multiscale(tiny_scene, tmp_path / "scene", 2)
-    with pytest.raises(DataError, match="has each photograph in several sizes; expected one for blocks"):
+    with pytest.raises(DataError, match="has photos in several sizes; blocks need a single size"):
         train(tmp_path / "scene", few_steps, tmp_path / "out")
 
 
@@ -312,7 +318,7 @@ def test_a_plan_by_points_needs_points(tiny_scene, tmp_path):
     (tmp_path / "scene" / "points3d.ply").unlink()
     refused = CliRunner().invoke(app, ["inspect", str(tmp_path / "scene"), "--blocks", "2"])
     assert isinstance(refused.exception, DataError)
-    assert "has no points to cut by; `clsplat blocks --plan` trains a coarse model first" in str(refused.exception)
+    assert "has no points to partition; `clsplat blocks --plan` trains a coarse model first" in str(refused.exception)
 
 
 def test_inspect_shows_a_plan_by_the_points_before_training(tiny_scene, tmp_path, monkeypatch):
@@ -332,7 +338,7 @@ def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     assert shown.exit_code == 0, shown.output
     names = [line.split()[0] for line in shown.stdout.splitlines() if "%" in line]
     assert names == ["block_00", "block_01", "whole"]
-    assert "time, by growth" in shown.stdout
+    assert "estimated time" in shown.stdout
     assert all(re.search(r"\d min", line) for line in shown.stdout.splitlines() if "%" in line)
     refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
-    assert "holds a scene in blocks that differs in blocks" in str(refused.exception)
+    assert "has a scene in blocks that differs in blocks" in str(refused.exception)

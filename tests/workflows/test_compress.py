@@ -100,7 +100,7 @@ def test_unsearched_format_is_refused_before_anything_is_opened():
 
 @pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [float("nan")], [0.501, 0.5]])
 def test_what_are_no_shares_is_refused(keeps):
-    with pytest.raises(ConfigError, match="--keep: expected shares"):
+    with pytest.raises(ConfigError, match="--keep: expected fractions"):
         checked_keeps(keeps)
     assert checked_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
 
@@ -146,7 +146,7 @@ def test_names_of_files_are_escaped():
     text = page(CompressionTarget.parse("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
     assert "a<b>" not in text
     assert "a&lt;b&gt;" in text
-    assert "No file meets the target" in text
+    assert "No file has met the target" in text
     assert re.findall(r'<polyline[^>]* stroke="([^"]+)"[^>]*dasharray', text) == ["var(--target)"]
 
 
@@ -169,7 +169,7 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
     monkeypatch.setattr(model_file, "load", load)
     monkeypatch.setattr(compress, "load", load)
     (tmp_path / "own.txt").write_text("mine")
-    with pytest.raises(ConfigError, match="holds something else"):
+    with pytest.raises(ConfigError, match="has other files"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
     assert opened == [few_steps / "point_cloud.ply"]
 
@@ -183,7 +183,7 @@ def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkey
     run_stages = runner.run_stages
     monkeypatch.setattr(runner, "run_stages", interrupted)
     search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
-    with pytest.raises(Interrupted, match=r"^stopped in keep_50; the same command goes on$"):
+    with pytest.raises(Interrupted, match=r"^stopped in keep_50; run the same command again to resume$"):
         clsplat.compress_model(few_steps, **search)
     monkeypatch.setattr(runner, "run_stages", run_stages)
     assert Path(clsplat.compress_model(few_steps, **search)["file"]).is_file()
@@ -191,10 +191,10 @@ def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkey
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match="a search that differs in steps; remove it, or give another --out"):
+    with pytest.raises(ConfigError, match="a search that differs in steps; remove it or give another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
-    with pytest.raises(ConfigError, match="holds something else than a search"):
+    with pytest.raises(ConfigError, match="has other files than those of a search"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
 
 
@@ -237,16 +237,16 @@ def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path)
 @pytest.mark.parametrize("text", ["", "[]"])
 def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, tmp_path):
     (tmp_path / "compress.json").write_text(text)
-    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .*, or give another"):
+    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .* or give another"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
 
 
 def test_unreachable_target_leaves_page_and_nearest_file(few_steps, tmp_path):
-    with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_balanced\.spz") as error:
+    with pytest.raises(ConfigError, match=r"no file meets it; the closest, .*_degree_0_balanced\.spz") as error:
         clsplat.compress_model(few_steps, target="1B", out=tmp_path / "out", format="spz", keep=[1.0])
     assert "give a larger size" in str(error.value)
     assert not (tmp_path / "out" / "compressed.spz").exists()
-    assert "No file meets" in (tmp_path / "out" / "compress.html").read_text()
+    assert "No file has met" in (tmp_path / "out" / "compress.html").read_text()
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"
 
 
@@ -254,7 +254,7 @@ def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path)
     ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
     clsplat.compress_model(few_steps, target="1MB", **ask)
     assert detect(tmp_path / "out" / "compressed.spz").name == "SPZ"
-    with pytest.raises(ConfigError, match=r"no file meets it; .*; compressed\.spz there is of another target"):
+    with pytest.raises(ConfigError, match=r"no file meets it; .*; the existing compressed\.spz is for another target"):
         clsplat.compress_model(few_steps, target="2B", **ask)
     assert (tmp_path / "out" / "compressed.spz").is_file()
 
@@ -316,7 +316,7 @@ def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, 
 
 @pytest.mark.parametrize("steps", [19, 1, 0, -5])
 def test_fewer_steps_than_leave_an_average_are_refused(steps, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match=f"--steps {steps}: expected a number of at least 20"):
+    with pytest.raises(ConfigError, match=f"--steps {steps}: expected at least 20"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, steps=steps)
 
 

@@ -198,8 +198,8 @@ def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
 def test_what_cannot_be_merged_is_refused(rng):
     source = model(rng, 5)
     for keep in (0, -1, 1.5, float("nan")):
-        with pytest.raises(ConfigError, match="expected a share"):
+        with pytest.raises(ConfigError, match="expected a fraction"):
             decimate(source, keep)
     source.means[2, 1] = np.nan
-    with pytest.raises(DataError, match="1 Gaussians hold values that are not finite"):
+    with pytest.raises(DataError, match="1 Gaussians have values that are not finite"):
         decimate(source)

@@ -114,12 +114,12 @@ def alone(few_steps: Path, tmp_path: Path) -> Path:
 def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
     found = CliRunner().invoke(app, ["lod", str(alone), str(tmp_path / "site"), "--steps", "0"])
     assert found.exit_code == 0, found.output
-    assert "model.ply: no photographs: merged alone" in found.output
+    assert "model.ply: no photos: levels are merged without training" in found.output
 
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
 def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
-    message = rf"model\.ply: no photographs are known, needed for --{option}; give --scene, or leave that out$"
+    message = rf"model\.ply: has no known photos, which --{option} needs; give --scene, or leave that out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(alone, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
@@ -141,18 +141,20 @@ def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog
         (tmp_path / "gone").mkdir()
     found = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
     assert (len(found["levels"]), found["split"]) == (2, None)
-    assert "levels are merged alone, and not measured" in caplog.text
+    assert "levels are merged without training and not measured" in caplog.text
 
 
 def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
-    message = r"run: its photographs cannot be read, needed for --device; give --scene, or leave that out$"
+    message = r"run: its photos cannot be read, which --device needs; give --scene, or leave that out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
-    with pytest.raises(DataError, match=r"gone, is missing; .* \(--scene DIR names another; --steps 0 needs none\)$"):
+    with pytest.raises(
+        DataError, match=r"gone, is missing; .* \(give --scene DIR, or --steps 0 to merge without photos\)$"
+    ):
         clsplat.write_levels(moved, tmp_path / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -196,11 +198,11 @@ def interrupted(pipeline, run, run_stages=runner.run_stages):
 def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch, trained):
     run_stages = runner.run_stages
     monkeypatch.setattr(runner, "run_stages", interrupted)
-    with pytest.raises(Interrupted, match=r"^stopped in level_1; the same command goes on$"):
+    with pytest.raises(Interrupted, match=r"^stopped in level_1; run the same command again to resume$"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert not (tmp_path / "site").exists()
     monkeypatch.setattr(runner, "run_stages", run_stages)
-    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels that differs in steps"):
+    with pytest.raises(ConfigError, match=r"site\.training: has the training of levels that differs in steps"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert tree(tmp_path / "site") == tree(trained[0])
@@ -226,7 +228,7 @@ def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):
 
 def test_photographs_are_as_small_as_is_asked(few_steps, tmp_path):
     clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=STEPS, downscale=2)
-    assert "20 x 20 px" in (tmp_path / "site.training" / "level_1" / "log.txt").read_text()
+    assert "20x20 px" in (tmp_path / "site.training" / "level_1" / "log.txt").read_text()
 
 
 def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
@@ -240,12 +242,12 @@ def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
     [
         ({"levels": 0}, r"--levels 0: expected 1 to 12$"),
         ({"levels": 13}, r"--levels 13: expected 1 to 12$"),
-        ({"keep": 0.0}, "--keep 0: expected a share"),
-        ({"keep": 1.0}, "--keep 1: expected a share"),
-        ({"keep": float("nan")}, "--keep nan: expected a share"),
-        ({"steps": -1}, "--steps -1: expected a number of at least 20"),
+        ({"keep": 0.0}, "--keep 0: expected a fraction"),
+        ({"keep": 1.0}, "--keep 1: expected a fraction"),
+        ({"keep": float("nan")}, "--keep nan: expected a fraction"),
+        ({"steps": -1}, "--steps -1: expected at least 20"),
         ({"downscale": 0.5}, "--downscale 0.5: expected a divisor"),
-        ({"downscale": 2.0, "steps": 0}, "--downscale 2: belongs to a training; expected --steps above 0"),
+        ({"downscale": 2.0, "steps": 0}, "--downscale 2: needs training; set --steps above 0"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(plan, message):
@@ -256,7 +258,7 @@ def test_what_cannot_be_asked_is_refused(plan, message):
 def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
     model = clsplat.load(few_steps)
     model[:0].save(tmp_path / "empty.ply")
-    with pytest.raises(DataError, match=r"empty\.ply: the model holds no Gaussians; expected some to merge"):
+    with pytest.raises(DataError, match=r"empty\.ply: the model has no Gaussians to merge"):
         clsplat.write_levels(tmp_path / "empty.ply", tmp_path / "site")
     with pytest.raises(ConfigError, match="already exists; give a new folder"):
         clsplat.write_levels(few_steps, tmp_path)
@@ -267,7 +269,7 @@ def test_the_command_prints_a_table_and_advises_one_file_for_few(few_steps, tmp_
     found = CliRunner().invoke(app, arguments)
     assert found.exit_code == 0, found.output
     text = " ".join(found.output.split())
-    assert "below a million one SOG is better" in text
+    assert "below a million a single SOG is better" in text
     assert "level Gaussians MB PSNR, dB before training" in text
     assert "site/lod-meta.json: " in text.replace(" /", "/")
     assert "PSNR of test views, not yet quantized" in text
