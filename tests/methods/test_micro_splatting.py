@@ -45,7 +45,7 @@ def test_every_rule_and_penalty_acts(finished):
     assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
     page = (finished.out / "report.html").read_text()
     assert "anisotropy" in page
-    assert re.search("fraction of growth.*split_oversized", page)
+    assert re.search("changed by each rule.*split_oversized", page)
     shown = re.findall(r"<figcaption>(\S+) ", page)
     assert len(shown) == len(set(shown)) > 0, "a view is shown twice"
 
