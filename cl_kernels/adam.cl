@@ -3,7 +3,7 @@
  * adam_step reads gradients from memory.  update_gaussians computes the gradients of projection itself, which saves
  * writing and reading 59 values for each Gaussian; it gives the same bits as project_backward and adam_step.
  *
- * `every` is all ones where each Gaussian is updated, and 0 where those that were culled keep values and moments.
+ * `every` is all ones where each Gaussian is updated, and 0 where culled ones keep values and moments.
  * `undrawn` is all ones where vectors without a Gaussian in the view are updated at once, and 0 where their harmonics
  * wait (deferred.cl).
  *

@@ -45,7 +45,7 @@ class World:
         return distance, index
 
     def by_shape(self, of: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
-        """Evaluate `Shape.normal` or `Shape.texture` at points, each on the shape that it lies on, [3, R]."""
+        """Evaluate `Shape.normal` or `Shape.texture` at points, each on its shape, [3, R]."""
         out = np.zeros(points.shape)
         for i in np.unique(index):
             here = np.flatnonzero(index == i)

@@ -55,8 +55,8 @@ def named(name: str) -> WebArchive:
 def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
 
-    An interrupted download stays beside `out` as `….part`; the next call continues it.
-    Raises DataError when the download fails, the checksum differs or a file lies outside of the archive's folder.
+    An interrupted download stays next to `out` as `….part`; the next call continues it.
+    Raises DataError when the download fails, the checksum differs or a file is outside of the archive's folder.
     """
     if path_exists(out):
         report(f"{out} is there already: nothing to do")
@@ -130,7 +130,7 @@ def _continue(url: str, part: Path, report: Report) -> None:
 
 
 def _unpack(archive: Path, out: Path, report: Report) -> None:
-    """Unpack into a hidden folder beside, and rename it when it is whole."""
+    """Unpack into a hidden folder next to it, and rename that when it is complete."""
     temporary = out.with_name(f".{out.name}.unpacking")
     shutil.rmtree(temporary, ignore_errors=True)
     try:

@@ -131,7 +131,7 @@ class Moving(SyntheticOptions):
         return [(split, i, t) for split, poses in splits for i in range(len(poses)) for t in self.moments(split)]
 
     def images(self) -> list[str]:
-        """The files of a finished data set beside its cameras, points and manifest."""
+        """The files of a finished data set besides its cameras, points and manifest."""
         return [f"{_name(*frame)}.png" for frame in self.frames()] + [_static(i) for i in range(self.test)]
 
     def fill(self, out: Path, workers: int) -> str:

@@ -36,7 +36,7 @@ def unit(v: Array) -> Array:
 
 
 def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
-    """Turn (x, y, z) so that z lies along the unit columns `axis` (Duff et al. 2017)."""
+    """Turn (x, y, z) so that z is along the unit columns `axis` (Duff et al. 2017)."""
     sign = np.copysign(1.0, axis[2])
     a = -1 / (sign + axis[2])
     b = axis[0] * axis[1] * a

@@ -23,7 +23,7 @@ def write_sync_frames(scene: Path, moments: int, long_side: int | None = None) -
     """Write frames of `scene/videos/NAME.mp4` into `scene/videos/NAME/`, evenly spaced; return the number of cameras.
 
     The moments are the same of all cameras: the videos start together and have one rate.  Of a video with more frames
-    than another the end is left out, with a warning.  Folders with so many frames stay as they are.
+    than another the end is left out, with a warning.  Folders with that number of frames stay as they are.
     Raises DataError where there is no video, one cannot be decoded, or a folder holds another number of frames.
     """
     folder = scene / VIDEOS

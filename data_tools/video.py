@@ -21,7 +21,7 @@ from clsplat.scene.quality import SIDE, sharpness
 from clsplat.scene.times_file import write_times
 
 LOG = logging.getLogger("clsplat")
-RECORD = ".frames.json"  # beside the frames: what they were made from
+RECORD = ".frames.json"  # next to the frames: what they were made from
 FLOW_SIDE = 120  # px: motion is measured at this size
 CELLS = 4, 3  # in each of which the motion of all pixels is averaged, so that noise has little
 STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
@@ -30,7 +30,7 @@ STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
     """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
 
-    The format is PNG because a second lossy coding changes features and colors.  An interrupted call goes on: frames
+    The format is PNG because a second lossy coding changes features and colors.  An interrupted call continues: frames
     of the same video and settings stay unchanged.  times: also write times.json, of a scene that moves: the number of
     each frame in the video.
     Raises DataError when the video cannot be decoded, or has one frame, as a picture has, and when `out` holds other

@@ -29,7 +29,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPENING = threading.Lock()
-GEOMETRY = 6  # of the pixel sums, those that do not belong to the color (cl_kernels/splat.h)
+GEOMETRY = 6  # of the pixel sums: the ones of the geometry, not of the color (cl_kernels/splat.h)
 
 
 def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:

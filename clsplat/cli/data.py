@@ -143,7 +143,7 @@ def cameras(
 
     print("\n".join(str(path) for path in write_cameras(scene, out, format_, images)))
     if images == "none" and format_ != "inria":
-        print("the photographs are not beside them: to train on the folder, write it with --images copy")
+        print("the photographs were not copied; to train on this folder, write it with --images copy")
 
 
 @app.command()

@@ -64,7 +64,7 @@ class Settings(BaseModel):
         """Raise ConfigError if the whole pipeline file (PipelineFile) lacks something that this needs."""
 
     def parts(self) -> dict[str, Any]:
-        """Return the values by key, without those that have no effect."""
+        """Return the values by key, except values without effect."""
         return {key: getattr(self, key) for key in type(self).model_fields}
 
     def input_path(self, key: str, scene: str | None) -> Path | None:

@@ -1,4 +1,4 @@
-"""Split moving Gaussians in time, prune those that no view shows, and penalize their motion."""
+"""Split moving Gaussians in time, prune the invisible ones, and penalize their motion."""
 
 import math
 from typing import Annotated, ClassVar, Literal

@@ -109,7 +109,7 @@ class ErrorGain(Statistic):
 
 
 class ViewError(Statistic):
-    """Error of all views, also of those that do not see the Gaussian, as the losses measure it."""
+    """Error of all views, including views that do not see the Gaussian, as the losses measure it."""
 
     type: Literal["view_error"] = "view_error"
 

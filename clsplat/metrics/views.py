@@ -172,7 +172,7 @@ def color_figures(
 def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Average the results of color_figures over views, with the keys of metrics.json.
 
-    If some views have no `psnr_color`, `psnr_color_views` counts those that do, and `psnr_color_reason` says why; if
+    If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` says why; if
     none has, `psnr_color` is None.
     """
     found, has = means(rows), [row for row in rows if "psnr_color" in row]

@@ -75,7 +75,7 @@ class ShuffleOrder(Order):
 
 
 class StackOrder(Order):
-    """A random view of the finest size in the place of 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
+    """A random view of the finest size replaces 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
     released code of Mip-Splatting)."""
 
     type: Literal["stack"] = "stack"

@@ -1,7 +1,7 @@
 """Stretch the schedules of a pipeline to another number of training steps.
 
 Steps, durations and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
-order as before, and those that act at the same step still do.  Intervals may become fractional.  If there are so few
+order as before, and stages that act at the same step still do.  Intervals may become fractional.  If there are so few
 steps that two actions fall on one, they happen in the order of the list.  Learning rates of what is learned over the
 whole training, such as a filter, are divided by the factor.
 """
@@ -99,7 +99,7 @@ def last_edit(training: Training) -> int:
 
 
 def min_steps(training: Training) -> int:
-    """Return the fewest steps to which a training can be stretched so that no two edits fall on one step."""
+    """Return the smallest number of steps for a training in which no two edits fall on one step."""
     edits = {
         step
         for stage in training.during

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsplat.prepare.database import opened
 from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
-MAX_PAIRS = 120  # tested pairs, evenly spaced from the most matches to the fewest
+MAX_PAIRS = 120  # tested pairs, evenly spaced in the order of their matches
 NEAR = 3.0  # px: largest residual of a match that a homography explains, and motion of a static point
 EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
 FOCALS = np.geomspace(0.4, 4.0, 47)  # focal lengths to try, as fractions of the longer side

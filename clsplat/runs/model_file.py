@@ -296,7 +296,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
     for images in {path.resolve().parent for path in photographs}:
         if folder == images or folder in images.parents or images in folder.parents:
             raise ConfigError(
-                f"{out}: is, holds or lies in the folder of the photographs, {images}; give another --out"
+                f"{out}: is, contains or is inside the folder of the photographs, {images}; give another --out"
             )
     own = _rendered(out)
     for path in paths:
@@ -360,7 +360,7 @@ class ModelFile:
     ) -> int:
         """Write images (`kind` png) or float32 arrays (npy) of layers of the views of a split; return their number.
 
-        time: of all views, in [0, 1], instead of their own.
+        time: of all views, in [0, 1], instead of each view's time.
         """
         views: Sequence[View] = self.scene.split(split)
         if times := parse_times(time):

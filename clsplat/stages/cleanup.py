@@ -43,7 +43,7 @@ class Cleanup(Stage):
         [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
     )
     """Rules that remove Gaussians.  `prune_useless` with `views_below: 2` also removes Gaussians that are useful in
-    only one view; `prune_wide` removes those that are large on the screen."""
+    only one view; `prune_wide` removes Gaussians that are large on the screen."""
 
     @field_validator("rules")
     @classmethod

@@ -101,7 +101,7 @@ class Batch:
         """Raise OutputError if the folder now belongs to another process."""
 
     def run(self, execution: Execution, device: str | None) -> None:
-        """Run every cell whose result is not in the store; `failures` collects those that failed.
+        """Run every cell whose result is not in the store; `failures` collects the failed ones.
 
         device: for the engine inline.  Raises Interrupted, BitsMismatch.
         """

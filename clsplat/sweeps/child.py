@@ -14,7 +14,7 @@ from clsplat.core.machine import Cores
 from clsplat.pipeline import plugins
 from clsplat.sweeps.store import ERRORS, PIPELINE_FILE, CellAttempt
 
-# a process group of its own: Ctrl-C in the terminal reaches only the supervisor, which passes it on
+# a separate process group: Ctrl-C in the terminal reaches only the supervisor, which passes it on
 PROCESS_GROUP: dict[str, Any] = (
     {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     if os.name == "nt"

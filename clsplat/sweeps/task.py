@@ -127,7 +127,7 @@ def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt
 
 
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
-    """Raise DataError if the photos or other files are not those that the cell's key was made from."""
+    """Raise DataError if the photos or other files differ from what the cell's key was made from."""
     cell.require_files()
     for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():

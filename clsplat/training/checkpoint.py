@@ -120,7 +120,7 @@ MODULES = "modules/"  # before the names of modules, before those of their table
 
 
 def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables with their keys in the file.  whole: include those that only training needs."""
+    """Yield the tables with their keys in the file.  whole: include tables that only training needs."""
     for module, state in run.modules.items():
         if whole or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())

@@ -51,7 +51,7 @@ class Packed:
 
     @property
     def count(self) -> int:
-        """Number of splats, without those that no view shows."""
+        """Number of splats that some view shows."""
         return int(self.header["count"])
 
     @property

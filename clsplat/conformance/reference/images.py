@@ -134,7 +134,7 @@ def averaged(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any]
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), image)
 
 
-# One level of the Haar transform and back, with a high-pass analysis filter of its own: matrices of whole lines.
+# One level of the Haar transform and back, with a separate high-pass analysis filter: matrices of whole lines.
 
 LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
 

@@ -43,7 +43,7 @@ class TrainingStep:
     frame: Frame = field(init=False)
     planes: Planes = field(init=False)  # the photograph, and which pixels count
     image: Array = field(init=False)  # what the losses compare with the photograph; a module may replace it
-    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by that of its own input
+    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by the gradient of its input
     comparison: Comparison = field(init=False)
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)
@@ -95,7 +95,7 @@ class ModuleState:
 
     # saved in a checkpoint, next to `scalars`
     def tables(self, whole: bool = True) -> Tables:
-        """Copy the tables to the host.  whole: include those that only training needs, such as Adam moments."""
+        """Copy the tables to the host.  whole: include tables that only training needs, such as Adam moments."""
         return {}
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
@@ -227,7 +227,7 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
 def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
     """Return the module states of a training that ends at global step `last`, in order.
 
-    They are those of its list, those that the model and the losses imply, and those still active from before.
+    They are the listed ones, the ones that the model and the losses imply, and any still active from before.
     """
     trained = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
     groups = {module.group for module in trained}

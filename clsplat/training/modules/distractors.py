@@ -40,7 +40,7 @@ class Distractors(TrainingModule):
     """Give each photograph its own Gaussians just in front of its camera (DeSplat, Wang et al. 2024).
 
     They absorb what is not part of the scene, and appear in no other image, metric or file.  Their number is fixed.  A
-    loss on the area that they cover fades those that explain little.
+    loss on the area that they cover fades the ones that explain little.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
