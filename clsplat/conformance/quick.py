@@ -18,7 +18,7 @@ from clsplat.core.resources import __version__, resource_dir
 from clsplat.opencl.device import BUILD_OPTIONS, Device, open_device
 from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
 from clsplat.opencl.kernel_caches import damaged_kernels
-from clsplat.render.tiles import Sort, known_sort
+from clsplat.render.tiles import Sort, resolve_sort
 
 LOG = logging.getLogger("clsplat")
 TIMEOUT_S = 300  # longest silence of a check
@@ -44,7 +44,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     checked if the run may choose it.  Raises DeviceError if the device computes wrongly, and MemoryLimitError.
     """
     info, schedule = device.info, device.schedule
-    bitonic = known_sort(device, sort) != "radix"
+    bitonic = resolve_sort(device, sort) != "radix"
     sorts = SORTS if bitonic else SORTS[:1]
     if all(_record(info, schedule, name).exists() for name in sorts):
         return

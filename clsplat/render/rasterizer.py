@@ -1,4 +1,4 @@
-"""Render Gaussians to an image, and compute their gradients from the image's."""
+"""Render Gaussians to an image, and compute their gradients from the gradient of the image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -18,7 +18,7 @@ from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
-# Sums of gradient records over the pairs of each Gaussian, and what the blended inverse depth has beside them.
+# Sum gradient records over the pairs of each Gaussian, including those of the blended inverse depth.
 
 INVERSE_DEPTHS = "inverse_depth_sums"  # in the workspace
 
@@ -33,7 +33,7 @@ def sum_records(
 ) -> None:
     """Write the sums of the records [P, RECORD] of each Gaussian, [PIXEL_SUMS, S].
 
-    defines: has PIXEL_SUMS where it is not the usual number; accumulate: 1 adds to the sums.
+    defines: contains PIXEL_SUMS unless it is the default; accumulate: 1 adds to the sums.
     """
     device = gaussians.device
     device.program("gather.cl", **defines).sum_records(
@@ -51,7 +51,7 @@ def sum_records(
 def sum_inverse_depths(
     workspace: Workspace, pair_sums: Array, lists: TileLists, gaussians: Gaussians, accumulate: int
 ) -> Array:
-    """Return the sum over pixels of w dL/dD of each Gaussian, [S], of its records; `accumulate`: 1 adds to it."""
+    """Return the sum of w dL/dD over the pixels of each Gaussian, [S]; accumulate: 1 adds to the sums."""
     sums = workspace.array(INVERSE_DEPTHS, gaussians.capacity)
     workspace.device.program("inverse_depth.cl").sum_inverse_depths(
         items=gaussians.count,
@@ -66,7 +66,7 @@ def sum_inverse_depths(
 
 
 def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splats: Array, grad_means: Array) -> None:
-    """Add to the gradient of the means, [3, S], what the last sums and the splats [N, RECORD] give."""
+    """Add the gradient of the inverse depth, from the last sums, to that of the means; splats: [N, RECORD]."""
     count, capacity = splats.shape[0], grad_means.shape[1]
     workspace.device.program("inverse_depth.cl").inverse_depth_backward(
         items=count,
@@ -79,13 +79,10 @@ def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splat
     )
 
 
-# The arguments of kernels that project Gaussians.
-
-
 def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
     """Return the arguments of every kernel that projects Gaussians, by name.
 
-    Harmonics of rows that the camera does not see may wait for updates; those kernels do not read them.
+    Harmonics of Gaussians outside the view may have deferred updates; these kernels do not read them.
     """
     gaussians = model.gaussians
     names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
@@ -102,15 +99,13 @@ def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
     }
 
 
-# Project Gaussians to splats, those of the view being up to date.
-
 RECORD = int(constants()["RECORD"])
 
 
 def project(
     workspace: Workspace, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array
 ) -> Footprints:
-    """Write the records and radii of splats; return where they lie among the tiles of a band.
+    """Write the records and radii of splats; return their footprints on the tiles of a band.
 
     splats: [N, RECORD]; radius: [S] px.  The footprints are valid until the next call.
     """
@@ -132,9 +127,9 @@ def project(
 
 
 def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
-    """Do the updates that Gaussians in the view wait for, and fetch from the host what lies there.
+    """Apply the deferred updates of Gaussians in the view, and fetch their harmonics from the host.
 
-    A projection without harmonics says which Gaussians those are.
+    A projection without harmonics determines which Gaussians are in the view.
     """
     deferred, on_host = model.gaussians.deferred, model.gaussians.on_host
     if on_host or (deferred and deferred.updates):
@@ -149,10 +144,10 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
 
 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
-MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
+MAX_PAIRS = 2**31  # sums of pairs have 32 bits
 Content = Literal["color", "depth", "entropy", "inverse_depth"]
-# channels: color, or (depth of the mean in scene units, 1, 0); or color and a fourth plane, the entropy of weights or
-# the blended inverse depth of the means
+# The planes are the color, or (depth of the mean in scene units, 1, 0), or the color and a fourth plane: the entropy of
+# the weights, or the blended inverse depth of the means.
 FOURTH_PLANE: dict[Content, str] = {"entropy": "WEIGHT_ENTROPY", "inverse_depth": "INVERSE_DEPTH"}
 
 
@@ -162,15 +157,15 @@ class Frame:
 
     camera: DeviceCamera
     splats: Array  # [N, RECORD]
-    depth_key: Array  # [S] bits of the depth; all ones where the splat was culled
-    radius: Array  # [S] px, 3 standard deviations; 0: not seen
+    depth_key: Array  # [S] bits of the depth; all ones if the splat was culled
+    radius: Array  # [S] px, 3 standard deviations; 0: not visible
     lists: TileLists
-    tile_last: Array  # [T] pairs of each tile up to the last that any pixel blends
+    tile_last: Array  # [T] pairs of each tile up to the last one that any pixel blends
     image: Array  # [3, rows, stride], zero outside the image; with a fourth plane [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # what was blended
-    drawn: DeviceModel  # what was drawn: a moving model as it is at the time of the camera
+    drawn: DeviceModel  # the rendered model: a dynamic one at the timestamp of the camera
 
 
 @dataclass(frozen=True)
@@ -178,7 +173,7 @@ class RenderLimits:
     """Limits on memory and on launches; results do not depend on them."""
 
     pairs: int  # (tile, Gaussian) pairs in memory
-    tiles: int = 0  # of a launch; 0: all
+    tiles: int = 0  # per launch; 0: all
 
 
 class Rasterizer:
@@ -193,16 +188,16 @@ class Rasterizer:
         self.tiler = Tiler(device, self.workspace, sort)
         self.skies = Skies(device, self.workspace)
         self._black = device.zeros(3)
-        device.program("project.cl")  # built at once, as the others
+        device.program("project.cl")  # builds the program now, like the others
         self._blend("color")
         self._lanes = int(device.tuning["LANES"])
         self._gradients: GaussianGradients | None = None  # allocated at first use
 
     def forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "color") -> Frame:
-        """Render the model.  background: [3], where the model has no sky.
+        """Render the model.  background: [3], used if the model has no sky.
 
-        Where the pairs of all tiles are more than the budget or the device's memory, the frame is rendered in bands of
-        rows: the same bits.  Raises MemoryLimitError where one row at a time does not fit.
+        If the pairs of all tiles exceed the budget or the device's memory, the frame is rendered in bands of rows, with
+        the same bits.  Raises MemoryLimitError if a single row does not fit.
         """
         sky = model.sky if content != "depth" else None
         model = at_moment(self.workspace, model, camera)
@@ -216,7 +211,7 @@ class Rasterizer:
             except TooManyPairs as error:
                 if not self._narrow(camera):
                     raise MemoryLimitError(
-                        f"a picture of {camera.width}x{camera.height} pixels: one row of its tiles has more than "
+                        f"an image of {camera.width}x{camera.height} px: one row of tiles has more than "
                         f"{MAX_PAIRS:,} pairs of a tile and a Gaussian; use smaller images or fewer Gaussians"
                     ) from error
             except MemoryLimitError:
@@ -224,7 +219,7 @@ class Rasterizer:
                     raise
 
     def _narrow(self, camera: DeviceCamera) -> bool:
-        """Halve the bands of a frame; return whether they had more than one row."""
+        """Halve the height of the bands; return whether they had more than one row."""
         bands = self._bands.get(camera.tiles_y, 1)
         self._bands[camera.tiles_y] = 2 * bands
         return bands < camera.tiles_y
@@ -257,7 +252,7 @@ class Rasterizer:
         return Frame(camera, *seen, image, transmittance, bands, content, model)
 
     def _blend(self, content: Content, **defines: int) -> Program:
-        """The kernels of blending; without sums and a fourth plane that nobody reads."""
+        """Return the blending kernels, with a fourth plane only if the content needs it."""
         defines |= {FOURTH_PLANE[content]: 1} if content in FOURTH_PLANE else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
@@ -266,7 +261,7 @@ class Rasterizer:
         return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
-        """First tile and number of tiles of each launch: few where the watchdog of a display limits its time."""
+        """Return the first tile and the number of tiles of each launch; display watchdogs may limit the time of one."""
         step = self.budget.tiles or band.tiles_inside
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
@@ -296,9 +291,9 @@ class Rasterizer:
     ) -> Array:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: as the frame's image, zero outside it.  A `count` above PIXEL_SUMS takes more time; those of
-        the texture need `texture`, [rows, stride], below 0 where it is not known.  behind: [rows, stride] T dL/dT of a
-        loss of what the splats leave, T.  Memory as in `forward`.
+        grad_image: in the layout of the frame's image, zero outside it.  A `count` above PIXEL_SUMS is slower; texture
+        sums need `texture`, [rows, stride], negative where unknown.  behind: [rows, stride] T dL/dT of a loss on the
+        transmittance T.  Memory as in `forward`.
         """
         bands = frame.bands
         while True:
@@ -320,7 +315,7 @@ class Rasterizer:
         behind: Array | None,
     ) -> Array:
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
-        of_blend = {**defines, "GRAD_BEHIND": 1} if behind else defines
+        blend_defines = {**defines, "GRAD_BEHIND": 1} if behind else defines
         pixel_sums = self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
         for number, band in enumerate(bands):
             lists = frame.lists
@@ -328,7 +323,7 @@ class Rasterizer:
                 lists = self._project_band(frame.drawn, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **of_blend, **model.defines).blend_backward(
+                self._blend(frame.content, **blend_defines, **model.defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -337,7 +332,7 @@ class Rasterizer:
                     camera=frame.camera.array,
                     image=frame.image,
                     grad_image=grad_image,
-                    texture=texture or frame.transmittance,  # without a texture the kernel reads none
+                    texture=texture or frame.transmittance,  # the kernel reads it only with texture sums
                     behind=behind or frame.transmittance,
                     tile_last=frame.tile_last,
                     pair_sums=pair_sums,
@@ -349,7 +344,7 @@ class Rasterizer:
         return pixel_sums
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> GaussianGradients:
-        """Return the derivatives of the loss by every parameter of the frame's model; valid until the next call."""
+        """Return the gradients of the loss with respect to all parameters of the model; valid until the next call."""
         if self._gradients is None or not self._gradients.fits(model.gaussians):
             self._gradients = GaussianGradients(model.gaussians)
         gradients = self._gradients

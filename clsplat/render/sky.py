@@ -1,4 +1,4 @@
-"""The sky in a frame and its derivatives: cl_kernels/sky.cl, and the runs of pixels that it works on."""
+"""Render the sky and compute its gradients, in runs of pixels (cl_kernels/sky.cl)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ NUMBERS = constants("sky.cl")
 RUN_WORDS, CORNERS, RUN_SUMS, PLACE_BITS, BORDER = (
     int(NUMBERS[name]) for name in ("RUN_WORDS", "CORNERS", "RUN_SUMS", "PLACE_BITS", "BORDER")
 )
-KEPT = 1 << 28  # bytes of runs on the device at most: those of the cameras that were used last
+CACHE_SIZE = 1 << 28  # bytes, of runs on the device
 Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The pixels of a camera by the texels that they lie between."""
+    """The pixels of a camera, grouped by the texels that they interpolate."""
 
-    camera: Array  # [1] camera_t that they are of
+    camera: Array  # [1] camera_t
     runs: Array  # [R, RUN_WORDS] uint32
-    strips: Array  # [strips + 1] uint32, first run of what one item paints
-    shown: Array  # [texels] uint32, those that the camera shows
+    strips: Array  # [strips + 1] uint32, first run of each work item
+    shown: Array  # [texels] uint32, texels in the view
     first_entry: Array  # [texels + 1] uint32
     entries: Array  # [R * CORNERS] uint32, run * CORNERS + corner, by texel
 
@@ -37,10 +37,7 @@ class Runs:
 
 
 def directions_of(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
-    """Return the directions of the rays through the centers of pixels in the scene, [height, width, 3], of any length.
-
-    values: camera_t.
-    """
+    """Return unnormalized ray directions through pixel centers, [height, width, 3], scene axes; values: camera_t."""
     turn = values["world_to_camera"].reshape(3, 4)[:, :3].astype(np.float64)
     x = (np.arange(width) + 0.5 - np.float64(values["cx"])) / np.float64(values["fx"])
     y = (np.arange(height) + 0.5 - np.float64(values["cy"])) / np.float64(values["fy"])
@@ -48,29 +45,31 @@ def directions_of(values: NDArray[np.void], width: int, height: int) -> NDArray[
 
 
 def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> Integers:
-    """Return the runs of all rows, [R, RUN_WORDS]: pixels side by side that lie between the same four texels, in one
-    octant.  values: camera_t."""
+    """Return the runs of all rows, [R, RUN_WORDS]: adjacent pixels of a row between the same four texels of an octant.
+
+    values: camera_t.
+    """
     rays = directions_of(values, width, height)
     first = np.floor(texel_positions(rays, side)).astype(np.int64)
     bits = (signs(rays) < 0) @ np.array([1, 2, 4])
-    place = first[..., 0] + 1 | (first[..., 1] + 1) << PLACE_BITS | bits << 2 * PLACE_BITS
-    begins = np.ones(place.shape, bool)
-    begins[:, 1:] = place[:, 1:] != place[:, :-1]
-    row, column = np.nonzero(begins)
+    key = first[..., 0] + 1 | (first[..., 1] + 1) << PLACE_BITS | bits << 2 * PLACE_BITS
+    starts = np.ones(key.shape, bool)
+    starts[:, 1:] = key[:, 1:] != key[:, :-1]
+    row, column = np.nonzero(starts)
     end = np.append(column[1:], width)
     end[np.append(row[1:] != row[:-1], True)] = width
-    found = first[row, column]
-    words = np.column_stack([row, column, end, place[row, column]])
-    return np.column_stack([words, bilinear_texels(found[:, 0], found[:, 1], side)])
+    corner = first[row, column]
+    words = np.column_stack([row, column, end, key[row, column]])
+    return np.column_stack([words, bilinear_texels(corner[:, 0], corner[:, 1], side)])
 
 
 class Skies:
-    """Paints skies, and sums their gradients; keeps the runs of the cameras that were used last."""
+    """Renders skies and computes their gradients; caches the runs of recently used cameras."""
 
-    def __init__(self, device: Device, workspace: Workspace, kept: int = KEPT) -> None:
+    def __init__(self, device: Device, workspace: Workspace, cache_size: int = CACHE_SIZE) -> None:
         self.device, self.workspace = device, workspace
-        self._limit = min(kept, device.info.memory // 16)
-        self._kept: dict[tuple[int, int], Runs] = {}  # least recently used first
+        self._limit = min(cache_size, device.info.memory // 16)
+        self._cache: dict[tuple[int, int], Runs] = {}  # least recently used first
         self._lanes = int(device.tuning["LANES"])
 
     @property
@@ -78,15 +77,15 @@ class Skies:
         return self.device.program("sky.cl")
 
     def runs(self, camera: DeviceCamera, side: int) -> Runs:
-        """Return the runs of a camera; the first time it waits for the device."""
+        """Return the runs of a camera; waits for the device if they are not cached."""
         key = camera.array.buffer.int_ptr, side
-        found = self._kept.pop(key, None) or self._made(camera, side)
-        while self._kept and found.nbytes + sum(runs.nbytes for runs in self._kept.values()) > self._limit:
-            self._kept.pop(next(iter(self._kept)))
-        self._kept[key] = found
+        found = self._cache.pop(key, None) or self._compute(camera, side)
+        while self._cache and found.nbytes + sum(runs.nbytes for runs in self._cache.values()) > self._limit:
+            self._cache.pop(next(iter(self._cache)))
+        self._cache[key] = found
         return found
 
-    def _made(self, camera: DeviceCamera, side: int) -> Runs:
+    def _compute(self, camera: DeviceCamera, side: int) -> Runs:
         values = np.asarray(camera.array.get(), CAMERA)[0]
         words = run_words(values, camera.width, camera.height, side)
         texel = words[:, -CORNERS:].ravel()
@@ -98,7 +97,7 @@ class Skies:
         return Runs(camera.array, *(self.device.upload(array.astype(np.uint32)) for array in arrays))
 
     def paint(self, sky: DeviceSky, camera: DeviceCamera, image: Array, transmittance: Array) -> None:
-        """Add what the splats leave, [rows, stride], times the sky to an image, [3 or 4, rows, stride], in place."""
+        """Add the sky times the transmittance, [rows, stride], to an image, [3 or 4, rows, stride], in place."""
         runs = self.runs(camera, sky.side)
         self._program.sky_forward(
             items=runs.strips.shape[0] - 1,
@@ -123,10 +122,10 @@ class Skies:
         difference: float,
         scale: float,
     ) -> tuple[Array, Array]:
-        """Return T dL/dT of the loss of what covers the sky, [1, rows, stride], and its sums of 1 - T by row, [rows].
+        """Return T dL/dT of the loss on splats in front of the sky, [1, rows, stride], and row sums of 1 - T, [rows].
 
-        free: [1, side * side] 1 for a texel that is learned, else 0; photograph: [3, rows, stride]; difference: up to
-        which a pixel shows the sky; scale: factor of the sums.
+        free: [1, side * side], 1 for trained texels, otherwise 0; photograph: [3, rows, stride]; difference: maximum
+        at which a pixel counts as sky; scale: factor of the sums.
         """
         runs, wide = self.runs(camera, sky.side), camera.stride + 2 * BORDER
         matches = self.workspace.array("sky matches", (camera.rows + 2, wide))
@@ -161,10 +160,10 @@ class Skies:
         return behind, sums
 
     def by_texels(self, sky: DeviceSky, camera: DeviceCamera, transmittance: Array, gradient: Array) -> Array:
-        """Return derivatives by the texels that the camera shows, [3, shown], from those by the image."""
+        """Return the gradient of the texels in the view, [3, shown], from that of the image."""
         runs = self.runs(camera, sky.side)
         count, shown = runs.runs.shape[0], runs.shown.shape[0]
-        sums, found = self.workspace.array("run sums", (count, RUN_SUMS)), self.workspace.array("texels", (3, shown))
+        sums, result = self.workspace.array("run sums", (count, RUN_SUMS)), self.workspace.array("texels", (3, shown))
         self._program.sky_backward(
             items=count,
             runs=runs.runs,
@@ -180,18 +179,18 @@ class Skies:
             run_sums=sums,
             first_entry=runs.first_entry,
             entries=runs.entries,
-            by_texels=found,
+            by_texels=result,
             shown=shown,
         )
-        return found
+        return result
 
     def update(
         self, sky: DeviceSky, camera: DeviceCamera, by_texels: Array, moments: Mapping[str, Array], rate: float
     ) -> None:
-        """Change the texels that the camera shows by Adam.
+        """Update the texels in the view with Adam.
 
-        by_texels: [3, shown]; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side], and `free`,
-        1 for a texel that is learned and else 0, [1, side * side].
+        by_texels: [3, shown] gradient; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
+        and `free`, [1, side * side], 1 for trained texels, otherwise 0.
         """
         runs = self.runs(camera, sky.side)
         self._program.sky_update(

@@ -1,8 +1,8 @@
-"""The splats of each tile, front to back.
+"""List the splats of each tile, front to back.
 
-Two algorithms give the same result.  Radix: order the Gaussians by depth once, emit their (tile, Gaussian) pairs in
-that order and sort stably by tile alone.  Bitonic: emit in order of index, write pairs to tiles, sort each tile by
-(depth, index).  Both give every tile the same splats in the same order, ties by index.
+Two algorithms give the same result.  Radix sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in that
+order, and sorts stably only by tile.  Bitonic emits the pairs in order of index, and sorts each tile by (depth, index).
+Both break ties by index.
 """
 
 import time
@@ -15,15 +15,15 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
-Defines = dict[str, int] | None  # with which the records were made
-TRIALS = 3  # of each sort when `auto` measures
-ONE_GROUP = 32  # values of an item, at most, where one group scans them all
-BLOCKS_MAX = 1024  # of a scan: each adds the sums of all before it
+Defines = dict[str, int] | None  # those of the projection
+TRIALS = 3  # of each sort for `auto`
+MAX_SINGLE_GROUP_RUN = 32  # values per item, up to which one group scans everything
+MAX_SCAN_BLOCKS = 1024  # each adds the sums of all blocks before it
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """Where each splat lies in depth and on the grid of tiles, [S] uint32 each; see cl_kernels/tiles.h."""
+    """The depth and the tiles of each splat, [S] uint32 each; see cl_kernels/tiles.h."""
 
     depth_key: Array
     tile_count: Array
@@ -33,7 +33,7 @@ class Footprints:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs in emission order, where the pairs of one Gaussian are contiguous, and the order of each tile."""
+    """Pairs in emission order, with those of a Gaussian contiguous, and the depth order of each tile."""
 
     pairs: int
     pair_splat: Array  # [P] Gaussian of each pair
@@ -45,7 +45,7 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Band:
-    """Rows of tiles, from `row_begin` up to `row_end`, of a grid: all of them, or those that are rendered together."""
+    """The rows of tiles, from `row_begin` to `row_end` (exclusive), that are rendered together."""
 
     tiles_x: int
     tiles_y: int
@@ -67,21 +67,21 @@ class Band:
 
 
 class TooManyPairs(Exception):
-    """A band has more pairs than the limit: use bands with fewer rows of tiles."""
+    """A band has more pairs than the limit; use bands with fewer rows of tiles."""
 
 
-def known_sort(device: Device, sort: Sort) -> Sort:
-    """Return radix for `auto` on a device without teams, since bitonic needs barriers; else `sort` itself."""
+def resolve_sort(device: Device, sort: Sort) -> Sort:
+    """Resolve `auto` to radix on devices without barriers, which bitonic needs; return other sorts unchanged."""
     return "radix" if sort == "auto" and int(device.tuning["TEAM"]) == 1 else sort
 
 
 class Tiler:
-    """Builds tile lists; `sort` is radix, bitonic or auto: radix on CPUs, on GPUs the faster on the first frame."""
+    """Builds tile lists.  sort: auto is radix on CPUs, and the faster one in the first frame on GPUs."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace
         self._team = int(device.tuning["TEAM"])
-        self.sort: Sort = known_sort(device, sort)
+        self.sort: Sort = resolve_sort(device, sort)
         self._pairs = device.program("pairs.cl")
         self._scan = device.program("scan.cl")
         self._radix = device.program("sort_radix.cl")
@@ -91,9 +91,9 @@ class Tiler:
     def build(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
     ) -> TileLists:
-        """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the only wait.
+        """Build the tile lists of `count` splats in a band.  Waits only to read the number of pairs.
 
-        Raises TooManyPairs when there are more than `limit`.
+        Raises TooManyPairs if there are more than `limit`.
         """
         if self.sort == "auto":
             self.sort = self._faster(splats, footprints, band, count, limit, defines)
@@ -133,7 +133,7 @@ class Tiler:
         return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
-        """Return what both kernels for large splats take; a group on a GPU looks through as many as it has items."""
+        """Return the arguments of both kernels for large splats; on GPUs, each item checks one splat."""
         run = self._team if self._team > 1 else self._runs(count, shortest=1 << 8)[0]
         size = {"groups": -(-count // run), "run": run, "count": count}
         size |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
@@ -146,9 +146,9 @@ class Tiler:
             offset.fill(0)
             return offset
         run, _ = self._runs(count, shortest=1 << 14)
-        if count <= ONE_GROUP * self._team:  # on a GPU one launch of long runs is shorter than two
+        if count <= MAX_SINGLE_GROUP_RUN * self._team:  # on GPUs, one launch with long runs is faster than two
             run = max(run, -(-count // self._team))
-        run = max(run, -(-count // (BLOCKS_MAX * self._team)))
+        run = max(run, -(-count // (MAX_SCAN_BLOCKS * self._team)))
         blocks = -(-count // (run * self._team))
         block_sum = self._zero
         if blocks > 1:
@@ -185,8 +185,8 @@ class Tiler:
         return keys, values
 
     def _runs(self, count: int, shortest: int) -> tuple[int, int]:
-        """Return the number of values of an item, and the number of groups."""
-        even = -(-count // (4 * self.device.info.units))  # four runs for each core even out their speeds
+        """Return the number of values per item, and the number of groups."""
+        even = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
         run = 8 if self._team > 1 else max(shortest, even)
         return run, -(-count // (run * self._team))
 
@@ -241,7 +241,7 @@ class Tiler:
         for sort in ("radix", "bitonic"):
             tiler = Tiler(self.device, self.workspace, sort)
             times = []
-            for _ in range(1 + TRIALS):  # the first one compiles
+            for _ in range(1 + TRIALS):  # the first trial compiles
                 start = time.perf_counter()
                 tiler.build(splats, footprints, band, count, limit, defines)
                 self.device.finish()

@@ -1,4 +1,4 @@
-"""Device memory that frames reuse."""
+"""Reuse device memory between frames."""
 
 import math
 from typing import Any
@@ -13,7 +13,7 @@ GROWTH = 1.25
 
 
 class Workspace:
-    """Arrays by name; a name keeps its buffer until it must grow."""
+    """Named arrays, each of which keeps its buffer until it must grow."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
@@ -22,20 +22,22 @@ class Workspace:
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Return an array of that shape; its values are undefined.
 
-        Raises MemoryLimitError when it does not fit, also without room to grow.
+        Raises MemoryLimitError if it does not fit, even without room to grow.
         """
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         length = math.prod(shape)
-        held = self._arrays.get(name)
-        if held is None or held.nbytes < length * kind.itemsize:
-            grows, held = held is not None, None
+        array = self._arrays.get(name)
+        if array is None or array.nbytes < length * kind.itemsize:
+            grows, array = array is not None, None
             self._arrays.pop(name, None)  # released before its successor is allocated
-            held = self._arrays[name] = self._roomy(length, kind) if grows else self.device.zeros(length, kind)
-        return Array(self.device, held.buffer, shape, kind)
+            array = self._arrays[name] = (
+                self._allocate_with_slack(length, kind) if grows else self.device.zeros(length, kind)
+            )
+        return Array(self.device, array.buffer, shape, kind)
 
-    def _roomy(self, length: int, kind: np.dtype[Any]) -> Array:
-        """Allocate with room to grow, as far as the device has it."""
+    def _allocate_with_slack(self, length: int, kind: np.dtype[Any]) -> Array:
+        """Allocate with room to grow, if the device has enough memory."""
         largest = self.device.info.allocation // kind.itemsize
         try:
             return self.device.zeros(max(length, min(int(length * GROWTH), largest)), kind)

@@ -19,7 +19,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DeviceError, MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import tuning_of
-from clsplat.render.tiles import known_sort
+from clsplat.render.tiles import resolve_sort
 from tests.support.doctor_worker import worker
 from tests.support.models import model_of
 
@@ -174,7 +174,7 @@ def test_the_two_second_form_holds(info, empty_cache):
     opened = Device(info)
     quick.ensure_correct(opened)
     records = list((empty_cache / "conformance").iterdir())
-    assert len(records) == (1 if known_sort(opened, "auto") == "radix" else 2)  # either sort may be chosen
+    assert len(records) == (1 if resolve_sort(opened, "auto") == "radix" else 2)  # either sort may be chosen
 
 
 # ---- wherever a device works

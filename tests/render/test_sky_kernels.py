@@ -109,7 +109,7 @@ def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
 def test_runs_of_pixels_are_kept_within_a_budget(device, rng):
     scene = Scene(device, rng, EnvironmentMap(side=8))
     camera, workspace = scene.photograph.camera, scene.trainer.rasterizer.workspace
-    skies = Skies(device, workspace, kept=1)
+    skies = Skies(device, workspace, cache_size=1)
     first = skies.runs(camera, 8)
     assert skies.runs(camera, 8) is first, "the last camera's are kept, whatever their size"
     assert skies.runs(camera, 16) is not first
