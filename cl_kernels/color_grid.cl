@@ -164,20 +164,20 @@ void color_grid_backward(
         const VF luminance = luminance_of(r, g, b), level = level_of(luminance, nz);
         VF a[ENTRIES], s[ENTRIES];
         matrices_of(grid, nx, nz, x, per_column, level, a, s);
-        VF p[3], by_level = zero;
+        VF p[3], grad_level = zero;
         for (uint c = 0; c < 3; c++) {
             const VF own = c == 0 ? r : c == 1 ? g : b;
             const VF changed = own + (a[4 * c] * r + a[4 * c + 1] * g + a[4 * c + 2] * b + a[4 * c + 3]);
             p[c] = (changed < 1.0f ? inside : zero) * VLOAD(gradient + c * plane + at);
             VSTORE(p[c], passed + c * plane + at);
-            by_level += p[c] * (s[4 * c] * r + s[4 * c + 1] * g + s[4 * c + 2] * b + s[4 * c + 3]);
+            grad_level += p[c] * (s[4 * c] * r + s[4 * c + 1] * g + s[4 * c + 2] * b + s[4 * c + 3]);
         }
-        const VF between = luminance > 0.0f ? (level < (float)(nz - 1) ? by_level : zero) : zero;
-        const VF by_luminance = (float)(nz - 1) * between;
-        VSTORE(p[0] + (a[0] * p[0] + a[4] * p[1] + a[8] * p[2]) + LUMINANCE_RED * by_luminance, grad_image + at);
-        VSTORE(p[1] + (a[1] * p[0] + a[5] * p[1] + a[9] * p[2]) + LUMINANCE_GREEN * by_luminance,
+        const VF between = luminance > 0.0f ? (level < (float)(nz - 1) ? grad_level : zero) : zero;
+        const VF grad_luminance = (float)(nz - 1) * between;
+        VSTORE(p[0] + (a[0] * p[0] + a[4] * p[1] + a[8] * p[2]) + LUMINANCE_RED * grad_luminance, grad_image + at);
+        VSTORE(p[1] + (a[1] * p[0] + a[5] * p[1] + a[9] * p[2]) + LUMINANCE_GREEN * grad_luminance,
                grad_image + plane + at);
-        VSTORE(p[2] + (a[2] * p[0] + a[6] * p[1] + a[10] * p[2]) + LUMINANCE_BLUE * by_luminance,
+        VSTORE(p[2] + (a[2] * p[0] + a[6] * p[1] + a[10] * p[2]) + LUMINANCE_BLUE * grad_luminance,
                grad_image + 2 * plane + at);
         if (channels > 3)
             VSTORE(VLOAD(gradient + 3 * plane + at), grad_image + 3 * plane + at);
@@ -231,7 +231,7 @@ void color_grid_row_sums(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_gather(
     __global const float *restrict row_sums,  // [ENTRIES,nz,nx,H']
-    __global float *restrict by_grid,         // [ENTRIES,nz,ny,nx]
+    __global float *restrict grad_grid,         // [ENTRIES,nz,ny,nx]
     const uint nx,
     const uint ny,
     const float per_row,                      // (ny - 1) / height
@@ -248,5 +248,5 @@ void color_grid_gather(
         const float weight = 1.0f - fabs(((float)y + 0.5f) * per_row - (float)j);
         total += weight > 0.0f ? weight * sums[y] : 0.0f;
     }
-    by_grid[e] = total;
+    grad_grid[e] = total;
 }

@@ -14,7 +14,7 @@
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_smoothness(
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
-    __global float *restrict by_smoothness,   // [ENTRIES,nz,ny,nx]
+    __global float *restrict grad_smoothness,   // [ENTRIES,nz,ny,nx]
     __global float *restrict shares,          // [ENTRIES,nz,ny,nx]
     const uint first,                         // value of the photograph
     const uint nx,
@@ -39,15 +39,15 @@ void color_grid_smoothness(
         derivative += 2.0f * weights[axis] * (before - after);
         share += weights[axis] * after * after;
     }
-    by_smoothness[e] = derivative;
+    grad_smoothness[e] = derivative;
     shares[e] = share;
 }
 
 /* One update of a photograph's grid by Adam.  One item = one value. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_update(
-    __global const float *restrict by_grid,        // [ENTRIES,nz,ny,nx] derivatives of the losses
-    __global const float *restrict by_smoothness,  // [ENTRIES,nz,ny,nx]
+    __global const float *restrict grad_grid,        // [ENTRIES,nz,ny,nx] derivatives of the losses
+    __global const float *restrict grad_smoothness,  // [ENTRIES,nz,ny,nx]
     __global float *restrict values,               // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict moment1,              // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict moment2,              // [photographs,ENTRIES,nz,ny,nx]
@@ -59,7 +59,8 @@ void color_grid_update(
     const uint e = get_global_id(0), at = first + e;
     if (e >= count)
         return;
-    adam_update(values + at, moment1 + at, moment2 + at, by_grid[e] + by_smoothness[e], ALL_LANES, rate, correction2,
+    adam_update(values + at, moment1 + at, moment2 + at, grad_grid[e] + grad_smoothness[e], ALL_LANES, rate,
+                correction2,
                 EPSILON);
 }
 

@@ -6,7 +6,7 @@
  * whole tiles, zero outside the image.  One group of TEAM items = one row; each sum is written once.  Deterministic. */
 #include "planes.h"
 
-#define SUMS 12  // derivatives by the matrix [E | b], row by row
+#define SUMS 12  // gradients of the matrix [E | b], row by row
 
 /* Change the colors.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))

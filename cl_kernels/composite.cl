@@ -81,8 +81,8 @@ void composite_backward(
     __global const float *restrict colors,        // [rays,3]
     __global const float *restrict photograph,     // [3,rows,stride]
     __global const uint *restrict pixels,          // [counted] row * width + column
-    __global float *restrict by_colors,           // [T,COLOR_ROWS,SAMPLES]
-    __global float *restrict by_densities,         // [T,COLOR_ROWS,SAMPLES]
+    __global float *restrict grad_colors,           // [T,COLOR_ROWS,SAMPLES]
+    __global float *restrict grad_densities,         // [T,COLOR_ROWS,SAMPLES]
     __global float *restrict errors,               // [step's rays] from first_ray on
     const float scale,                             // of a ray's squared difference in the loss
     const uint first_ray,
@@ -99,10 +99,10 @@ void composite_backward(
     const float own = ray < counted ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
     const uint pixel = pixels[ray < counted ? ray : counted - 1];
     __global const float *shown = photograph + pixel / width * stride + pixel % width, *t = edges + ray * (samples + 1);
-    float by_color[3], error = 0.0f;
+    float grad_color[3], error = 0.0f;
     for (uint channel = 0; channel < 3; channel++) {
         const float difference = colors[ray * 3 + channel] - shown[channel * plane];
-        by_color[channel] = 2.0f * own * scale * difference;
+        grad_color[channel] = 2.0f * own * scale * difference;
         error += difference * difference;
     }
     if (ray < counted)
@@ -111,19 +111,19 @@ void composite_backward(
     for (uint k = samples; k-- > 0;) {
         const uint at = feature_at(ray * samples + k, 0, COLOR_ROWS);
         const float weight = weights[ray * samples + k];
-        float by_weight = 0.0f;
+        float grad_weight = 0.0f;
         for (uint channel = 0; channel < 3; channel++) {
             const float raw = raw_colors[at + channel * SAMPLES], y = logistic(raw);
-            by_weight += by_color[channel] * (color_of(raw) - background[channel]);
-            by_colors[at + channel * SAMPLES] =
-                without_dust(by_color[channel] * weight * (1.0f + 2.0f * COLOR_PADDING) * y * (1.0f - y));
-            by_densities[at + (1 + channel) * SAMPLES] = 0.0f;
+            grad_weight += grad_color[channel] * (color_of(raw) - background[channel]);
+            grad_colors[at + channel * SAMPLES] =
+                without_dust(grad_color[channel] * weight * (1.0f + 2.0f * COLOR_PADDING) * y * (1.0f - y));
+            grad_densities[at + (1 + channel) * SAMPLES] = 0.0f;
         }
-        by_colors[at + 3 * SAMPLES] = 0.0f;
-        const float by_depth = left[ray * samples + k] * by_weight - behind;
-        by_densities[at] =
-            without_dust(by_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
-        behind += weight * by_weight;
+        grad_colors[at + 3 * SAMPLES] = 0.0f;
+        const float grad_depth = left[ray * samples + k] * grad_weight - behind;
+        grad_densities[at] =
+            without_dust(grad_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
+        behind += weight * grad_weight;
     }
 }
 

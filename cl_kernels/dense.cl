@@ -42,15 +42,15 @@ void dense_forward(
             VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), found + k * SAMPLES + v * COLUMNS * LANES);
 }
 
-/* Derivatives by derived_count inputs of a layer: those in the rows of `inputs` from first_input on, whose weights
+/* Gradients of derived_count inputs of a layer: those in the rows of `inputs` from first_input on, whose weights
  * start at first_parameter.  kept: 1 to add to the existing values, before the gate; else 0.
  * One item = BLOCK inputs of BLOCK vectors of samples. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_backward(
-    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
     __global const float *restrict parameters,  // [P] at first_parameter: weights [derived_count,output_count]
     __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
-    __global float *restrict by_inputs,         // [T,derived_count,SAMPLES]
+    __global float *restrict grad_inputs,         // [T,derived_count,SAMPLES]
     const uint first_parameter,
     const uint input_rows,
     const uint first_input,
@@ -66,13 +66,13 @@ void dense_backward(
         return;
     const uint blocks = derived_count / BLOCK, column = i % COLUMNS * LANES;
     const uint input = i / COLUMNS % blocks * BLOCK, tile = i / (COLUMNS * blocks);
-    __global float *found = by_inputs + (tile * derived_count + input) * SAMPLES + column;
+    __global float *found = grad_inputs + (tile * derived_count + input) * SAMPLES + column;
     __global const float *gate = inputs + (tile * input_rows + first_input + input) * SAMPLES + column;
     VF sums[BLOCK * BLOCK];
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
             sums[k * BLOCK + v] = kept ? VLOAD(found + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
-    multiply_rows(sums, by_outputs + tile * output_rows * SAMPLES + column,
+    multiply_rows(sums, grad_outputs + tile * output_rows * SAMPLES + column,
                   parameters + first_parameter + input * output_count, output_count, 1, output_count);
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++) {
@@ -81,12 +81,12 @@ void dense_backward(
         }
 }
 
-/* Derivatives by the weights of a layer: sums over the samples of a chunk of tiles.
+/* Gradients of the weights of a layer: sums over the samples of a chunk of tiles.
  * One item = BLOCK inputs by BLOCK outputs of one chunk. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_weights(
     __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
-    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
     __global float *restrict partials,          // [chunks,P]
     const uint first_parameter,
     const uint parameter_count,                 // P
@@ -110,7 +110,8 @@ void dense_weights(
             sums[k * BLOCK + m] = (VF)(0.0f);
     const uint first = chunk * CHUNK, own = tiles - first < CHUNK ? tiles - first : CHUNK;
     multiply_samples(sums, inputs + (first * input_rows + first_input + input) * SAMPLES,
-                     by_outputs + (first * output_rows + output) * SAMPLES, input_rows * SAMPLES, output_rows * SAMPLES,
+                     grad_outputs + (first * output_rows + output) * SAMPLES, input_rows * SAMPLES,
+                     output_rows * SAMPLES,
                      own);
     __global float *found = partials + chunk * parameter_count + first_parameter + input * output_count + output;
     for (uint k = 0; k < BLOCK; k++)
@@ -118,11 +119,11 @@ void dense_weights(
             found[k * output_count + m] = sum_lanes(sums[k * BLOCK + m]);
 }
 
-/* Derivatives by the biases of a layer: sums over the samples of a chunk of tiles.  One item = one output of one
+/* Gradients of the biases of a layer: sums over the samples of a chunk of tiles.  One item = one output of one
  * chunk. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_biases(
-    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
     __global float *restrict partials,          // [chunks,P]
     const uint first_parameter,                 // of the biases
     const uint parameter_count,                 // P
@@ -138,7 +139,7 @@ void dense_biases(
     VF sum = (VF)(0.0f);
     for (uint tile = chunk * CHUNK; tile < (chunk + 1) * CHUNK && tile < tiles; tile++)
         for (uint at = 0; at < SAMPLES; at += LANES)
-            sum += VLOAD(by_outputs + (tile * output_rows + output) * SAMPLES + at);
+            sum += VLOAD(grad_outputs + (tile * output_rows + output) * SAMPLES + at);
     partials[chunk * parameter_count + first_parameter + output] = sum_lanes(sum);
 }
 

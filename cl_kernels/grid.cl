@@ -140,7 +140,7 @@ __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void grid_backward(
     __global const float *restrict places,       // [T,PLACE_ROWS,SAMPLES]
     __global const uint *restrict levels,        // [levels,LEVEL_VALUES]
-    __global const float *restrict by_features,  // [T,rows,SAMPLES] GRID_FEATURES for each level
+    __global const float *restrict grad_features,  // [T,rows,SAMPLES] GRID_FEATURES for each level
     __global float *restrict gradient,           // [P] from first_parameter on: entries [entries,GRID_FEATURES]
     const uint first_parameter,
     const uint rows,
@@ -159,7 +159,7 @@ void grid_backward(
     for (uint first = 0; first < samples; first += LANES) {
         cells_t cells;
         find_cells(places + feature_at(first, 0, PLACE_ROWS), n, &cells);
-        __global const float *by = by_features + feature_at(first, level * GRID_FEATURES, rows);
+        __global const float *by = grad_features + feature_at(first, level * GRID_FEATURES, rows);
         float given[GRID_FEATURES][LANES];
         for (uint k = 0; k < GRID_FEATURES; k++)
             VSTORE_PRIVATE(VLOAD(by + k * SAMPLES), given[k]);

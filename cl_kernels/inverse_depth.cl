@@ -7,7 +7,7 @@
  * No local memory.  Deterministic: no pixel is listed twice, and sums have one order. */
 #include "splat.h"
 
-/* Add the gradient by the fourth plane; return each pixel's term.  One item = one listed pixel. */
+/* Add the gradient of the fourth plane; return each pixel's term.  One item = one listed pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void inverse_depth_loss(
     __global const float *restrict image,     // [4,H',stride]
@@ -63,7 +63,7 @@ void inverse_depth_backward(
     if (i >= count)
         return;
     const float inverse = splats[(size_t)i * RECORD + SPLAT_INVERSE_DEPTH];
-    const float by_depth = -sums[i] * inverse * inverse;
+    const float grad_depth = -sums[i] * inverse * inverse;
     for (uint k = 0; k < 3; k++)
-        grad_means[k * stride + i] += camera->world_to_camera[8 + k] * by_depth;
+        grad_means[k * stride + i] += camera->world_to_camera[8 + k] * grad_depth;
 }

@@ -117,25 +117,25 @@ void move_backward(
     const VF zero = (VF)(0.0f);
     const VF odds = exp_clamped(VLOAD(logit_opacity + i));  // alpha / (1 - alpha)
     const VF divisor = 1.0f + odds * (1.0f - m.presence);
-    const VF by_logit = VLOAD(grad_logit_opacity + i);
-    VSTORE((m.present ? by_logit / divisor : zero), grad_logit_opacity + i);
+    const VF grad_logit = VLOAD(grad_logit_opacity + i);
+    VSTORE((m.present ? grad_logit / divisor : zero), grad_logit_opacity + i);
 
-    VF by_center = zero;
+    VF grad_center = zero;
     for (uint k = 0; k < 3; k++) {
-        const VF by_mean = VLOAD(grad_means + k * stride + i);
+        const VF grad_mean = VLOAD(grad_means + k * stride + i);
         VF power = (VF)(1.0f);
         for (uint order = 1; order <= degree; order++) {
             const uint at = (plane_of(order) + k) * stride + i;
-            by_center = by_center - by_mean * VLOAD(motion + at) * (power * (float)order);
+            grad_center = grad_center - grad_mean * VLOAD(motion + at) * (power * (float)order);
             power = power * m.dt;
-            VSTORE((m.present ? by_mean * power : zero), grad_motion + at);
+            VSTORE((m.present ? grad_mean * power : zero), grad_motion + at);
         }
     }
-    const VF by_presence = by_logit * ((1.0f + odds) / divisor);  // by log g
+    const VF grad_presence = grad_logit * ((1.0f + odds) / divisor);  // by log g
     const VF distance = m.dt * m.inverse_duration;
-    by_center = by_center + by_presence * (distance * m.inverse_duration);
-    VSTORE((m.present ? by_center : zero), grad_motion + MOTION_CENTER * stride + i);
-    VSTORE((m.present ? by_presence * (distance * distance) : zero), grad_motion + MOTION_DURATION * stride + i);
+    grad_center = grad_center + grad_presence * (distance * m.inverse_duration);
+    VSTORE((m.present ? grad_center : zero), grad_motion + MOTION_CENTER * stride + i);
+    VSTORE((m.present ? grad_presence * (distance * distance) : zero), grad_motion + MOTION_DURATION * stride + i);
 }
 
 /* Gradients of the turn, added to those of the center; the gradient of the quaternions does not change.
@@ -154,14 +154,14 @@ void turn_backward(
     if (i >= count)
         return;
     const VF dt = time - VLOAD(motion + MOTION_CENTER * stride + i);
-    VF by_center = VLOAD(grad_motion + MOTION_CENTER * stride + i);
+    VF grad_center = VLOAD(grad_motion + MOTION_CENTER * stride + i);
     for (uint k = 0; k < 4; k++) {
         const uint at = (first + k) * stride + i;
-        const VF by_quat = VLOAD(grad_quats + k * stride + i);
-        VSTORE(by_quat * dt, grad_motion + at);
-        by_center = by_center - by_quat * VLOAD(motion + at);
+        const VF grad_quat = VLOAD(grad_quats + k * stride + i);
+        VSTORE(grad_quat * dt, grad_motion + at);
+        grad_center = grad_center - grad_quat * VLOAD(motion + at);
     }
-    VSTORE(by_center, grad_motion + MOTION_CENTER * stride + i);
+    VSTORE(grad_center, grad_motion + MOTION_CENTER * stride + i);
 }
 
 /* One update of some planes of the motion; values stay within bounds.  Dimension 1 is the plane. */

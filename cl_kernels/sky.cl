@@ -227,14 +227,14 @@ void sky_backward(
         run_sums[number * RUN_SUMS + k] = sum_lanes(sums[k]);
 }
 
-/* Derivatives by the texels that the view shows: sums over the corners of runs, in the order of the runs.
+/* Gradients of the texels that the view shows: sums over the corners of runs, in the order of the runs.
  * One item = one channel of one such texel; dimensions texel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_gather(
     __global const float *restrict run_sums,   // [R,RUN_SUMS]
     __global const uint *restrict first_entry, // [shown + 1]
     __global const uint *restrict entries,     // [R * CORNERS] run * CORNERS + corner, by texel
-    __global float *restrict by_texels,        // [3,shown]
+    __global float *restrict grad_texels,        // [3,shown]
     const uint shown)                          // texels that the view shows
 {
     const uint place = get_global_id(0), channel = get_global_id(1);
@@ -243,7 +243,7 @@ void sky_gather(
     float sum = 0.0f;
     for (uint k = first_entry[place]; k < first_entry[place + 1]; k++)
         sum += run_sums[entries[k] * 3 + channel];
-    by_texels[channel * shown + place] = sum;
+    grad_texels[channel * shown + place] = sum;
 }
 
 /* Adam on the texels that the view shows and that are learned, each with the bias of its own updates: 1 - BETA^t, by
@@ -252,7 +252,7 @@ void sky_gather(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_update(
     __global const uint *restrict shown_texels,  // [shown]
-    __global const float *restrict by_texels,    // [3,shown]
+    __global const float *restrict grad_texels,    // [3,shown]
     __global const float *restrict free,         // [side * side] 1 for a texel that is learned, else 0
     __global float *restrict texels,             // [3,side * side]
     __global float *restrict moment1,            // [3,side * side]
@@ -271,7 +271,7 @@ void sky_update(
     const float bias2 = BETA2 * biases[map_plane + texel] + (1.0f - BETA2);
     for (uint channel = 0; channel < 3; channel++) {
         const uint at = channel * map_plane + texel;
-        const float g = by_texels[channel * shown + place] * pixels;
+        const float g = grad_texels[channel * shown + place] * pixels;
         const float m = BETA1 * moment1[at] + (1.0f - BETA1) * g;
         const float v = BETA2 * moment2[at] + (1.0f - BETA2) * (g * g);
         moment1[at] = m;

@@ -43,8 +43,8 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
-        by_image, by_alpha = (gradient.detach().cpu().numpy() for gradient in gradients)
-        computed = ctx.result.backward(image=by_image, alpha=by_alpha if by_alpha.any() else None)
+        grad_image, grad_alpha = (gradient.detach().cpu().numpy() for gradient in gradients)
+        computed = ctx.result.backward(image=grad_image, alpha=grad_alpha if grad_alpha.any() else None)
         arrays = [torch.from_numpy(getattr(computed, name)) for name in PARAMETERS]
         return None, None, None, *(a.to(t.device) for a, t in zip(arrays, ctx.saved_tensors, strict=True))
 

@@ -27,7 +27,7 @@ BOUNCE = 0.45  # light on a shape that blocks the sky, over the skylight it bloc
 
 @dataclass(frozen=True)
 class World:
-    """Shapes in this light, and the square photographs that are taken of them."""
+    """Shapes under a fixed light, and the square photos taken of them."""
 
     shapes: tuple[Shape, ...]
     camera_angle_x: float  # field of view, radians

@@ -26,7 +26,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class WebArchive:
-    """An archive on the web.  Without a checksum, `fetch` reports that of the file, so that the user can compare it."""
+    """An archive on the web.  Without a checksum, `fetch` prints that of the download for comparison."""
 
     url: str
     license: str

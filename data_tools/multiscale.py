@@ -37,7 +37,7 @@ def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
 
 
 def pyramid(pixels: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
-    """An image [H, W, C] at 1, 1/2, 1/4, …; H and W are divisible by 2^(levels - 1)."""
+    """Return an image [H, W, C] at 1, 1/2, 1/4, …; H and W are divisible by 2^(levels - 1)."""
     images = [pixels]
     level = pixels.astype(np.float64)  # sums of 8-bit values and their means by powers of two are exact
     while len(images) < levels:
@@ -70,5 +70,5 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
 
 
 def _pixel_to_camera(width: int, height: int, focal: float) -> list[list[float]]:
-    """The inverse calibration matrix with OpenGL axes, as the format has it."""
+    """Return the inverse calibration matrix with OpenGL axes, as the format defines it."""
     return [[1 / focal, 0.0, -0.5 * width / focal], [0.0, -1 / focal, 0.5 * height / focal], [0.0, 0.0, -1.0]]

@@ -37,7 +37,7 @@ FAMILIES = {  # by the name of the base; any other family gets a separate page
     "Stage": Family("stages", "stage", "stages"),
     "Scheduled": Family("stages", "scheduled stage", "during"),
     "Training": Family("stages", "training stage", "stages"),
-    "Keeping": Family("stages", "training stage with validation", "stages"),
+    "ValidatedTraining": Family("stages", "training stage with validation", "stages"),
     "Loss": Family("losses", "loss", "losses"),
     "ImageLoss": Family("losses", "loss on images", "losses"),
     "Penalty": Family("losses", "penalty", "losses"),

@@ -1,1 +1,1 @@
-"""What researchers call: thin objects over the rooms below, NumPy in and out.  `import clsplat` offers the names."""
+"""The Python API: thin objects over the packages below, NumPy in and out.  `import clsplat` offers the names."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.quick import open_correct
+from clsplat.conformance.quick import open_verified
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.model import Model
 from clsplat.metrics.images import to_8_bits
@@ -37,7 +37,7 @@ def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort:
 
     The check runs once per device, as for a run.  Raises DeviceError if it computes wrongly.
     """
-    return open_correct(default_device(schedule) if device is None else device, schedule, sort)
+    return open_verified(default_device(schedule) if device is None else device, schedule, sort)
 
 
 def default_device(schedule: Schedule = "auto") -> Device:

@@ -66,7 +66,8 @@ def _usage(error: Any) -> str:
         print(error.format_message(), end="")
         return f"{command}: expected a command"
     if option := getattr(error, "option_name", None) if hasattr(error, "possibilities") else None:
-        known = [name for one in context.command.get_params(context) for name in one.opts] if context else []
+        parameters = context.command.get_params(context) if context else []
+        known = [name for parameter in parameters for name in parameter.opts]
         near = difflib.get_close_matches(option, [name for name in known if name.startswith("-")], n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else f"see `{command} --help`"
         return f"{command}: no option {option}; {hint}"

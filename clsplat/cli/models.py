@@ -203,12 +203,12 @@ def compress(
     from clsplat.workflows.compress import table
 
     shares = _numbers("--keep", keep, "shares, separated by commas, such as 1,0.7,0.5")
-    found = commands.compress_model(model, scene, target, out, format=format_, keep=shares, steps=steps, device=device)
-    terminal.show(table(found))
-    chosen, source = found["chosen"], found["source"]
+    result = commands.compress_model(model, scene, target, out, format=format_, keep=shares, steps=steps, device=device)
+    terminal.show(table(result))
+    chosen, source = result["chosen"], result["source"]
     size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
     terminal.print_message(
-        f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {found['page']}"
+        f"{result['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {result['page']}"
     )
 
 
@@ -233,12 +233,12 @@ def lod(
     """Write a model in levels of detail for the web (streamed SOG); with photos, each level is trained."""
     from clsplat.workflows.lod import table
 
-    found = commands.write_levels(
+    result = commands.write_levels(
         model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device
     )
-    terminal.show(table(found))
-    measured = f"; PSNR of {found['split']} views, not yet quantized" if found["split"] else ""
-    terminal.print_message(f"{found['folder']}/lod-meta.json: {found['bytes'] / 1e6:.3g} MB{measured}")
+    terminal.show(table(result))
+    measured = f"; PSNR of {result['split']} views, not yet quantized" if result["split"] else ""
+    terminal.print_message(f"{result['folder']}/lod-meta.json: {result['bytes'] / 1e6:.3g} MB{measured}")
 
 
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
@@ -325,8 +325,8 @@ def render(
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options["times"] = times if time is None else time
         options |= {"depth": depth, "alpha": alpha, "downscale": scale, "kind": format_}
-        found = pictures.render_path(model, scene, file, out=out, device=device, **options)
-        terminal.print_message(_video_text(found, pictures_wide=1 if side is None else 2))
+        result = pictures.render_path(model, scene, file, out=out, device=device, **options)
+        terminal.print_message(_video_text(result, pictures_wide=1 if side is None else 2))
         return
     video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
     if used := [name for name, value in video_options.items() if value is not None]:
@@ -346,12 +346,12 @@ def render(
     terminal.print_message(f"{pluralize(count, 'image')} written to {out}")
 
 
-def _video_text(found: dict[str, Any], pictures_wide: int) -> str:
+def _video_text(result: dict[str, Any], pictures_wide: int) -> str:
     """Return one line about a video."""
-    first, *others = (Path(name) for name in found["files"])
-    width, height = found["size"]
-    made = f"{found['frames']} frames of {pictures_wide * width} x {height} px in {found['took']:.1f} s"
+    first, *others = (Path(name) for name in result["files"])
+    width, height = result["size"]
+    summary = f"{result['frames']} frames of {pictures_wide * width} x {height} px in {result['took']:.1f} s"
     if first.suffix in (".png", ".npy"):
-        return f"{first.parent}: {made}"
+        return f"{first.parent}: {summary}"
     also = "".join(f", {path.name}" for path in others)
-    return f"{first}{also}: {first.stat().st_size / 1e6:.2f} MB, {found['seconds']:.1f} s long; {made}"
+    return f"{first}{also}: {first.stat().st_size / 1e6:.2f} MB, {result['seconds']:.1f} s long; {summary}"

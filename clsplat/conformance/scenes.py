@@ -145,7 +145,7 @@ def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
 
 
 def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
-    """Apply the chain rule to derivatives by k = xy / yy, ln s and ln t, with s² = yy and t² = xx - xy² / yy.
+    """Apply the chain rule to gradients of k = xy / yy, ln s and ln t, with s² = yy and t² = xx - xy² / yy.
 
     If xx > yy, x and y are swapped.
     """

@@ -49,7 +49,7 @@ def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
     temporary = _temporary(path, suffix)
     try:
         if path.exists() and not path.is_file():  # os.replace would replace a device too
-            raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
+            raise OutputError(f"{path}: cannot be written (it is not a file); use another name")
         make_folder(path.parent)
         yield temporary
         _replace(temporary, path)
@@ -314,7 +314,7 @@ def check_not_run_file(path: Path) -> None:
     folders = path.absolute().parents
     run = next((folder for folder in folders if any((folder / n).is_file() for n in (CHECKSUMS, STATUS))), None)
     if run and path_exists(path) and _belongs_to(run, path):
-        raise ConfigError(f"{path}: is a file of a run; give another name")
+        raise ConfigError(f"{path}: is a file of a run; use another name")
 
 
 def _belongs_to(run: Path, path: Path) -> bool:

@@ -55,7 +55,7 @@ class Manifest:
     def require_listed(self, path: Path) -> None:
         """Raise DataError if a file exists that no tool has written."""
         if path.is_file() and not self.lists(path):
-            raise DataError(f"{path}: exists and was not made from this scene; give another folder, or remove the file")
+            raise DataError(f"{path}: exists and was not made from this scene; use another folder, or remove the file")
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()

@@ -20,9 +20,9 @@ MAX_POLLS = 40  # of the elapsed time, for a poll may start a process
 
 
 class Listener(Protocol):
-    """Called with what is counted, how many are done, the total, and the time left, if known."""
+    """Called with the label, the number done, the total, and the time left, if known."""
 
-    def __call__(self, what: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
+    def __call__(self, label: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
@@ -65,9 +65,9 @@ def listening(listener: Listener) -> Iterator[None]:
     """
     outer = _listener.get()
 
-    def both(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+    def both(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
         for call in filter(None, (outer, listener)):
-            call(what, done, total, seconds_left=seconds_left)
+            call(label, done, total, seconds_left=seconds_left)
 
     token = _listener.set(both)
     try:
@@ -87,11 +87,11 @@ def counts_as_debug() -> Iterator[None]:
 
 
 class Count:
-    """A counter of finished items; `what` describes them, such as 'photographs decoded'."""
+    """A counter of finished items; `label` describes them, such as 'photographs decoded'."""
 
-    def __init__(self, what: str, total: int, is_even: bool = True) -> None:
+    def __init__(self, label: str, total: int, is_even: bool = True) -> None:
         """is_even: whether items take about the same time, so that the time left can be estimated."""
-        self.what, self.total, self.done, self.is_even = what, total, 0, is_even
+        self.label, self.total, self.done, self.is_even = label, total, 0, is_even
         self._start: tuple[float, int] | None = None  # time, and items that an earlier call had done
         self._logged = time.monotonic()
         self.reach(0)
@@ -113,16 +113,16 @@ class Count:
             self._start = time.monotonic(), done
         left = self.seconds_left
         if listener := _listener.get():
-            listener(self.what, done, self.total, seconds_left=left)
+            listener(self.label, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
             remaining = f", {clock(left)} left" if left else ""
-            LOG.log(_level.get(), "%s: %d of %d%s", self.what, done, self.total, remaining)
+            LOG.log(_level.get(), "%s: %d of %d%s", self.label, done, self.total, remaining)
 
 
-def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
+def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
     """Yield the items and count them; an item is done when the next one is requested."""
-    count = Count(what, total)
+    count = Count(label, total)
     for number, item in enumerate(items, 1):
         yield item
         count.reach(number)

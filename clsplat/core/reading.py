@@ -72,7 +72,7 @@ def read_json(
         return json.loads(data)
     except (ValueError, RecursionError) as error:
         reason = str(error).partition(";")[0]
-        raise kind(f"{path}: not a JSON file ({reason}); expected {expected}: make it again") from error
+        raise kind(f"{path}: not a JSON file ({reason}); expected {expected}: create it again") from error
 
 
 def open_regular(path: Path, limit: int | None = None) -> BufferedReader:

@@ -156,7 +156,7 @@ class Stream:
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream; never raises for the state of the stream."""
+        """Flush the stream; never raises, even if the stream is closed or broken."""
         self._do("flush")
 
     def _do(self, action: str, *arguments: str) -> None:

@@ -179,9 +179,9 @@ def counts_on_terminal() -> Iterator[None]:
     bar = _new_bar()
     task = bar.add_task("", total=None, visible=False)
 
-    def update(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+    def update(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
         left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
-        bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
+        bar.update(task, total=total, completed=done, description=f"{label}: {done} of {total}{left}", visible=True)
 
     with _drawn(bar), listening(update):
         yield

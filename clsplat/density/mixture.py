@@ -18,15 +18,15 @@ MIN_OPACITY, MAX_OPACITY = 1e-6, 0.99  # renderers of 3DGS clamp alpha at 0.99
 
 def volume(log_scales: Floats) -> Floats:
     """Return the volumes of ellipsoids divided by 4π/3, [N] scene units³."""
-    found: Floats = np.exp(log_scales.sum(axis=1))
-    return found
+    mass: Floats = np.exp(log_scales.sum(axis=1))
+    return mass
 
 
 def surface(log_scales: Floats) -> Floats:
     """Return the surface areas of ellipsoids divided by 4π, [N] scene units², by Thomsen's formula."""
     products = (log_scales.sum(axis=1, keepdims=True) - log_scales) * THOMSEN
-    found: Floats = np.exp(products).mean(axis=1) ** (1 / THOMSEN)
-    return found
+    result: Floats = np.exp(products).mean(axis=1) ** (1 / THOMSEN)
+    return result
 
 
 def mass_of(tables: dict[str, Floats], size: Size = volume) -> Floats:

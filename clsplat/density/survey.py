@@ -133,7 +133,7 @@ class Survey:
         return self._model.gaussians.count
 
     def sample_views(self, number: int) -> list[View]:
-        """Return a random sample of the views, by seed and step, in their order; all if there are no more."""
+        """Return a random sample of the views, by seed and step, in their order; all views if there are not more."""
         count = len(self.views)
         indices = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
         return [self.views[index] for index in np.sort(indices)]

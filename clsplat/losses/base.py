@@ -103,7 +103,7 @@ class ImageLoss(Loss):
     """Whether it compares the image with the photograph; training needs at least one loss that does."""
 
     def reads(self, step: int) -> Content:
-        """Return what it reads of the image at a global step: only colors, or also a fourth plane."""
+        """Return which planes of the rendered image it needs at a global step: only colors, or also a fourth plane."""
         return "color"
 
     @abstractmethod
@@ -154,8 +154,8 @@ class Penalty(Loss):
         """Add weight · d(penalty)/d(parameter) to the gradients of the penalty's parameters."""
 
 
-def content_of(losses: Sequence[Loss], step: int) -> Content:
-    """Return what losses read of the image at a global step.
+def required_content(losses: Sequence[Loss], step: int) -> Content:
+    """Return which planes of the rendered image the losses need at a global step.
 
     Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for two different fourth planes.
     """

@@ -16,7 +16,7 @@ HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float,
 
 
 class HostLoss(ImageLoss):
-    """A loss in NumPy: `function(image, photograph)` returns its value and its gradient by the image.
+    """A loss in NumPy: `function(image, photograph)` returns its value and its gradient with respect to the image.
 
     Arrays are [height, width, 3] float32.  Each step copies both images to the host and the gradient back.
     """
@@ -65,7 +65,7 @@ class HostLoss(ImageLoss):
             value, derivative = float(value), np.asarray(derivative, np.float32)
         except (TypeError, ValueError):
             raise ValueError(
-                f"the loss '{self.name}' returned {quote(result)}; expected (value, derivative by the image)"
+                f"the loss '{self.name}' returned {quote(result)}; expected (value, gradient of the image)"
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(

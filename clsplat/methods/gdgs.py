@@ -74,6 +74,6 @@ def cells_of(means: Floats, cells: int) -> NDArray[np.int64]:
         return np.full(len(means), -1)
     low, high = np.quantile(means[finite], CENTRAL, axis=0)
     inside = finite & np.all((means >= low) & (means <= high), axis=1)
-    place = (np.where(inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
-    index = np.minimum(place.astype(np.int64), cells - 1)
+    position = (np.where(inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
+    index = np.minimum(position.astype(np.int64), cells - 1)
     return np.where(inside, np.ravel_multi_index(tuple(index.T), (cells,) * 3), -1)

@@ -25,16 +25,16 @@ Floats = NDArray[np.float64]
 def sampled_weights(survey: Survey, weight_per_view: float | None = None, number: int | None = None) -> Weights:
     """Return the weights in training views.
 
-    weight_per_view: as in `weights`.  number: of sampled views; None: all views.
+    weight_per_view: as in `weights`.  number: the number of sampled views; None: all views.
     """
     views = survey.views if number is None else survey.sample_views(number)
     return weights(survey.render(views), survey.count, weight_per_view)
 
 
-def useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
+def unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
     """Return for each view the Gaussians that it sees but does not need, [V, N].
 
-    It needs the heaviest, which add up to the share `weight_per_view` of its weight.
+    A view needs its heaviest Gaussians, which together make up the share `weight_per_view` of its weight.
     """
     hidden = np.zeros((len(survey.views), survey.count), bool)
     for row, look in zip(hidden, survey.render(survey.views), strict=True):
@@ -64,8 +64,8 @@ class PruneUseless(Rule):
 
     def mark(self, edit: Edit) -> None:
         weights = edit.survey.cached(sampled_weights, self.weight_per_view, self.views)
-        kept = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
-        edit.choose(~kept, copies=0, kept=0)
+        keep = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
+        edit.choose(~keep, copies=0, kept=0)
 
 
 class HideUseless(Scheduled):
@@ -90,4 +90,4 @@ class HideUseless(Scheduled):
             run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
 
     def run(self, run: Run) -> None:
-        hide(run.model.gaussians, useless(run.survey(), self.weight_per_view))
+        hide(run.model.gaussians, unneeded(run.survey(), self.weight_per_view))

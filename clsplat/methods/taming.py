@@ -82,14 +82,14 @@ class GrowScored(ByScore):
     def mark(self, edit: Edit) -> None:
         if edit.room is None or edit.room >= 0:
             return
-        rows, kept = edit.rows().astype(np.int64), edit.kept.get() > 0
+        rows, keep = edit.rows().astype(np.int64), edit.kept.get() > 0
         refused = rows > 1
         if not refused.any():
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
         # first the clones, which keep the original, with their part of the room; then the splits with the rest
-        for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
+        for kind, part in ((keep, (refused & keep).sum() / refused.sum()), (~keep, 1.0)):
             order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
             grown = added <= round(part * room)

@@ -100,12 +100,12 @@ class Stillness:
         for station in self._stations.values():
             if station.renders.count < MIN_TIMESTAMPS:
                 continue
-            shown, taken = station.renders.deviation(), station.photographs.deviation()
-            still = np.ones(shown.shape[:2], bool) if station.counted is None else station.counted
+            rendered, captured = station.renders.deviation(), station.photographs.deviation()
+            still = np.ones(rendered.shape[:2], bool) if station.counted is None else station.counted
             if not station.has_static_file:
-                still = still & (taken.max(axis=2) <= STILL)
+                still = still & (captured.max(axis=2) <= STILL)
             if still.any():
-                values = {FLICKER: float(shown[still].mean()), OF_PHOTOGRAPHS: float(taken[still].mean())}
+                values = {FLICKER: float(rendered[still].mean()), OF_PHOTOGRAPHS: float(captured[still].mean())}
                 figures |= {name: {**values, SHARE: float(still.mean())} for name in station.views}
         return figures
 
@@ -165,8 +165,8 @@ def color_figures(
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
     changed = in_colors_of(finite, photograph, counted, model)
     corrected = corrected_by_regression(finite, truth, counted)
-    own = {} if changed is None else {"psnr_color": psnr(changed, photograph, counted)}
-    return {**own, "psnr_affine": psnr(corrected, photograph, counted)}
+    color = {} if changed is None else {"psnr_color": psnr(changed, photograph, counted)}
+    return {**color, "psnr_affine": psnr(corrected, photograph, counted)}
 
 
 def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
@@ -175,11 +175,11 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` says why; if
     none has, `psnr_color` is None.
     """
-    found, has = means(rows), [row for row in rows if "psnr_color" in row]
-    if not found or len(has) == len(rows):
-        return found
+    averages, has = means(rows), [row for row in rows if "psnr_color" in row]
+    if not averages or len(has) == len(rows):
+        return averages
     reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colors to"
-    return {"psnr_color": None, **found, "psnr_color_views": len(has), "psnr_color_reason": reason}
+    return {"psnr_color": None, **averages, "psnr_color_views": len(has), "psnr_color_reason": reason}
 
 
 def in_colors_of(
@@ -344,7 +344,7 @@ def measure(
             require_finite(floats, view)
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
-        own = color_figures(floats, image, mask, colors) if colors else {}
+        color = color_figures(floats, image, mask, colors) if colors else {}
         still = stillness.add(view, rendered, image, mask)
         if mask is None:
             similarity = device_ssim(painter.workspace, photograph, rendered)
@@ -352,11 +352,11 @@ def measure(
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
         more = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, own, still))
-    flicker, moments = stillness.figures(), by_moment({one.view: one.psnr for one in results}, views, trained)
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, color, still))
+    flicker, moments = stillness.figures(), by_moment({result.view: result.psnr for result in results}, views, trained)
     return [
-        replace(one, still={**one.still, **flicker.get(one.view, {})}, moments=moments.get(one.view, {}))
-        for one in results
+        replace(result, still={**result.still, **flicker.get(result.view, {})}, moments=moments.get(result.view, {}))
+        for result in results
     ]
 
 

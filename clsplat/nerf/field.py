@@ -113,7 +113,7 @@ class Levels:
         """Add the gradient of the loss of the level that was rendered last to `gradient`, [P], and write the squared
         differences of its rays."""
         rays, tiles = level.rays, level.raw_colors.shape[0]
-        by_colors, by_densities = (
+        grad_colors, grad_densities = (
             self.workspace.array(f"field by {name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
         )
         camera = rays.camera
@@ -129,8 +129,8 @@ class Levels:
             colors=level.colors,
             photograph=target.photograph,
             pixels=rays.pixels,
-            by_colors=by_colors,
-            by_densities=by_densities,
+            grad_colors=grad_colors,
+            grad_densities=grad_densities,
             errors=target.errors,
             scale=target.scale,
             first_ray=rays.draw.first if rays.draw else 0,
@@ -141,8 +141,8 @@ class Levels:
             counted=rays.counted,
             rays=rays.count,
         )
-        by_grid = self.network.backward(parameters, by_colors, by_densities, gradient)
-        self.encoding.backward(by_grid, gradient)
+        grad_grid = self.network.backward(parameters, grad_colors, grad_densities, gradient)
+        self.encoding.backward(grad_grid, gradient)
 
     def write_colors(self, level: SampleLevel, image: Array) -> None:
         """Write the colors of a level's rays to their pixels in an image, [3, rows, stride]."""

@@ -69,34 +69,34 @@ class Network:
         self._apply(self._color, parameters, _Table(behind), colors, NO_LIMIT)
         return colors, densities
 
-    def backward(self, parameters: Array, by_colors: Array, by_densities: Array, gradient: Array) -> Array:
+    def backward(self, parameters: Array, grad_colors: Array, grad_densities: Array, gradient: Array) -> Array:
         """Add the gradient of the parameters to `gradient`, [P], from the gradients of the last outputs.
 
         Returns the gradient of the grid's features, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
-        tiles, width = by_colors.shape[0], self.shape.width
+        tiles, width = grad_colors.shape[0], self.shape.width
         last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
         behind = _Table(self._table("conditioned", tiles, self.shape.color_width))
-        by_behind = self._table("by conditioned", tiles, self.shape.color_width)
-        by_seen, by_x = self._table("by seen", tiles, width), self._table("by hidden", tiles, width)
-        self._sum(self._color, behind, by_colors)
-        self._derive(self._color, parameters, by_colors, behind, by_behind, RELU)
-        self._sum(self._condition, seen, by_behind)
-        self._derive(self._condition, parameters, by_behind, seen, by_seen, NO_LIMIT)
-        self._sum(self._density, last, by_densities)
-        self._sum(self._bottleneck, last, by_seen)
-        self._derive(self._density, parameters, by_densities, last, by_x, NO_LIMIT)
-        self._derive(self._bottleneck, parameters, by_seen, last, by_x, RELU, kept=1)
+        grad_behind = self._table("by conditioned", tiles, self.shape.color_width)
+        grad_seen, grad_x = self._table("by seen", tiles, width), self._table("by hidden", tiles, width)
+        self._sum(self._color, behind, grad_colors)
+        self._derive(self._color, parameters, grad_colors, behind, grad_behind, RELU)
+        self._sum(self._condition, seen, grad_behind)
+        self._derive(self._condition, parameters, grad_behind, seen, grad_seen, NO_LIMIT)
+        self._sum(self._density, last, grad_densities)
+        self._sum(self._bottleneck, last, grad_seen)
+        self._derive(self._density, parameters, grad_densities, last, grad_x, NO_LIMIT)
+        self._derive(self._bottleneck, parameters, grad_seen, last, grad_x, RELU, kept=1)
         for i in range(len(self._trunk), 0, -1):
             before, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
-            self._sum(layer, before, by_x)
+            self._sum(layer, before, grad_x)
             if i - 1 == self.shape.skip:
-                self._derive_grid(layer, parameters, by_x, self.shape.width, kept=0)
-            by_before = self._table(f"by hidden {i % 2}", tiles, width)
-            self._derive(layer, parameters, by_x, before, by_before, RELU)
-            by_x = by_before
-        self._sum(self._first, _Table(*self.position(tiles)), by_x)
-        by_grid = self._derive_grid(self._first, parameters, by_x, 0, kept=int(self.shape.skip is not None))
+                self._derive_grid(layer, parameters, grad_x, self.shape.width, kept=0)
+            grad_before = self._table(f"by hidden {i % 2}", tiles, width)
+            self._derive(layer, parameters, grad_x, before, grad_before, RELU)
+            grad_x = grad_before
+        self._sum(self._first, _Table(*self.position(tiles)), grad_x)
+        grad_grid = self._derive_grid(self._first, parameters, grad_x, 0, kept=int(self.shape.skip is not None))
         count = self.shape.network_parameters
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
@@ -105,14 +105,14 @@ class Network:
             chunks=-(-tiles // CHUNK),
             count=count,
         )
-        return by_grid
+        return grad_grid
 
-    def _derive_grid(self, layer: DenseLayer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
+    def _derive_grid(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, kept: int) -> Array:
         """Compute the gradient of the grid's features, which a layer reads starting at a row."""
-        tiles = by_outputs.shape[0]
-        position, by_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
-        self._derive(layer, parameters, by_outputs, position, by_grid, NO_LIMIT, kept, row)
-        return by_grid
+        tiles = grad_outputs.shape[0]
+        position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
+        self._derive(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, kept, row)
+        return grad_grid
 
     def _hidden(self, i: int, tiles: int) -> Array:
         """Return the outputs of layer i of the trunk, with room for the encoded position if it is appended there."""
@@ -148,22 +148,22 @@ class Network:
         self,
         layer: DenseLayer,
         parameters: Array,
-        by_outputs: Array,
+        grad_outputs: Array,
         inputs: _Table,
-        by_inputs: Array,
+        grad_inputs: Array,
         lowest: float,
         kept: int = 0,
         row: int = 0,
     ) -> None:
         """Compute the gradient of the inputs of a layer that use its weights from a row on."""
-        tiles, derived, output_rows = *by_inputs.shape[:2], by_outputs.shape[1]
+        tiles, derived, output_rows = *grad_inputs.shape[:2], grad_outputs.shape[1]
         count = tiles * self._columns * (derived // BLOCK)
         self._program.dense_backward(
             items=count,
-            by_outputs=by_outputs,
+            grad_outputs=grad_outputs,
             parameters=parameters,
             inputs=inputs.array,
-            by_inputs=by_inputs,
+            grad_inputs=grad_inputs,
             first_parameter=layer.first + row * layer.columns,
             input_rows=inputs.rows,
             first_input=inputs.first,
@@ -175,13 +175,13 @@ class Network:
             count=count,
         )
 
-    def _sum(self, layer: DenseLayer, inputs: _Table, by_outputs: Array) -> None:
+    def _sum(self, layer: DenseLayer, inputs: _Table, grad_outputs: Array) -> None:
         """Write the partial sums of the gradient of a layer's parameters."""
-        tiles, output_rows = by_outputs.shape[:2]
+        tiles, output_rows = grad_outputs.shape[:2]
         chunks = -(-tiles // CHUNK)
         count = chunks * (layer.rows // BLOCK) * (layer.columns // BLOCK)
         shared: dict[str, Any] = {
-            "by_outputs": by_outputs,
+            "grad_outputs": grad_outputs,
             "partials": self._partials(tiles),
             "parameter_count": self.shape.network_parameters,
             "output_rows": output_rows,
@@ -271,20 +271,20 @@ class Encoding:
             **shared,
         )
 
-    def backward(self, by_position: Array, gradient: Array) -> None:
+    def backward(self, grad_position: Array, gradient: Array) -> None:
         """Add the gradient of the grid's entries to `gradient`, [P].
 
-        by_position: gradient of the grid's features for the samples of the last `forward`, [tiles, grid_rows, SAMPLES].
+        grad_position: gradient of the grid's features at the last `forward`'s samples, [tiles, grid_rows, SAMPLES].
         """
         if not self.shape.grid:
             return
-        tiles, rows = by_position.shape[:2]
+        tiles, rows = grad_position.shape[:2]
         count = self.shape.grid.levels * self.parts
         self._grid.grid_backward(
             groups=-(-count // int(self.workspace.device.tuning["TEAM"])),
             places=self.places(tiles),
             levels=self._levels,
-            by_features=by_position,
+            grad_features=grad_position,
             gradient=gradient,
             first_parameter=self.shape.network_parameters,
             rows=rows,

@@ -276,9 +276,9 @@ def _corners(view: View, near: float, far: float) -> Floats:
     """Return the corners of a view's frustum between two depths, [8, 3], ordered as UNIT: columns, rows, depth."""
     camera = view.camera
     across = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    places = np.column_stack([across, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
+    positions = np.column_stack([across, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
     rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
-    return np.asarray((places - translation) @ rotation)
+    return np.asarray((positions - translation) @ rotation)
 
 
 def _meet(cube: Floats, frustum: Floats) -> bool:

@@ -36,8 +36,8 @@ LOG = logging.getLogger("clsplat")
 
 
 @contextmanager
-def raising_device_errors(what: str, device_name: str) -> Iterator[None]:
-    """Convert errors of the runtime in a block that does `what` to MemoryLimitError or DeviceError.
+def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
+    """Convert errors of the runtime in a block that does `action` to MemoryLimitError or DeviceError.
 
     Some runtimes allocate device memory on first use, and run out of it only at a launch or a copy.
     """
@@ -45,10 +45,10 @@ def raising_device_errors(what: str, device_name: str) -> Iterator[None]:
         yield
     except cl.MemoryError as error:
         raise MemoryLimitError(
-            f"{what}: {device_name} is out of memory ({error}); use fewer Gaussians or smaller images"
+            f"{action}: {device_name} is out of memory ({error}); use fewer Gaussians or smaller images"
         ) from error
     except cl.Error as error:
-        raise DeviceError(f"{what} failed on {device_name}: {error}") from error
+        raise DeviceError(f"{action} failed on {device_name}: {error}") from error
 
 
 class Timings:
@@ -194,7 +194,7 @@ class Device:
         except KernelError as error:
             if self.tuning["TILE"] == 8:
                 raise
-            LOG.info("tiles of 8 x 8 px instead of 16 x 16: %s", error)
+            LOG.info("using tiles of 8 x 8 px instead of 16 x 16: %s", error)
             self.tuning["TILE"] = 8
             self.program("blend_simt.cl")
 
@@ -266,9 +266,9 @@ class Device:
         with self.refusals("work in progress"):
             self.queue.finish()
 
-    def refusals(self, what: str) -> AbstractContextManager[None]:
-        """Convert errors of the runtime in a block that does `what` (see `raising_device_errors`)."""
-        return raising_device_errors(what, self.info.name)
+    def refusals(self, action: str) -> AbstractContextManager[None]:
+        """Convert errors of the runtime in a block that does `action` (see `raising_device_errors`)."""
+        return raising_device_errors(action, self.info.name)
 
 
 def create_context(device: Any) -> Any:

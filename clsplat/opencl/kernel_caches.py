@@ -32,8 +32,8 @@ def kernel_caches() -> str:
     return f"{', '.join(others)} and {last}"
 
 
-def damaged_kernels() -> str:
-    """Return what to do about a device that works only with empty caches."""
+def kernel_cache_advice() -> str:
+    """Return advice for a device that works only with empty kernel caches."""
     if full := [folder for folder in _kernel_folders() if _is_full(folder)]:
         return f"{full[0]}: has no space for built kernels; free some, or set XDG_CACHE_HOME to another folder"
     return f"its cache of built kernels is damaged: remove {kernel_caches()}"

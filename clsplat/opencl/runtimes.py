@@ -16,7 +16,7 @@ from pathlib import Path
 from clsplat.core.errors import OutputError, quote
 from clsplat.core.files import write_text
 from clsplat.core.machine import cache_folder
-from clsplat.opencl.kernel_caches import damaged_kernels, empty_kernel_caches, remove_cut_kernels
+from clsplat.opencl.kernel_caches import empty_kernel_caches, kernel_cache_advice, remove_cut_kernels
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE = Path(__file__).with_name("probe.py")
@@ -94,7 +94,7 @@ def probe_fault(key: str, platform: int, device: int) -> str | None:
     elif fault not in (_HANGS, _NO_EXECUTION):
         with empty_kernel_caches() as variables:
             if _run_probe(platform, device, variables) is None:
-                return damaged_kernels()
+                return kernel_cache_advice()
     return fault
 
 

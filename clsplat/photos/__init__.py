@@ -1,4 +1,4 @@
-"""What a training step compares with: photographs on the device, their sampling and transforms."""
+"""Targets of a training step: photographs on the device, their sampling and transforms."""
 
 from clsplat.core.settings import import_modules
 

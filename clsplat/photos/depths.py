@@ -147,10 +147,10 @@ class PointDepths:
         weights = np.minimum(1.0, self._counts[rows[kept]] / SURE)
         if self.maps and camera.view is not None:
             pixels = places // camera.stride, places % camera.stride
-            found = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
-            if found is None:
+            samples = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
+            if samples is None:
                 return None
-            places, inverse, weights = found[0] * camera.stride + found[1], found[2], np.ones(len(found[2]))
+            places, inverse, weights = samples[0] * camera.stride + samples[1], samples[2], np.ones(len(samples[2]))
         if not len(places):
             return None
         upload, values = self.device.upload, (inverse.astype(np.float32), weights.astype(np.float32))
@@ -173,8 +173,8 @@ def nearest_in_pixels(
     row = np.floor(float(values["fy"]) * y / depth + float(values["cy"]))
     shown = in_front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     rows = np.flatnonzero(shown)
-    places = (row[rows] * camera.stride + column[rows]).astype(np.intp)
-    order = np.lexsort((rows, depth[rows], places))
-    _, first = np.unique(places[order], return_index=True)
+    indices = (row[rows] * camera.stride + column[rows]).astype(np.intp)
+    order = np.lexsort((rows, depth[rows], indices))
+    _, first = np.unique(indices[order], return_index=True)
     kept = order[first]
-    return places[kept], depth[rows[kept]], rows[kept]
+    return indices[kept], depth[rows[kept]], rows[kept]

@@ -99,10 +99,10 @@ class DetailDivisor(Settings):
         """Return the downscale factor by step for training photographs, each [height, width, 3]."""
         steps, divisors = knots([Spectrum.of(image) for image in photographs], self.until, self.largest)
 
-        def at(places: Floats) -> Floats:
+        def at(positions: Floats) -> Floats:
             """Interpolate linearly in the number of pixels."""
-            pixels = np.interp(places, steps, divisors**-2.0)
-            return np.where(places < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
+            pixels = np.interp(positions, steps, divisors**-2.0)
+            return np.where(positions < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
 
         tried = np.array([1.0, *self.changes])
         sizes = at(tried)

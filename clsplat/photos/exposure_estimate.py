@@ -60,7 +60,7 @@ def noted(views: Sequence[View]) -> Exposures:
 
     Real tone curves differ, so this is only an initial value.
     """
-    values = {view.name: one.value for view, one in zip(views, load_exposures(views), strict=True) if one}
+    values = {view.name: known.value for view, known in zip(views, load_exposures(views), strict=True) if known}
     if not values:
         return UNKNOWN
     mean = math.fsum(values.values()) / len(values)
@@ -94,16 +94,16 @@ def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
     by_name: dict[str, View] = {}
     for view in views:
         by_name.setdefault(view.name, view)
-    found = [samples(tracks, view, *read(view)) for view in by_name.values()]
-    photograph = np.repeat(np.arange(len(found)), [len(rows) for rows, _ in found])
-    point, values = (np.concatenate([one[i] for one in found]) for i in (0, 1))
-    log_gains, shared, left = np.full((len(found), 3), np.nan), 0, np.zeros(2)
+    per_view = [samples(tracks, view, *read(view)) for view in by_name.values()]
+    photograph = np.repeat(np.arange(len(per_view)), [len(rows) for rows, _ in per_view])
+    point, values = (np.concatenate([part[i] for part in per_view]) for i in (0, 1))
+    log_gains, shared, left = np.full((len(per_view), 3), np.nan), 0, np.zeros(2)
     for channel in range(3):
         usable = (values[:, channel] > DARKEST) & (values[:, channel] < BRIGHTEST)
         photographs = np.bincount(point[usable], minlength=len(tracks.positions))
         usable &= photographs[point] > 1
         shared = max(shared, int(np.count_nonzero(photographs > 1)))
-        parts = photograph[usable], point[usable], values[usable, channel], len(found)
+        parts = photograph[usable], point[usable], values[usable, channel], len(per_view)
         log_gains[:, channel], with_gains = _fitted(*parts)
         left += with_gains, _fitted(*parts, rounds=0)[1]
     known = np.isfinite(log_gains).all(axis=1)
@@ -121,9 +121,9 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
     x, y, z = turned + view.world_to_camera[:, 3:]
     in_front = z > 0
     depth = np.where(in_front, z, 1)
-    places = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
-    inside = in_front & (places[0] >= 0) & (places[0] < width) & (places[1] >= 0) & (places[1] < height)
-    column, row = (np.floor(np.where(inside, place, 0)).astype(np.intp) for place in places)
+    xy = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
+    inside = in_front & (xy[0] >= 0) & (xy[0] < width) & (xy[1] >= 0) & (xy[1] < height)
+    column, row = (np.floor(np.where(inside, value, 0)).astype(np.intp) for value in xy)
     if mask is not None:
         inside &= mask[row, column]
     sums = cv2.boxFilter(image, cv2.CV_32S, (SIDE, SIDE), normalize=False)
@@ -156,7 +156,7 @@ def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: F
         left = weights * (values - _means(point, values, weights)[point])
         return np.bincount(photograph, left, minlength=count).astype(np.float64)
 
-    found, residual = np.zeros(count), gathered(rest)
+    solution, residual = np.zeros(count), gathered(rest)
     direction, square = residual.copy(), float((residual**2).sum())
     of_rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
     goal = max(CONVERGED**2 * square, float((of_rounding**2).sum()))
@@ -165,10 +165,10 @@ def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: F
             break
         image = gathered(direction[photograph])
         step = square / float((direction * image).sum())
-        found, residual = found + step * direction, residual - step * image
+        solution, residual = solution + step * direction, residual - step * image
         before, square = square, float((residual**2).sum())
         direction = residual + square / before * direction
-    return found
+    return solution
 
 
 def _means(group: Integers, values: Floats, weights: Floats) -> Floats:

@@ -113,8 +113,8 @@ class Photographs:
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        held = self._held.get(_key(view))
-        return placed_camera(held.camera, view) if held else upload_camera(self.device, view)
+        cached = self._held.get(_key(view))
+        return placed_camera(cached.camera, view) if cached else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view, with the view's current camera.
@@ -165,9 +165,9 @@ class Photographs:
         return Pixels(pixels[:3], pixels[3:], None if shows is None else shows[None])
 
     def _make_room(self, size: int) -> None:
-        held = sum(photograph.nbytes for photograph in self._held.values())
-        while self._held and held + size > self.budget:
-            held -= self._held.pop(next(iter(self._held))).nbytes
+        total = sum(photograph.nbytes for photograph in self._held.values())
+        while self._held and total + size > self.budget:
+            total -= self._held.pop(next(iter(self._held))).nbytes
 
 
 def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:

@@ -104,9 +104,9 @@ class ViewSettings(Settings):
         """Return settings whose resolution is a schedule.  photographs: of training, each [height, width, 3]."""
         if not isinstance(self.resolution, DetailDivisor):
             return self
-        found = self.resolution.of(photographs())
-        LOG.info(course(found))
-        return self.model_copy(update={"resolution": found})
+        resolution = self.resolution.of(photographs())
+        LOG.info(course(resolution))
+        return self.model_copy(update={"resolution": resolution})
 
     def divisor(self, step: int) -> float:
         """Return the downscale factor at a global step.  Raises ConfigError if `settled` was not called."""

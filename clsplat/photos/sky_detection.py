@@ -1,4 +1,4 @@
-"""Where photographs show the sky: bright or blue, even, far from all points, joined to the upper edge, and above the
+"""Detect the sky in photographs: bright or blue, even, far from all points, joined to the upper edge, and above the
 horizon (ours)."""
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SkyEvidence:
-    """What one photograph shows of the sky."""
+    """The sky pixels of one photograph."""
 
     view: View
     image: Image  # small, [height, width, 3]
@@ -39,8 +39,8 @@ class SkyEvidence:
 
     @property
     def share(self) -> float:
-        """The share of what counts of its upper third that shows the sky; 0 where that goes on below the horizon, as a
-        wall does."""
+        """Fraction of the unmasked pixels in its upper third that show the sky; 0 if most of it is not above the
+        horizon, as for a wall."""
         if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < SKYWARD:
             return 0.0
         rows = slice(max(1, round(len(self.mask) * UPPER)))
@@ -79,14 +79,14 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
     color of its pixels; the others have that of all pixels of sky.  None where no photograph shows any.
     """
     colors, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
-    for one in seen:
-        place = texel_positions(one.directions, side)
-        first = np.floor(place).astype(np.int64)
-        texels, weight = bilinear_texels(first[..., 0], first[..., 1], side), bilinear_weights(place - first)
-        of_all += np.bincount(texels[one.counted].ravel(), weight[one.counted].ravel(), side**2)
-        texels, weight = texels[one.mask], weight[one.mask]
+    for photo in seen:
+        position = texel_positions(photo.directions, side)
+        first = np.floor(position).astype(np.int64)
+        texels, weight = bilinear_texels(first[..., 0], first[..., 1], side), bilinear_weights(position - first)
+        of_all += np.bincount(texels[photo.counted].ravel(), weight[photo.counted].ravel(), side**2)
+        texels, weight = texels[photo.mask], weight[photo.mask]
         of_sky += np.bincount(texels.ravel(), weight.ravel(), side**2)
-        values = one.image[one.mask].astype(np.float64) / 255
+        values = photo.image[photo.mask].astype(np.float64) / 255
         for channel in range(3):
             shares = weight * values[:, channel, None]
             colors[:, channel] += np.bincount(texels.ravel(), shares.ravel(), side**2)
@@ -96,8 +96,8 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
     for _ in range(BEYOND):
         free = np.asarray(free[neighbor_texels(side)].any(axis=1))
     mean = colors.sum(axis=0) / of_sky.sum()
-    found = np.where(of_sky[:, None] > 0, colors / np.maximum(of_sky, 1e-9)[:, None], mean)
-    return found.astype(np.float32), free | (of_all == 0)
+    filled = np.where(of_sky[:, None] > 0, colors / np.maximum(of_sky, 1e-9)[:, None], mean)
+    return filled.astype(np.float32), free | (of_all == 0)
 
 
 def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
@@ -110,14 +110,14 @@ def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
     mean = _blurred(brightness, counted)
     spread = np.sqrt(np.maximum(_blurred(brightness**2, counted) - mean**2, 0))
     blue = (values[..., 2] > values[..., 0] + BLUE) & (values[..., 2] > DARKEST_BLUE)
-    found = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
-    joined = (found & counted) | np.logical_and.accumulate(~counted, axis=0)
+    sky = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
+    joined = (sky & counted) | np.logical_and.accumulate(~counted, axis=0)
     _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
-    return np.asarray(found & counted & np.isin(parts, parts[0][joined[0]]))
+    return np.asarray(sky & counted & np.isin(parts, parts[0][joined[0]]))
 
 
 def _blurred(values: NDArray[np.float32], counted: Mask) -> NDArray[np.float32]:
-    """The means in squares of 3 px, of pixels that count."""
+    """Return the mean of the unmasked pixels in a 3 px square around each pixel."""
     if counted.all():
         return np.asarray(cv2.blur(values, (3, 3)))
     shares = cv2.blur(counted.astype(np.float32), (3, 3))
@@ -125,7 +125,7 @@ def _blurred(values: NDArray[np.float32], counted: Mask) -> NDArray[np.float32]:
 
 
 def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
-    """Which pixels are far from all points."""
+    """Return which pixels are far from all points."""
     free = np.ones(shape, np.uint8)
     column, row = np.floor(points).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
@@ -134,7 +134,7 @@ def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
 
 
 def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:
-    """Where the dataset's points lie in a photograph, [K, 2] px: those that it shows, where that is known."""
+    """Return the positions of the dataset's points in a photograph, [K, 2] px; only visible points if that is known."""
     if scene.tracks is not None and view.name in scene.tracks.seen:
         positions = scene.tracks.positions[scene.tracks.seen[view.name]]
     else:
@@ -142,8 +142,8 @@ def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:
     camera, pose = view.camera, view.world_to_camera.astype(np.float64)
     x, y, z = pose[:, :3] @ positions.astype(np.float64).T + pose[:, 3:]
     ahead = z > 0
-    found = camera.fx * x[ahead] / z[ahead] + camera.cx, camera.fy * y[ahead] / z[ahead] + camera.cy
-    return np.stack(found, axis=1)
+    pixels = camera.fx * x[ahead] / z[ahead] + camera.cx, camera.fy * y[ahead] / z[ahead] + camera.cy
+    return np.stack(pixels, axis=1)
 
 
 def _small(image: Image) -> Image:

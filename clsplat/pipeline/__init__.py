@@ -1,1 +1,1 @@
-"""Pipeline files: what they can say, how they are read, overridden, explained and combined."""
+"""Define, read, override, explain and combine pipeline files."""

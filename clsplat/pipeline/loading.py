@@ -35,7 +35,7 @@ class Pipeline:
     path: Path
     settings: PipelineFile
     reason: str = ""
-    """Why settings differ from those of the file, in one line."""
+    """The reason why settings differ from those of the file, in one line."""
 
     @property
     def names(self) -> list[str]:
@@ -278,7 +278,7 @@ def _late(stages: Sequence[Stage], need: str) -> str:
         for inner in training.during:
             if need in inner.makes and inner.every:
                 cadence = f"{inner.stage} makes every {inner.every} steps after step {inner.start}"
-                acts = any(fires_at(inner.every, one) for one in range(step + 1, step + training.steps))
+                acts = any(fires_at(inner.every, later_step) for later_step in range(step + 1, step + training.steps))
                 remedies = [] if acts else [f"set {inner.stage}.every below {training.steps}"]
                 remedies += [f"set {inner.stage}.start earlier"] if acts or inner.start >= step + training.steps else []
                 return f"{cadence}, but the training ends earlier; {' and '.join(remedies)}, or use --minutes"

@@ -1,4 +1,4 @@
-"""Read a pipeline file with `matrix:`, which stands for one run per combination of pipelines, scenes, settings, seeds.
+"""Read a pipeline file with `matrix:`, which describes one run per combination of pipelines, scenes, settings, seeds.
 
     name: ablation
     matrix:
@@ -178,8 +178,8 @@ def _bases(path: Path, document: Document, matrix: Matrix) -> list[_Base]:
     bases = []
     for i, name in enumerate(matrix.pipelines):
         try:
-            found = find(name)
-            base = _Base(found.stem, found, read_yaml(found))
+            file = find(name)
+            base = _Base(file.stem, file, read_yaml(file))
             checked(base.path, base.document)
         except ConfigError as error:
             line = document.line(("matrix", "pipelines", i))

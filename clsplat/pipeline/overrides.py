@@ -109,7 +109,9 @@ class _Node:
         """Whether the name is the type of a list item, and not an index."""
         keyed_by_type = any(base.keyed_by_type for base in bases(self.inside))
         return (
-            keyed_by_type and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
+            keyed_by_type
+            and not name.isdigit()
+            and all(isinstance(item, dict) and "type" in item for item in self.data)
         )
 
     def put(self, name: str, value: Any, text: str) -> None:
@@ -120,8 +122,8 @@ class _Node:
         kinds: dict[str, Any] = {key: kind for base in bases(self.inside) for key, kind in variants(base).items()}
         if name not in kinds:
             near = difflib.get_close_matches(name, kinds, n=1)
-            meant = f"; did you mean {near[0]}?" if near else ""
-            raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{meant}")
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{hint}")
         if value is not None and not isinstance(value, dict):
             raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
         types = [item["type"] for item in self.data]

@@ -214,7 +214,7 @@ def _imports(module: ModuleType) -> list[ModuleType]:
             base = importlib.util.resolve_name(relative, module.__package__ or "")
             names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     parts = [name.split(".") for name in names]
-    every = dict.fromkeys(".".join(one[:i]) for one in parts for i in range(1, len(one) + 1))
+    every = dict.fromkeys(".".join(path[:i]) for path in parts for i in range(1, len(path) + 1))
     return [sys.modules[name] for name in every if getattr(sys.modules.get(name), "__file__", None)]
 
 

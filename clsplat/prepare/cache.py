@@ -83,28 +83,28 @@ def prepare(
     Raises OutputError when another process is making one of the results, and the errors of the steps.
     """
     count = Count("steps of the preparation", len(planned), is_even=False)
-    if reused := [one.step.stage for one in planned if not one.why]:
+    if reused := [planned_step.step.stage for planned_step in planned if not planned_step.why]:
         LOG.info("reusing the results of %s in %s", ", ".join(reused), root)
-    for number, one in enumerate(planned):
+    for number, planned_step in enumerate(planned):
         with counts_as_debug():  # each step logs its own progress
             count.reach(number)
-        with _exclusive(one) if one.why else nullcontext():
-            if one.why and _fault(one.folder):  # another process may have made it since
-                with stage(one.step.stage):
-                    _run_step(one, source, root)
+        with _exclusive(planned_step) if planned_step.why else nullcontext():
+            if planned_step.why and _fault(planned_step.folder):  # another process may have made it since
+                with stage(planned_step.step.stage):
+                    _run_step(planned_step, source, root)
             else:
-                for text in one.step.warnings(read_record(one.folder)):
+                for text in planned_step.step.warnings(read_record(planned_step.folder)):
                     LOG.warning("%s", text)
-        source = one.folder
+        source = planned_step.folder
     return source
 
 
 @contextmanager
-def _exclusive(one: PlannedStep) -> Iterator[None]:
+def _exclusive(planned_step: PlannedStep) -> Iterator[None]:
     """Lock a result, so that only one process continues what an interrupted call left."""
-    with raising_output_error(one.folder.parent):
-        make_folder(one.folder.parent)
-    with lock.lock_folder(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
+    with raising_output_error(planned_step.folder.parent):
+        make_folder(planned_step.folder.parent)
+    with lock.lock_folder(planned_step.folder, planned_step.folder.with_name(f".{planned_step.folder.name}.lock")):
         yield
 
 
@@ -139,40 +139,48 @@ def read_note(out: Path) -> dict[str, str] | None:
         return None
 
 
-def _run_step(one: PlannedStep, source: Path, root: Path) -> None:
+def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
     """Make a result in a hidden folder, and rename the folder when it is complete and synced to the disk.
 
     A step that can resume finds there what an interrupted call made from the same inputs with the same settings.
     """
-    temporary = one.folder.with_name(f".{one.folder.name}")
-    if one.why != NO_RESULT:
-        LOG.info("%s runs again: %s", one.step.stage, one.why)
+    temporary = planned_step.folder.with_name(f".{planned_step.folder.name}")
+    if planned_step.why != NO_RESULT:
+        LOG.info("%s runs again: %s", planned_step.step.stage, planned_step.why)
     start = time.perf_counter()
     try:
-        if one.step.resumes:
+        if planned_step.step.resumes:
             remove_partial_files(temporary, border=RECORD)
         else:
             shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True, exist_ok=True)
-        summary = one.step.make(source.resolve(), temporary, root.parent)
+        summary = planned_step.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
-        settings = one.step.model_dump(mode="json")
-        record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
+        settings = planned_step.step.model_dump(mode="json")
+        record = {
+            "origin": planned_step.origin,
+            "inputs": planned_step.inputs,
+            "settings": settings,
+            "seconds": seconds,
+            **summary,
+        }
         sync_below(temporary)
         write_text(temporary / RECORD, json.dumps({**record, "files": _sizes(temporary)}, indent=1) + "\n")
-        if one.folder.exists():  # a damaged result
-            shutil.rmtree(one.folder)
-        os.replace(temporary, one.folder)
-        sync_folder(one.folder.parent)
+        if planned_step.folder.exists():  # a damaged result
+            shutil.rmtree(planned_step.folder)
+        os.replace(temporary, planned_step.folder)
+        sync_folder(planned_step.folder.parent)
     except BaseException as error:
-        if isinstance(error, DataError) or not one.step.resumes:  # the same data would fail again
+        if isinstance(error, DataError) or not planned_step.step.resumes:  # the same data would fail again
             shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
-            raise write_error(one.folder, error) from error
-        if isinstance(error, DataError) and str(source.resolve()) != one.origin:  # name the user's folder, not a result
-            raise DataError(str(error).replace(str(source.resolve() / IMAGES), one.origin)) from error
+            raise write_error(planned_step.folder, error) from error
+        if (
+            isinstance(error, DataError) and str(source.resolve()) != planned_step.origin
+        ):  # name the user's folder, not a result
+            raise DataError(str(error).replace(str(source.resolve() / IMAGES), planned_step.origin)) from error
         raise
-    LOG.info("%s (%.0f s)", one.step.summary(summary), seconds)
+    LOG.info("%s (%.0f s)", planned_step.step.summary(summary), seconds)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -186,7 +194,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """The size of each file below a folder in bytes, by relative path, without a record that a killed call left.
+    """Return the size of each file below a folder in bytes, by relative path, except for the record.
 
     Links, such as those to photographs, are followed.
     """
@@ -196,7 +204,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _fault(folder: Path) -> str:
-    """What is wrong with a result; "" when it has its record and every listed file has its size."""
+    """Return what is wrong with a result; "" when it has its record and every listed file has its size."""
     record = read_record(folder)
     if not record:
         return f"{RECORD} is missing or damaged"
@@ -211,7 +219,7 @@ def _fault(folder: Path) -> str:
 
 
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """The reason to run a step, as the difference from the newest result; "" when the result is there."""
+    """Return the reason to run a step, as the difference from the newest result; "" when the result is there."""
     if folder.exists():
         fault = _fault(folder)
         return fault and f"{fault}; the result is made again"
@@ -238,7 +246,7 @@ INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that ar
 
 def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
     """Return the figures of each step, by its name, without steps whose results were removed."""
-    records = {one.step.stage: read_record(one.folder) for one in planned}
+    records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}
         for stage, record in records.items()
@@ -293,9 +301,9 @@ def _publish(result: Path, out: Path) -> None:
     with raising_output_error(out):
         (out / IMAGES).unlink(missing_ok=True)
         link(result / IMAGES, out / IMAGES)
-        half = out / STEPS / f".{MODEL}"
-        shutil.rmtree(half, ignore_errors=True)
-        shutil.copytree(result / MODEL, half)
-        sync_below(half)
-        half.rename(out / MODEL)
+        partial = out / STEPS / f".{MODEL}"
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(result / MODEL, partial)
+        sync_below(partial)
+        partial.rename(out / MODEL)
         sync_folder(out)

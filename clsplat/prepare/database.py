@@ -88,12 +88,12 @@ def verified(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]
 
 
 @contextmanager
-def explained(path: Path, what: str) -> Iterator[None]:
+def explained(path: Path, action: str) -> Iterator[None]:
     """Raise DataError, as one sentence, for an error of pycolmap."""
     try:
         yield
     except (ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: could not {what} ({str(error).splitlines()[0]}); check the photographs") from error
+        raise DataError(f"{path}: could not {action} ({str(error).splitlines()[0]}); check the photographs") from error
 
 
 def pairs_done(database: Path) -> int:

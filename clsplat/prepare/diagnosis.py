@@ -92,7 +92,7 @@ def diagnose(matched: MatchGraph) -> str:
 
 
 def _parts(matched: MatchGraph, groups: Sequence[list[str]]) -> str:
-    """Which photographs match one another, and which match none, in words."""
+    """Describe which photographs match one another and which match none."""
     single = [name for group in groups if len(group) == 1 for name in group]
     count = len(groups) - len(single)
     if not count:

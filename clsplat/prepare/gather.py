@@ -83,7 +83,7 @@ def require_photographs(folder: Path, without: Path | None = None) -> None:
 
 
 def _how_to_convert(unreadable: list[str]) -> list[str]:
-    """A sentence for each kind of photographs that cannot be read."""
+    """Return a sentence for each kind of photo that cannot be read."""
     texts = []
     for kind, (suffixes, command) in CONVERTED.items():
         if names := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
@@ -93,7 +93,7 @@ def _how_to_convert(unreadable: list[str]) -> list[str]:
 
 
 def _photo_names(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
-    """The names of the readable photographs, sorted, and of those in other formats."""
+    """Return the sorted names of the readable photos, and the names of photos in other formats."""
     require_folder(folder)
     names: list[str] = []
     unreadable: list[str] = []
@@ -186,13 +186,13 @@ def link(source: Path, target: Path) -> None:
         relative = os.path.relpath(source.resolve(), target.parent.resolve())
         target.symlink_to(relative, target_is_directory=source.is_dir())
     except (OSError, ValueError):  # Windows has no relative path to another drive
-        half = target.with_name(f".{target.name}")
+        partial = target.with_name(f".{target.name}")
         if source.is_dir():
-            shutil.rmtree(half, ignore_errors=True)
-            shutil.copytree(source, half)
+            shutil.rmtree(partial, ignore_errors=True)
+            shutil.copytree(source, partial)
         else:
-            shutil.copyfile(source, half)
-        half.replace(target)
+            shutil.copyfile(source, partial)
+        partial.replace(target)
 
 
 def _is_there(source: Path, target: Path) -> bool:
@@ -233,7 +233,7 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
 def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
     """Return how many photographs were placed, their mean reprojection error, and which are left out; "" if unknown.
 
-    figures: those of each step, as `step_facts` returns them.
+    figures: of each step, as `step_facts` returns them.
     """
     cameras = figures.get("map_cameras", {})
     try:

@@ -112,7 +112,7 @@ def map_cameras(
         except FAILURES as error:
             if not (attempt.wider or models):
                 raise
-            LOG.warning("the attempt failed and is skipped: %s", error)
+            LOG.warning("skipping an attempt that failed: %s", error)
             if not attempt.wider:
                 break
             more, candidates = [], []
@@ -143,7 +143,7 @@ def _remove_hidden(folder: Path) -> None:
 def _run_attempt(
     source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any], more: Sequence[tuple[str, str]]
 ) -> list[Any]:
-    """The models of an attempt, the largest first; with the same features, it extends the earlier model."""
+    """Return the models of an attempt, the largest first; with the same features, it extends the earlier model."""
     pycolmap = require_pycolmap()
     database, work = _fill_database(source, out, attempt, more), out / ".models"
     if not verified(pycolmap, database):
@@ -183,11 +183,11 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, more: Sequence[tup
     """
     database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():
-        half = database.with_name(f".half.{DATABASE}")
-        shutil.copyfile(source / DATABASE, half)
+        partial = database.with_name(f".half.{DATABASE}")
+        shutil.copyfile(source / DATABASE, partial)
         if attempt.dense:
-            clear_features(require_pycolmap(), half)
-        half.replace(database)
+            clear_features(require_pycolmap(), partial)
+        partial.replace(database)
     if attempt.dense:
         add_features(source / IMAGES, database, DENSER)
         match_database(database, pairing)

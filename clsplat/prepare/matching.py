@@ -68,9 +68,9 @@ def match_features(
     link(source / IMAGES, out / IMAGES)
     database = out / DATABASE
     if not database.exists():  # an existing one continues: its pairs are not matched again
-        half = out / f".{DATABASE}"
-        shutil.copyfile(source / DATABASE, half)
-        half.replace(database)
+        partial = out / f".{DATABASE}"
+        shutil.copyfile(source / DATABASE, partial)
+        partial.replace(database)
     pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
     chosen = match_database(database, pairing)
@@ -159,7 +159,7 @@ def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
 def _closest(
     pairs: Sequence[tuple[int, int]], close: NDArray[np.float64], is_left: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
-    """The pairs of each left-out photograph with the `count` photographs most similar to it."""
+    """Return the pairs of each left-out photo with the `count` photographs most similar to it."""
     counts, chosen = [0] * len(is_left), []
     for i, j in sorted(pairs, key=lambda pair: -close[pair]):
         if any(is_left[k] and counts[k] < count for k in (i, j)):

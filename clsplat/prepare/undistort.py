@@ -55,7 +55,7 @@ def undistort_scene(
 
 
 def _source(view: View) -> str:
-    """A hash of everything that the pixels of an undistorted image and its mask depend on."""
+    """Return a hash of everything that the pixels of an undistorted image and its mask depend on."""
     files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
     return hash_values(*files, view.lens, view.camera)
 
@@ -68,13 +68,13 @@ def _with_lens(view: View, undefined_pixels: UndefinedPixels) -> View:
 
 
 def _reduced(view: View, long_side: int | None) -> View:
-    """The view with no side longer than `long_side` px."""
+    """Return the view with no side longer than `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
     return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """The names with .png as their suffix, or appended where two names would be equal."""
+    """Return the names with .png as their suffix, or appended where two names would be equal."""
     short = [Path(name).with_suffix(".png").as_posix() for name in names]
     counts = Counter(short)
     chosen = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(short, names, strict=True)]

@@ -89,8 +89,8 @@ def _turn(gaussians: Gaussians) -> dict[str, int]:
 def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
     """Return a copy of Gaussians with some tables replaced."""
     moved = copy.copy(gaussians)
-    own = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
-    moved.tables = {**gaussians.tables, **own}
+    tables = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
+    moved.tables = {**gaussians.tables, **tables}
     return moved
 
 

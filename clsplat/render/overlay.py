@@ -21,7 +21,7 @@ class OverlayLayer:
 
 
 def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:
-    """Composite a layer, rendered over black, over an image, [3 or 4, rows, stride].
+    """Composite a layer, rendered over black, onto an image, [3 or 4, rows, stride].
 
     scale: weight of the loss on the layer's alpha, the sum of 1 - T over pixels.
     """

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.quick import open_correct
+from clsplat.conformance.quick import open_verified
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import PIPELINE, check_not_run_file
 from clsplat.core.progress import counted
@@ -95,7 +95,7 @@ def film(
     loaded = loaded.with_origin(origin)
     made = plan_video(request, found, points_of(loaded, found), moves=moves(loaded), origin=origin)
     background = loaded.rendering.background or (found.background if found else "black")
-    opened = open_correct(device)
+    opened = open_verified(device)
     canvas = Canvas(painter_of(loaded, opened, background))
     if not videos:
         taken = [view.image_path for view in found.views] if found else []

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.quick import open_correct
+from clsplat.conformance.quick import open_verified
 from clsplat.core.errors import ConfigError, DataError, shell_quote
 from clsplat.core.files import METRICS, PIPELINE, open_atomic, path_exists, raising_output_error, write_text
 from clsplat.core.progress import counted
@@ -334,7 +334,7 @@ class ModelFile:
         """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
         self.source = ModelSource.of(model, scene)
         loaded = read(self.source.file)
-        self.device = open_correct(device)
+        self.device = open_verified(device)
         found = self.source.scene(loaded)
         self.loaded = loaded.with_origin(found.origin)
         self.photographs = apply_side_files(self.source.file, found) if scene is None else found

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.conformance.quick import open_correct
+from clsplat.conformance.quick import open_verified
 from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import UNDISTORTED
 from clsplat.core.machine import Owner
@@ -139,7 +139,7 @@ def check_start(
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    opened = open_correct(device, settings.rasterizer.schedule, settings.rasterizer.sort)
+    opened = open_verified(device, settings.rasterizer.schedule, settings.rasterizer.sort)
     planned = check_preparation(pipeline, out)
     if planned and start != "restart" and read_note(out) not in (None, make_note(planned)):
         raise ConfigError(f"{out}: was started with other photos or other settings of `prepare`; use another folder")

@@ -23,7 +23,7 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import last_edit, map_trainings, min_steps, stretched, with_steps
 from clsplat.runs.run_folder import Start
 from clsplat.runs.runner import check_run, run_stages, write_pipeline
-from clsplat.stages.optimize import Keeping
+from clsplat.stages.optimize import ValidatedTraining
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 from clsplat.training.status import StatusFile
@@ -221,7 +221,7 @@ def _require_one_training(pipeline: Pipeline) -> None:
         raise ConfigError(
             f"{pipeline.path}: --minutes: expected one stage that trains, found {len(trainings)}; leave --minutes out"
         )
-    if isinstance(trainings[0], Keeping) and trainings[0].refit:
+    if isinstance(trainings[0], ValidatedTraining) and trainings[0].refit:
         raise ConfigError(
             f"{pipeline.path}: --minutes: a refit trains twice, for an unknown time; add --set optimize.refit=false"
         )

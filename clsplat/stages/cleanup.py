@@ -70,7 +70,7 @@ class Cleanup(Stage):
         change = mark(edit, self.rules)
         if change.after == 0:
             raise NumericError(
-                "cleanup: its rules would remove all Gaussians; weaken them, such as by a smaller "
+                "cleanup: its rules would remove all Gaussians; weaken them, for example with a smaller "
                 "prune_faint.opacity_below, or remove the stage"
             )
         with run.editing_tables():

@@ -36,11 +36,11 @@ ROOMY = 8  # memory for this many times the initial Gaussians: growth rarely rea
 MAX_TRAINING_VIEWS = 8  # that are measured together with the validation views
 
 
-class Keeping(Training):
-    """A training that keeps its last model, or the best one at validation views.
+class ValidatedTraining(Training):
+    """Training that keeps its last model, or the best one on the validation views.
 
-    With `keep: best`, the validation views (`scene.validation`) are measured as often as an `evaluate` of them in
-    `during` says, or else 20 times, at least 100 steps apart; together with some training views.
+    With `keep: best`, the validation views (`scene.validation`) and some training views are measured whenever an
+    `evaluate` of validation views in `during` runs; without one, 20 times, at least 100 steps apart.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"patience"})
@@ -55,7 +55,7 @@ class Keeping(Training):
     """With `keep: best`: train again from the start for the best number of steps, on the validation views too."""
 
     @model_validator(mode="after")
-    def _by_validation(self) -> "Keeping":
+    def _by_validation(self) -> "ValidatedTraining":
         if self.keep != "best" and (self.patience or self.refit):
             raise ValueError(f"'{'patience' if self.patience else 'refit'}' needs 'keep: best'; set both or neither")
         if self.keep != "best" and any(getattr(stage, "patience", None) for stage in self.during):
@@ -110,7 +110,7 @@ class Keeping(Training):
         if self.keep == "best" and pipeline.scene.validation == 0:
             raise ConfigError("optimize.keep: best needs validation views; set scene.validation: auto")
         trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
-        if self.refit and (number := sum(isinstance(stage, Keeping) for stage in trainings)) > 1:
+        if self.refit and (number := sum(isinstance(stage, ValidatedTraining) for stage in trainings)) > 1:
             raise ConfigError(f"optimize.refit: expected a single stage that trains, got {number}")
         before = list(itertools.takewhile(lambda stage: stage is not self, trainings))
         if not any(getattr(stage, "patience", None) for stage in before):  # else the first step is unknown
@@ -133,7 +133,7 @@ class Keeping(Training):
         if self.keep == "last" or not _validates(stage):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
-        measured = [one.get(f"{run.downscale:g}", {}) for one in averages.values()]
+        measured = [average.get(f"{run.downscale:g}", {}) for average in averages.values()]
         train, validation = compared(measured)
         if train is None or validation is None:  # measured at another size, or everything is masked
             return
@@ -143,13 +143,15 @@ class Keeping(Training):
             return
         first_overfit = (best and best.first_overfit) or (now if now.is_overfit else None)
         tables, evaluations = copy_model(run), best.evaluations + 1 if best else 1
-        copied = {split: dict(one) for split, one in averages.items()}
+        copied = {split: dict(average) for split, average in averages.items()}
         run.best = Best(
             measured=now,
             degree=run.model.degree,
             metrics=copied,
             scalars=dict(run.scalars),
-            modules={name: dict(one.scalars) for name, one in run.modules.items() if one.after_training != "dropped"},
+            modules={
+                name: dict(state.scalars) for name, state in run.modules.items() if state.after_training != "dropped"
+            },
             evaluations=evaluations,
             since_best=0,
             first_overfit=first_overfit,
@@ -182,8 +184,8 @@ class Keeping(Training):
 
 def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
     """Return the PSNR of each of the averages, dB, or None: in the photographs' colors if all have it for all views."""
-    whole = all(one.get("psnr_color") is not None and "psnr_color_reason" not in one for one in measured)
-    return [one.get("psnr_color" if whole else "psnr") for one in measured]
+    whole = all(average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured)
+    return [average.get("psnr_color" if whole else "psnr") for average in measured]
 
 
 def _validates(stage: Scheduled) -> bool:
@@ -217,7 +219,7 @@ def report(
 DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
 
 
-class Optimize(Keeping):
+class Optimize(ValidatedTraining):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
     Stages in `during` that edit the model run between two steps, so that other stages see the model before the edit.

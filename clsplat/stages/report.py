@@ -360,7 +360,7 @@ class HtmlReport(Stage):
             "report.html.j2",
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
-            main=_main(run),
+            main=_headline(run),
             overfitting_note=overfitting_note(run),
             advice=advised,
             photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
@@ -382,11 +382,11 @@ class HtmlReport(Stage):
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
     """Return the addresses, relative to the page, of the files that stages of a name write, by path in the run."""
-    files = [Path(one[stage]["file"]) for one in run.pipeline["stages"] if stage in one]
+    files = [Path(entry[stage]["file"]) for entry in run.pipeline["stages"] if stage in entry]
     return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
 
-def _main(run: Run) -> str:
+def _headline(run: Run) -> str:
     """Return the most important figures as a line of text."""
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []

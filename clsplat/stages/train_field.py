@@ -111,7 +111,7 @@ class TrainField(Training):
         if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == self.field:
             return run.learned_field
         field = LearnedField.initial(self.field, run.seed, run.photographs.background)
-        LOG.info("a field of %s parameters", f"{self.field.learned:,}")
+        LOG.info("training a field with %s parameters", f"{self.field.learned:,}")
         return field
 
     def _step(self, run: Run, field: LearnedField, pool: ViewPool) -> None:

@@ -96,7 +96,9 @@ class Timelapse(Stage):
     def run(self, run: Run) -> None:
         files = self._files(run)
         if not files:
-            raise ConfigError(f"timelapse: {quote(self.folder)} has no snapshots; set 'folder' to that of snapshot")
+            raise ConfigError(
+                f"timelapse: {quote(self.folder)} has no snapshots; set 'folder' to the folder of the snapshot stage"
+            )
         size = image_size(files[-1])
         with encoding.open_video(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):

@@ -130,7 +130,7 @@ class Batch:
                 done += step
                 progress.append(f"{name} {step}/{self._steps[name]}")
         named = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
-        self._count.what = f"steps ({named})" if progress else "steps"
+        self._count.label = f"steps ({named})" if progress else "steps"
         self._count.reach(min(done, self._count.total))
 
     def _is_stopped(self) -> bool:

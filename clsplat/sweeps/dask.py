@@ -203,7 +203,7 @@ class Cluster:
         self.addresses = set(workers)
         if self._cluster and len(workers) < (count := len(self._local_slots or ())):
             self._cluster.scale(count)  # Dask does not restart a worker that dies while it starts
-        known = [one for address, worker in workers.items() if (one := slot_from_worker(address, worker))]
+        known = [slot for address, worker in workers.items() if (slot := slot_from_worker(address, worker))]
         self._slots = known if self._local_slots is None else self._local_slots if workers else []
         if self._slots:
             self._seen = now
@@ -239,7 +239,7 @@ class Cluster:
                 pure=False,
             )
         ticket = _Future(self, future, address)
-        self._tickets = [*(one for one in self._tickets if not one.is_over), ticket]
+        self._tickets = [*(pending for pending in self._tickets if not pending.is_over), ticket]
         return ticket
 
     def close(self) -> None:
@@ -258,7 +258,7 @@ class Cluster:
 
     @property
     def _pending(self) -> "list[_Future]":
-        return [one for one in self._tickets if not one.is_over and one.future.status == "pending"]
+        return [ticket for ticket in self._tickets if not ticket.is_over and ticket.future.status == "pending"]
 
 
 # Worker processes of this machine, one per device, for a scheduler elsewhere.

@@ -129,7 +129,9 @@ def _run(device: str) -> str:
         scene = str(folder / "scene")
         _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
         words = fill_command(run_command(device), shipped()[PIPELINE], folder / "run")
-        _call(device, [*words, "--scene", scene, *(word for one in SETTINGS for word in ("--set", one))], folder)
+        _call(
+            device, [*words, "--scene", scene, *(word for setting in SETTINGS for word in ("--set", setting))], folder
+        )
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS_DIGITS]
 
 

@@ -106,7 +106,7 @@ class Dispatcher:
         Raises BitsMismatch if two runs of a cell differ, Interrupted, and what the engine raises; `close` of the engine
         then ends the running cells.
         """
-        waiting = sorted(wanted, key=lambda one: -one.cost)
+        waiting = sorted(wanted, key=lambda pending: -pending.cost)
         while waiting or self._running:
             if self.is_stopped():
                 raise Interrupted("stopped; continue with the same command and --resume")
@@ -142,7 +142,9 @@ class Dispatcher:
         """Return the class of most devices; ties: the one in which most cells are published, then by name."""
         counts = Counter(classes)
         most = sorted(bits for bits in counts if counts[bits] == max(counts.values()))
-        return max(most, key=lambda bits: sum(self.store.folder(one.on(bits).key).result.is_dir() for one in wanted))
+        return max(
+            most, key=lambda bits: sum(self.store.folder(pending.on(bits).key).result.is_dir() for pending in wanted)
+        )
 
     def _require_class(self, classes: Sequence[str]) -> None:
         """Raise DeviceError if there are devices, but none of the chosen class for NO_DEVICE_TIMEOUT_S seconds."""
@@ -156,32 +158,32 @@ class Dispatcher:
                 "that class, or set placement: {bits: any}; the store keeps all progress"
             )
 
-    def _fits(self, one: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
+    def _fits(self, pending: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
         """Return whether a cell may run on a device: in its class, and larger than devices that were too small."""
-        allowed = self._allowed(one, slots)
-        return slot in ([other for other in allowed if other.memory > one.above] or allowed)
+        allowed = self._allowed(pending, slots)
+        return slot in ([other for other in allowed if other.memory > pending.above] or allowed)
 
-    def _allowed(self, one: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
+    def _allowed(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """Return the devices on which a cell may run; a started cell stays in its class while that has devices."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
-        classes = {slot.bits for slot in slots if not one.above}
-        started = [bits for bits in classes if self.store.folder(one.on(bits).key).path.is_dir()]
+        classes = {slot.bits for slot in slots if not pending.above}
+        started = [bits for bits in classes if self.store.folder(pending.on(bits).key).path.is_dir()]
         return [slot for slot in slots if not started or slot.bits in started]
 
     def _collect(self, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
-        one, cell, ticket = self._running[slot]
+        pending, cell, ticket = self._running[slot]
         try:
             outcome = ticket.outcome()
         except CellLost:
             self.store.log_event("lost", cell=cell.key, worker=slot.worker)
-            self._requeue(one, slot, waiting)
+            self._requeue(pending, slot, waiting)
             return
         if outcome is None:
             return
         if outcome.state == "different":
             raise BitsMismatch(outcome.message)
-        larger = replace(one, above=slot.memory)
+        larger = replace(pending, above=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
             other.memory > slot.memory for other in self._allowed(larger, self.engine.slots())
         ):
@@ -191,8 +193,8 @@ class Dispatcher:
         del self._running[slot]
         self.ended(cell, outcome)
 
-    def _requeue(self, one: PendingCell, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
+    def _requeue(self, pending: PendingCell, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
         """Return a cell to the queue, and free its device."""
         del self._running[slot]
-        waiting.insert(0, one)
+        waiting.insert(0, pending)
         self._unsuitable[1].clear()

@@ -66,8 +66,8 @@ def read(path: Path) -> tuple[Notes, Arrays]:
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
     """Split arrays into those below `folder`, named without it, and the others."""
-    own = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
-    return own, {name: array for name, array in arrays.items() if not name.startswith(folder)}
+    part = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
+    return part, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
@@ -88,11 +88,11 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
         raise DataError("its contents are not stored as they were written")
     if sum(max(member.file_size, member.compress_size) for member in members) > size:
-        raise DataError(f"it declares more bytes than its {size}")
+        raise DataError(f"it declares more bytes than the {size} that it has")
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:
-    """The notes, checked."""
+    """Check and return the notes."""
     data = archive.read(f"{META}.npy")
     if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
         raise DataError("its notes differ from their checksum")

@@ -129,17 +129,17 @@ def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[n
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
     """Raise DataError if tables cannot be those of modules.  tables: named without MODULES."""
     for name in scalars:
-        own, tables = split(tables, f"{name}/")
-        class_of(name).check_saved(scalars[name], own)
+        module_tables, tables = split(tables, f"{name}/")
+        class_of(name).check_saved(scalars[name], module_tables)
     if tables:
         raise DataError(f"it has tables of modules that its notes do not list: {', '.join(tables)}")
 
 
 def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
     """Restore the modules of a run from copies of another step."""
-    for name, own in scalars.items():
+    for name, values in scalars.items():
         if name in run.modules and name in modules_so_far(run):
-            run.modules[name].load(own, split(tables, f"{name}/")[0])
+            run.modules[name].load(values, split(tables, f"{name}/")[0])
 
 
 # The tables of the best model of a run: copied to the host, and put back.
@@ -249,7 +249,7 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
         return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
     trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
-    index, stage = next((one for one in reversed(trains) if one[0] <= run.stage_index), (0, "optimize"))
+    index, stage = next((train for train in reversed(trains) if train[0] <= run.stage_index), (0, "optimize"))
     current = Rates.model_validate(stages[index].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
@@ -304,12 +304,12 @@ def set_aside(run: Run, broken: list[str]) -> str:
 
 def saved(out: Path) -> list[Path]:
     """Return the checkpoints of a run folder from old to new; those of a refit come last."""
-    places = {
-        (found[1] == "refit", int(found[2])): path
+    by_rank = {
+        (match[1] == "refit", int(match[2])): path
         for path in (out / CHECKPOINTS).glob("*.npz")
-        if (found := re.fullmatch(r"(step|refit)_(\d+)\.npz", path.name))
+        if (match := re.fullmatch(r"(step|refit)_(\d+)\.npz", path.name))
     }
-    return [places[place] for place in sorted(places)]
+    return [by_rank[rank] for rank in sorted(by_rank)]
 
 
 def load(path: Path) -> tuple[State, Arrays]:
@@ -369,7 +369,7 @@ def drop_later(out: Path, taken: Path | None) -> None:
 
 
 def _remove(files: Iterable[Path]) -> None:
-    """Remove older states; on Windows, one that another program reads stays until the next call."""
+    """Remove older states; on Windows, a state that another program is reading stays until the next call."""
     for file in files:
         try:
             file.unlink(missing_ok=True)
@@ -429,15 +429,15 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
     if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
     for difference in differences(before, run.pipeline, run.settings):
-        if difference.kind == "output" or difference.is_of_place(state.file_hashes, run.file_hashes):
+        if difference.kind == "output" or difference.is_moved_file(state.file_hashes, run.file_hashes):
             continue
         if difference.kind is None:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
-        if state.best and state.best.refit == "begun" and difference.place.endswith((".steps", ".patience")):
+        if state.best and state.best.refit == "begun" and difference.key_path.endswith((".steps", ".patience")):
             raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
-        is_end = difference.place.endswith(".steps")  # an earlier end of the training
+        is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
             more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")

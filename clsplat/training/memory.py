@@ -104,11 +104,11 @@ def most_pixels(views: Sequence[View], tile: int) -> int:
 def bytes_of_modules(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
     """Return the device bytes of modules in the training that needs most."""
     lists = [getattr(stage, "modules", ()) for stage in stages]
-    return max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
+    return max((sum(module.device_bytes(views, tile) for module in modules) for modules in lists), default=0)
 
 
 def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the components of parameters and moments, by table.  motion: columns of the motion; 0 if static."""
+    """Return the number of components of each parameter and moment.  motion: columns of the motion; 0 if static."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}

@@ -193,7 +193,7 @@ class Forecast:
     def of(cls, step: int, last_step: int, due: Sequence[Callable[[int], bool]]) -> "Forecast":
         """Return the forecast of a training after `step`.  due: for each rule, whether it acts at a step."""
         later = range(last_step - 1, step, -1)  # none follows the last step
-        return cls(last_step, next((one for one in later if any(rule(one) for rule in due)), step))
+        return cls(last_step, next((later_step for later_step in later if any(rule(later_step) for rule in due)), step))
 
     def add(self, step: int, psnr: float, gaussians: int, seconds: float) -> None:
         """Add a report.  seconds: mean time of a step since the last one."""

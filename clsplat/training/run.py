@@ -120,7 +120,7 @@ class Run:
         """Go to the start of a stage."""
         self.stage_index, self.stage_step, self.during_index, self.edited = index, 0, 0, False
         self.records.settled = self.records.lines
-        self.modules = {name: one for name, one in self.modules.items() if one.after_training != "dropped"}
+        self.modules = {name: state for name, state in self.modules.items() if state.after_training != "dropped"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # valid only within one training
 

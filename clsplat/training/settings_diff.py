@@ -13,56 +13,58 @@ Kind = Literal["output", "training"] | None
 class Difference(NamedTuple):
     """A setting that differs between two resolved pipelines."""
 
-    place: str  # such as stages[1].optimize.rates.quats
+    key_path: str  # such as stages[1].optimize.rates.quats
     was: Any
     now: Any
     kind: Kind  # from its class; None: the setting cannot change on resume
 
     def __str__(self) -> str:
-        return f"{self.place} was {shorten(repr(self.was), 80)}, is {shorten(repr(self.now), 80)}"
+        return f"{self.key_path} was {shorten(repr(self.was), 80)}, is {shorten(repr(self.now), 80)}"
 
-    def is_of_place(self, were: Mapping[str, str], are: Mapping[str, str]) -> bool:
-        """Return whether a file was only moved.  were, are: hashes of the files that settings name, by path."""
+    def is_moved_file(self, old_hashes: Mapping[str, str], new_hashes: Mapping[str, str]) -> bool:
+        """Return whether a file was only moved.  old_hashes, new_hashes: of the files that settings name, by path."""
         is_text = isinstance(self.was, str) and isinstance(self.now, str)
-        return is_text and self.was in were and were[self.was] == are.get(self.now)
+        return is_text and self.was in old_hashes and old_hashes[self.was] == new_hashes.get(self.now)
 
     @property
     def stage(self) -> int | None:
         """The index of its stage in the pipeline; None outside of stages."""
-        found = re.match(r"stages\[(\d+)\]", self.place)
-        return int(found[1]) if found else None
+        match = re.match(r"stages\[(\d+)\]", self.key_path)
+        return int(match[1]) if match else None
 
 
-def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
+def differences(
+    old: Any, new: Any, settings: Any = None, key_path: str = "", kind: Kind = None
+) -> Iterator[Difference]:
     """Yield the differences of two resolved pipelines, in order.
 
     settings: the settings that `new` was resolved from; their classes define the kinds.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
-            inner, of = _inside(settings, key)
-            where = f"{place}.{key}" if place else str(key)
-            yield from differences(old.get(key), new.get(key), inner, where, kind or of)
+            inner, inner_kind = _inside(settings, key)
+            path = f"{key_path}.{key}" if key_path else str(key)
+            yield from differences(old.get(key), new.get(key), inner, path, kind or inner_kind)
     elif isinstance(old, list) and isinstance(new, list) and (kinds := _kinds([*old, *new])):
-        before, after = ({one["type"]: one for one in items} for items in (old, new))
-        now = {one.type: one for one in settings or ()}
+        before, after = ({item["type"]: item for item in items} for items in (old, new))
+        now = {item.type: item for item in settings or ()}
         for name in dict.fromkeys([*before, *after]):
-            own = kind or (
+            item_kind = kind or (
                 "training" if kinds[name].optional_on_resume and not {name} <= before.keys() & after.keys() else None
             )
-            yield from differences(before.get(name), after.get(name), now.get(name), f"{place}.{name}", own)
+            yield from differences(before.get(name), after.get(name), now.get(name), f"{key_path}.{name}", item_kind)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
             inner = settings[i] if isinstance(settings, list) else None
-            yield from differences(before, after, inner, f"{place}[{i}]", kind)
+            yield from differences(before, after, inner, f"{key_path}[{i}]", kind)
     elif old != new:
-        yield Difference(place, old, new, kind)
+        yield Difference(key_path, old, new, kind)
 
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
     """Return the classes of a list's items by type, if the items are addressed by type."""
     known = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := tag_of(kind))}
-    named = [str(one.get("type")) if isinstance(one, dict) else "" for one in items]
+    named = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
     return {name: known[name] for name in named} if all(name in known for name in named) else {}
 
 

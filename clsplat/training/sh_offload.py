@@ -30,9 +30,9 @@ def make_room(run: Run, count: int) -> None:
         return
     why = ""
     if run.harmonics == "auto":
-        if count <= (held := _plan(run, "device").limit):
+        if count <= (capacity := _plan(run, "device").limit):
             return
-        why = f", since the device can hold only {held:,} Gaussians with harmonics"
+        why = f", since the device can hold only {capacity:,} Gaussians with harmonics"
     gaussians.move_to_host()
     LOG.info("step %d: harmonics move to the host%s: the same bits, but slower", run.step, why)
 
@@ -43,12 +43,12 @@ def most_gaussians(run: Run, asked: float = math.inf) -> int:
     With `auto`, the result depends only on the Gaussians, not on where their harmonics are now.  asked: the search may
     stop at this number.
     """
-    place = last_place(run.harmonics, run.device.info)
-    held = _plan(run, place if run.harmonics == "host" else "device").limit
-    if run.harmonics != "auto" or place == "device" or min(asked, NEAR * run.model.gaussians.count) <= held:
-        return held
+    location = last_place(run.harmonics, run.device.info)
+    capacity = _plan(run, location if run.harmonics == "host" else "device").limit
+    if run.harmonics != "auto" or location == "device" or min(asked, NEAR * run.model.gaussians.count) <= capacity:
+        return capacity
     there = run.model.gaussians.count if run.stage_step else 0
-    return max(held, there, _plan(run, "host", _seen(run)).limit)
+    return max(capacity, there, _plan(run, "host", _seen(run)).limit)
 
 
 def more_room(run: Run) -> str:

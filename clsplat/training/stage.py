@@ -43,8 +43,8 @@ def path_in_run(*suffixes: str) -> PathInRun:
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
     """Return the marks in metadata, and in that of the arguments of a type."""
-    own = [mark for mark in metadata if isinstance(mark, PathInRun)]
-    return own + [mark for one in get_args(kind) for mark in _marks(one, getattr(one, "__metadata__", ()))]
+    marks = [mark for mark in metadata if isinstance(mark, PathInRun)]
+    return marks + [mark for part in get_args(kind) for mark in _marks(part, getattr(part, "__metadata__", ()))]
 
 
 class Stage(Settings):
@@ -78,7 +78,7 @@ class Stage(Settings):
     def named_outputs(cls) -> dict[str, tuple[str, ...]]:
         """Return the fields that hold a path inside the run folder, each with its suffixes."""
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
-        return {name: found[0].suffixes for name, found in marks.items() if found}
+        return {name: files[0].suffixes for name, files in marks.items() if files}
 
     def act(self, run: Run) -> None:
         """Run the stage under its name in status.json.  A failure inside an edit leaves an inconsistent run.

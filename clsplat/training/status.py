@@ -102,7 +102,7 @@ def status_of(content: Any) -> Status | None:
 
     Raises DataError with the first wrong field.
     """
-    if isinstance(content, dict) and type(made := content.get("format")) is int and made > FORMAT:
+    if isinstance(content, dict) and type(version := content.get("format")) is int and version > FORMAT:
         return None
     try:
         return Status.model_validate(content)

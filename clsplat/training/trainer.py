@@ -13,7 +13,7 @@ from clsplat.losses.base import (
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
-    content_of,
+    required_content,
     returned,
 )
 from clsplat.opencl.device import Array, constants
@@ -94,7 +94,7 @@ class StepTrainer:
         Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two that read different fourth
         planes, and for one that a module does not support.
         """
-        content = content_of(self.losses, step)
+        content = required_content(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
         now = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
         now.modules = self.modules

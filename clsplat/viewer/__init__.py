@@ -1,1 +1,1 @@
-"""What people look at: the viewer page, charts, video."""
+"""The viewer page, charts and videos."""

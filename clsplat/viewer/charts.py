@@ -190,7 +190,7 @@ MAX_POINT_DISTANCE = 3.0  # of drawn points from the center of the cameras, in r
 def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floating]) -> list[str]:
     """Draw cameras, and points [N, 3] around them, from above and from the side.
 
-    views: by a name for the legend.  Each camera shows its name on hover.
+    views: the views of each group, by the name in the legend.  Each camera shows its name on hover.
     """
     views = {name: of_kind for name, of_kind in views.items() if of_kind}
     everything = [view for of_kind in views.values() for view in of_kind]

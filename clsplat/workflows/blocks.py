@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.quick import open_correct
+from clsplat.conformance.quick import open_verified
 from clsplat.core.errors import (
     ClsplatError,
     ConfigError,
@@ -137,7 +137,7 @@ class Blocks:
                 "--set-coarse needs a coarse model that is trained; leave it out, or give a pipeline as --coarse"
             )
         rasterizer = self.pipeline.settings.rasterizer
-        self.device = open_correct(device, rasterizer.schedule, rasterizer.sort)
+        self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
         self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
         if len(self.scene.original.downscales) > 1:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")

@@ -77,15 +77,15 @@ def test_gradients_agree_with_finite_differences(smooth, rng):
     background = (0.2, 0.5, 0.9)
     case = random_case(rng, 6, *SIZE)
     model = model_of(case)
-    by_image = rng.normal(size=(SIZE[1], SIZE[0], 3)).astype(np.float32)
-    by_alpha = rng.normal(size=(SIZE[1], SIZE[0])).astype(np.float32)
+    grad_image = rng.normal(size=(SIZE[1], SIZE[0], 3)).astype(np.float32)
+    grad_alpha = rng.normal(size=(SIZE[1], SIZE[0])).astype(np.float32)
     renderer = Renderer(model, smooth)
-    gradients = renderer.render(case.view, background).backward(image=by_image, alpha=by_alpha)
+    gradients = renderer.render(case.view, background).backward(image=grad_image, alpha=grad_alpha)
 
     def loss(changed: Model) -> float:
         renderer.update(changed)
         picture = renderer.render(case.view, background)
-        return float((picture.image * by_image.astype(np.float64)).sum() + (picture.alpha * by_alpha).sum())
+        return float((picture.image * grad_image.astype(np.float64)).sum() + (picture.alpha * grad_alpha).sum())
 
     for name in PARAMETERS:
         table = getattr(model, name)
@@ -106,10 +106,12 @@ def test_gradients_agree_with_finite_differences(smooth, rng):
 def test_gradients_by_image_and_by_alpha_add_up(device, rng):
     case = random_case(rng, 20, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view, 0.3)
-    by_image, by_alpha = rng.normal(size=picture.image.shape), rng.normal(size=picture.alpha.shape)
-    both = picture.backward(image=by_image, alpha=by_alpha)
+    grad_image, grad_alpha = rng.normal(size=picture.image.shape), rng.normal(size=picture.alpha.shape)
+    both = picture.backward(image=grad_image, alpha=grad_alpha)
     for name in PARAMETERS:
-        parts = sum(getattr(picture.backward(**{k: v}), name) for k, v in (("image", by_image), ("alpha", by_alpha)))
+        parts = sum(
+            getattr(picture.backward(**{k: v}), name) for k, v in (("image", grad_image), ("alpha", grad_alpha))
+        )
         np.testing.assert_allclose(getattr(both, name), parts, atol=1e-4 * max(1e-6, np.abs(parts).max()))
 
 
@@ -140,13 +142,13 @@ def test_pictures_show_themselves(device, rng):
 def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
     cases = [random_case(rng, count, *size) for count, size in ((40, SIZE), (90, (64, 48)))]
     renderers = [Renderer(model_of(case), device) for case in cases]
-    by_image = [np.ones((case.size[1], case.size[0], 3)) for case in cases]
+    grad_image = [np.ones((case.size[1], case.size[0], 3)) for case in cases]
     alone = []
-    for renderer, case, planes in zip(renderers, cases, by_image, strict=True):
+    for renderer, case, planes in zip(renderers, cases, grad_image, strict=True):
         picture = renderer.render(case.view)
         alone.append((picture.image, picture.backward(image=planes)))
     pictures = [renderer.render(case.view) for renderer, case in zip(renderers, cases, strict=True)]
-    for (image, expected), picture, planes in zip(alone, pictures, by_image, strict=True):
+    for (image, expected), picture, planes in zip(alone, pictures, grad_image, strict=True):
         np.testing.assert_array_equal(image, picture.image)
         gradients = picture.backward(image=planes)
         for name in PARAMETERS:
@@ -222,12 +224,12 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, plain = model_of(case), model_of(case)
     plain = Model(**{**plain.tables(), "sh_rest": plain.sh_rest[:, :9]}, rendering=plain.rendering)
-    renderer, by_image = Renderer(model, device), np.ones((SIZE[1], SIZE[0], 3))
+    renderer, grad_image = Renderer(model, device), np.ones((SIZE[1], SIZE[0], 3))
     picture = renderer.render(case.view)
-    expected = picture.backward(image=by_image)
+    expected = picture.backward(image=grad_image)
     renderer.update(plain)  # of another degree
-    assert renderer.render(case.view).backward(image=by_image).sh_rest.shape == (20, 9)
-    again = picture.backward(image=by_image)
+    assert renderer.render(case.view).backward(image=grad_image).sh_rest.shape == (20, 9)
+    again = picture.backward(image=grad_image)
     assert renderer.model is plain
     for name in PARAMETERS:
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
@@ -236,16 +238,16 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
 @on_one_setting
 def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
     case = random_case(rng, 20, *SIZE)
-    model, by_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
+    model, grad_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
     renderer = Renderer(model, device)
     picture = renderer.render(case.view)
-    expected = picture.backward(image=by_image)
+    expected = picture.backward(image=grad_image)
     model.means[:] += 0.3
     renderer.update(model)
-    again = picture.backward(image=by_image)
+    again = picture.backward(image=grad_image)
     for name in PARAMETERS:
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
-    assert (renderer.render(case.view).backward(image=by_image).means != expected.means).any()
+    assert (renderer.render(case.view).backward(image=grad_image).means != expected.means).any()
 
 
 @on_one_setting

@@ -34,12 +34,12 @@ def test_image_and_alpha_are_those_of_the_renderer(device, rng):
 def test_gradients_agree_with_finite_differences(smooth, rng):
     case = random_case(rng, 6, *SIZE)
     renderer, parameters = Renderer(model_of(case), smooth), parameters_of(model_of(case))
-    by_image = torch.tensor(rng.normal(size=(SIZE[1], SIZE[0], 3)))
-    by_alpha = torch.tensor(rng.normal(size=(SIZE[1], SIZE[0])))
+    grad_image = torch.tensor(rng.normal(size=(SIZE[1], SIZE[0], 3)))
+    grad_alpha = torch.tensor(rng.normal(size=(SIZE[1], SIZE[0])))
 
     def loss(changed: dict) -> "torch.Tensor":
         image, alpha = clsplat.torch.render(renderer, case.view, changed, 0.3)
-        return (image.double() * by_image).sum() + (alpha.double() * by_alpha).sum()
+        return (image.double() * grad_image).sum() + (alpha.double() * grad_alpha).sum()
 
     loss(parameters).backward()
     for name, table in parameters.items():

@@ -101,8 +101,8 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
         return float(((composite()[0].colors() - wanted) ** 2).sum())
 
     found, inputs = composite()
-    by_raw, by_densities = found.backward(2 * (found.colors() - wanted))
-    gradient, _ = network.backward(weights, inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
+    grad_raw, grad_densities = found.backward(2 * (found.colors() - wanted))
+    gradient, _ = network.backward(weights, inputs, grad_raw.reshape(-1, 3), grad_densities.reshape(-1, 1))
     for own, expected in zip(weights, gradient, strict=True):
         for values, derivative in zip(own, expected, strict=True):
             numeric = np.zeros(values.shape)

@@ -30,7 +30,7 @@ def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     )
     shapes = [(5, 4), (4 + 5, 4), (4, 1), (4, 4), (4 + 2, 4), (4, 3)]
     weights = [(rng.normal(0, 0.7, shape), rng.normal(0, 0.5, shape[1])) for shape in shapes]
-    by_colors, by_densities = rng.normal(size=(samples, 3)), rng.normal(size=(samples, 1))
+    grad_colors, grad_densities = rng.normal(size=(samples, 3)), rng.normal(size=(samples, 1))
 
     def outputs() -> tuple[np.ndarray, np.ndarray, nerf.Inputs]:
         position = np.concatenate([level.forward(table, at, variances), sines], axis=1)
@@ -38,10 +38,10 @@ def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
 
     def value() -> float:
         colors, densities, _ = outputs()
-        return float((colors * by_colors).sum() + (densities * by_densities).sum())
+        return float((colors * grad_colors).sum() + (densities * grad_densities).sum())
 
-    _, by_position = network.backward(weights, outputs()[2], by_colors, by_densities)
-    found = level.backward(by_position[:, :2], at, variances)
+    _, grad_position = network.backward(weights, outputs()[2], grad_colors, grad_densities)
+    found = level.backward(grad_position[:, :2], at, variances)
     numeric = np.zeros_like(table)
     for place in np.ndindex(table.shape):
         before = table[place]

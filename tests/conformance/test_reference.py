@@ -672,8 +672,8 @@ def test_gradients_of_the_colors_of_a_photograph(rng):
     image = rng.uniform(-0.2, 1.4, gradient.shape)
     matrix = np.column_stack([np.eye(3) + rng.normal(0, 0.2, (3, 3)), rng.normal(0, 0.1, 3)])
     assert 0.1 < np.mean(ref.colored(image, matrix) == 1) < 0.7
-    by_image, by_matrix = ref.colored_backward(image, matrix, gradient)
-    for analytic, array in ((by_image, image), (by_matrix, matrix)):
+    grad_image, grad_matrix = ref.colored_backward(image, matrix, gradient)
+    for analytic, array in ((grad_image, image), (grad_matrix, matrix)):
         numeric = five_point(lambda: (gradient * ref.colored(image, matrix)).sum(), array)
         assert relative_error(analytic, numeric) < FD_TOLERANCE
     _, by_gains = ref.colored_backward(image, ref.gain_matrix(*numbers), gradient)
@@ -687,8 +687,8 @@ def test_gradients_of_a_grid_of_colors(rng, nodes):
     gradient, grid = rng.normal(size=(3, 5, 6)), rng.normal(0, 0.2, (3, 4, *nodes))
     image = rng.uniform(-0.2, 1.3, gradient.shape)
     assert 0.05 < np.mean(ref.gridded(image, grid) == 1) < 0.7
-    by_image, by_grid = ref.gridded_backward(image, grid, gradient)
-    for analytic, array in ((by_image, image), (by_grid, grid)):
+    grad_image, grad_grid = ref.gridded_backward(image, grid, gradient)
+    for analytic, array in ((grad_image, image), (grad_grid, grid)):
         numeric = five_point(lambda: (gradient * ref.gridded(image, grid)).sum(), array)
         assert relative_error(analytic, numeric) < FD_TOLERANCE
     value, slope = ref.grid_smoothness(grid)
@@ -727,9 +727,9 @@ def test_gradients_of_a_sky(rng):
     numeric = five_point(lambda: (gradient * left * ref.sky_image(texels, directions)).sum(), texels)
     assert relative_error(ref.sky_gradient(side, directions, left, gradient), numeric) < FD_TOLERANCE
     chosen = rng.random((height, width)) < 0.5
-    _, by_left = ref.sky_cover(chosen, left, 0.3)
+    _, grad_left = ref.sky_cover(chosen, left, 0.3)
     numeric = five_point(lambda: ref.sky_cover(chosen, left, 0.3)[0], left)
-    assert relative_error(by_left, numeric) < FD_TOLERANCE
+    assert relative_error(grad_left, numeric) < FD_TOLERANCE
 
 
 def test_gradients_of_a_layer_before_an_image(rng):
@@ -771,10 +771,10 @@ def test_gradients_of_a_motion(rng, degree, turns):
         tables = ref.moved(motion, means, quats, logit, time, degree, turns)
         return sum(float((weight * table).sum()) for weight, table in zip(weights, tables, strict=True))
 
-    by_motion, by_logit = ref.moved_backward(motion, logit, *weights, time, degree, turns)
-    assert by_motion.all()
-    assert relative_error(by_motion, five_point(value, motion)) < FD_TOLERANCE
-    assert relative_error(by_logit, five_point(value, logit)) < FD_TOLERANCE
+    grad_motion, grad_logit = ref.moved_backward(motion, logit, *weights, time, degree, turns)
+    assert grad_motion.all()
+    assert relative_error(grad_motion, five_point(value, motion)) < FD_TOLERANCE
+    assert relative_error(grad_logit, five_point(value, logit)) < FD_TOLERANCE
 
 
 @pytest.mark.parametrize("penalty", [lambda m: ref.motion_l2(m, 2.5), lambda m: ref.short_duration(m, 0.4)])

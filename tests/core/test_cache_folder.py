@@ -21,7 +21,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.machine import cache_folder
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
-from clsplat.opencl.kernel_caches import damaged_kernels, kernel_caches, remove_cut_kernels
+from clsplat.opencl.kernel_caches import kernel_cache_advice, kernel_caches, remove_cut_kernels
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
 
@@ -148,7 +148,7 @@ def test_a_device_works_without_a_home(tmp_path):
 def test_a_full_folder_is_not_called_damaged(machine, monkeypatch, free):
     cache_folder()
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    text = damaged_kernels()
+    text = kernel_cache_advice()
     assert ("has no space for built kernels; free some" in text) == (not free)
     assert ("is damaged: remove" in text) == bool(free)
 

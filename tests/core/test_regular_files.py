@@ -115,5 +115,5 @@ def test_only_the_vertices_of_a_model_are_read(tmp_path):
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "\xff", "9" * 5000])
 def test_what_is_no_json_is_refused_in_one_line(text, tmp_path):
     (tmp_path / "x").write_bytes(text.encode("latin-1"))
-    with pytest.raises(DataError, match=r"^.*/x: not a JSON file \(.*\); expected a JSON file: make it again$"):
+    with pytest.raises(DataError, match=r"^.*/x: not a JSON file \(.*\); expected a JSON file: create it again$"):
         read_json(tmp_path / "x")

@@ -110,7 +110,7 @@ def test_frames_of_another_video_or_other_settings_do_not_mix(video, tmp_path, m
     (tmp_path / "w.avi").write_bytes(video.read_bytes() + b"more")
     asked = {"video": video, "frames": 4, "long_side": None, **more}
     message = refusal(write_frames, tmp_path / asked["video"], tmp_path / "frames", asked["frames"], asked["long_side"])
-    assert f"holds frames that were taken with another {next(iter(more))}; give another folder" in message
+    assert f"holds frames that were extracted with another {next(iter(more))}; use another folder" in message
     assert {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()} == before
 
 

@@ -78,8 +78,8 @@ def test_squares_are_those_of_finite_differences(rng):
             opacity = splats.opacity.copy()
             opacity[i] += sign * step
             sides.append(ref.blend(replace(splats, opacity=opacity), 20, 16, background)[0])
-        by_falloff = (sides[0] - sides[1]) / (2 * step) * splats.opacity[i] / falloff
-        assert found[i] == pytest.approx((by_falloff**2).sum(), rel=1e-3)
+        grad_falloff = (sides[0] - sides[1]) / (2 * step) * splats.opacity[i] / falloff
+        assert found[i] == pytest.approx((grad_falloff**2).sum(), rel=1e-3)
 
 
 @on_one_setting

@@ -52,7 +52,7 @@ def test_a_file_that_no_run_has_written_is_replaced(few_steps, tmp_path):
             clsplat.convert(run, place)
     for name in ("report.html", "metrics.json"):
         assert (run / name).is_file()
-        with pytest.raises(ConfigError, match="is a file of a run; give another name"):
+        with pytest.raises(ConfigError, match="is a file of a run; use another name"):
             check_not_run_file(run / name)
 
 
@@ -61,7 +61,7 @@ def test_no_file_of_a_run_is_replaced(source, tmp_path):
     run.mkdir()
     (run / "status.json").write_text("{}")
     (run / "point_cloud.ply").write_text("trained")
-    with pytest.raises(ConfigError, match=r"point_cloud\.ply: is a file of a run; give another name"):
+    with pytest.raises(ConfigError, match=r"point_cloud\.ply: is a file of a run; use another name"):
         clsplat.convert(source, run / "point_cloud.ply")
     assert (run / "point_cloud.ply").read_text() == "trained"
     assert clsplat.convert(source, run / "new.spz")["gaussians"] == 100

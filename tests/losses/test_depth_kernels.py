@@ -56,11 +56,11 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
         return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH)).sum())
 
     splats = ref.project(gaussians, camera, case.degree, **numbers)
-    found, by_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
+    found, grad_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
     upstream = found.mean2d, found.conic, found.opacity, found.color
     settings = case.degree, case.variance, case.compensate
     gradients = ref.project_backward(gaussians, camera, *settings, splats, *upstream)
-    gradients["means"] = gradients["means"] + by_depth[:, None] * camera.rotation[2]
+    gradients["means"] = gradients["means"] + grad_depth[:, None] * camera.rotation[2]
     free = splats.opacity < 0.98
     for name in ("means", "quats", "log_scales", "logit_opacity"):
         values = gradients[name]

@@ -245,7 +245,7 @@ def test_capped_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkey
     assert device.tuning["TILE"] == 8
     assert len(caplog.records) == 1
     assert (
-        "tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward needs work-groups of 256 items"
+        "using tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward needs work-groups of 256 items"
         in caplog.text
     )
     np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)

@@ -15,12 +15,12 @@ MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: 
 
 @MODELS
 def test_derivatives_by_numbers_are_those_of_the_matrix(rng, model):
-    row, by_matrix, step = rng.normal(0, 0.2, len(model.columns)), rng.normal(size=(3, 4)), 1e-5
+    row, grad_matrix, step = rng.normal(0, 0.2, len(model.columns)), rng.normal(size=(3, 4)), 1e-5
     values = [
-        ((by_matrix * (model.matrix(row + change) - model.matrix(row - change))).sum() / (2 * step))
+        ((grad_matrix * (model.matrix(row + change) - model.matrix(row - change))).sum() / (2 * step))
         for change in step * np.eye(len(row))
     ]
-    assert model.gradient(row, by_matrix) == pytest.approx(np.array(values), rel=1e-6, abs=1e-9)
+    assert model.gradient(row, grad_matrix) == pytest.approx(np.array(values), rel=1e-6, abs=1e-9)
     penalties = [
         (model.penalty(row + change)[0] - model.penalty(row - change)[0]) / (2 * step)
         for change in step * np.eye(len(row))
@@ -29,9 +29,9 @@ def test_derivatives_by_numbers_are_those_of_the_matrix(rng, model):
 
 
 def test_the_gain_is_that_of_the_reference(rng):
-    row, by_matrix = rng.normal(0, 0.3, 3), rng.normal(size=(3, 4))
+    row, grad_matrix = rng.normal(0, 0.3, 3), rng.normal(size=(3, 4))
     assert Gain().matrix(row) == pytest.approx(ref.gain_matrix(*row))
-    assert Gain().gradient(row, by_matrix) == pytest.approx(ref.gain_gradient(*row, by_matrix))
+    assert Gain().gradient(row, grad_matrix) == pytest.approx(ref.gain_gradient(*row, grad_matrix))
 
 
 @MODELS

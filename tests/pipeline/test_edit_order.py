@@ -66,7 +66,7 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
 def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     recipe, old = known(name)
     steps = data.draw(st.integers(1, min_steps(recipe.training)))
-    factor = Axis.by(Fraction(steps, recipe.training.steps)).factor
+    factor = Axis.from_factor(Fraction(steps, recipe.training.steps)).factor
     old, new = (
         {(step, place) for step, place in one if place != -1}  # at least one change of the size stays
         for one in (old, edits(in_steps(recipe, steps).training, recipe.training))

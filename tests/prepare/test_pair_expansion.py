@@ -89,7 +89,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
     monkeypatch.setattr(mapping, "DENSER", FeatureOptions(480, 1400))
     figures = map_cameras(matches, tmp_path, attempts=3 if step == "more_pairs" else 4)
     assert figures["registered"] >= 7
-    assert f"the attempt failed and is skipped: {error}" in caplog.text
+    assert f"skipping an attempt that failed: {error}" in caplog.text
     assert [text for text in caplog.messages if text.endswith("trying again with denser features")]
 
 

@@ -60,11 +60,11 @@ def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
     static = gradients_of(replace(model, gaussians=Gaussians(device, tables)))
     upstream = static["means"], static["quats"], static["logit_opacity"][:, 0]
     logit = p["logit_opacity"][:, 0].astype(np.float64)
-    by_motion, by_logit = ref.moved_backward(p[MOTION].astype(np.float64), logit, *upstream, TIME, *WIDTHS[width])
+    grad_motion, grad_logit = ref.moved_backward(p[MOTION].astype(np.float64), logit, *upstream, TIME, *WIDTHS[width])
     found = gradients_of(model)
     for column in range(width):
-        assert relative_error(found[MOTION][:, column], by_motion[:, column]) < CONIC
-    assert relative_error(found["logit_opacity"][:, 0], by_logit) < CONIC
+        assert relative_error(found[MOTION][:, column], grad_motion[:, column]) < CONIC
+    assert relative_error(found["logit_opacity"][:, 0], grad_logit) < CONIC
     for name in ("means", "quats", "log_scales", "sh_base", "sh_rest"):
         np.testing.assert_array_equal(found[name], static[name])
 

@@ -127,11 +127,11 @@ def test_one_matrix_is_the_affine_kind(device, rng):
     found = grids.changed(workspace, camera, image, 1).get()
     expected = transform_colors(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)
-    passed, by_grid = grids.differentiated(workspace, camera, image, gradient, 1)
-    passed, by_grid = passed.get(), by_grid.get()
-    through, by_matrix = color_gradients(workspace, camera, image, affine.matrix(1), gradient)
+    passed, grad_grid = grids.differentiated(workspace, camera, image, gradient, 1)
+    passed, grad_grid = passed.get(), grad_grid.get()
+    through, grad_matrix = color_gradients(workspace, camera, image, affine.matrix(1), gradient)
     assert passed == pytest.approx(through.get(), abs=1e-5)
-    assert by_grid == pytest.approx(by_matrix().ravel(), rel=1e-4, abs=1e-4)
+    assert grad_grid == pytest.approx(grad_matrix().ravel(), rel=1e-4, abs=1e-4)
 
 
 @on_one_setting

@@ -77,12 +77,14 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
     at = move.apply_to(pose)
     center = -at[:, :3].T @ at[:, 3]
     by_points = (weights * np.cos(points @ at[:, :3].T + at[:, 3])) @ at[:, :3]
-    by_turn, by_shift = move.gradients(at, by_points.sum(axis=0), np.cross(points - center, by_points).sum(axis=0))
-    assert by_turn == pytest.approx(numeric(lambda change: value(turn + change, shift)), rel=1e-7)
+    grad_turn, by_shift = move.gradients(at, by_points.sum(axis=0), np.cross(points - center, by_points).sum(axis=0))
+    assert grad_turn == pytest.approx(numeric(lambda change: value(turn + change, shift)), rel=1e-7)
     assert by_shift == pytest.approx(numeric(lambda change: value(turn, shift + change)), rel=1e-7)
     at_pivot = at[:, :3] @ (shift - pose[:, :3].T @ pose[:, 3] + depth * pose[2, :3]) + at[:, 3]
     assert at_pivot == pytest.approx([0, 0, depth]), "it turns about that point"
-    small, larger = (PoseChange(size * turn, shift, 0).gradients(at, np.zeros(3), by_turn)[0] for size in (1e-5, 1e-3))
+    small, larger = (
+        PoseChange(size * turn, shift, 0).gradients(at, np.zeros(3), grad_turn)[0] for size in (1e-5, 1e-3)
+    )
     assert small == pytest.approx(larger, rel=2e-3)
 
 

@@ -17,7 +17,7 @@ from clsplat.training.stage import Scheduled, Stage
 def kinds(before, after) -> dict[str, str | None]:
     """The kind of each difference between two pipelines, by place."""
     found = differences(before.resolved(), after.resolved(), after.settings)
-    return {difference.place: difference.kind for difference in found}
+    return {difference.key_path: difference.kind for difference in found}
 
 
 @pytest.fixture

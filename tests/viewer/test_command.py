@@ -168,7 +168,7 @@ def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
 def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
     copy = shutil.copytree(run, tmp_path / "copy")
     before = (copy / "report.html").read_bytes()
-    with pytest.raises(ConfigError, match=r"report\.html: is a file of a run; give another name"):
+    with pytest.raises(ConfigError, match=r"report\.html: is a file of a run; use another name"):
         clsplat.view(copy, out=copy / "report.html")
     assert (copy / "report.html").read_bytes() == before
     for name in ("viewer.html", "new.html", "new.html"):

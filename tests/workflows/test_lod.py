@@ -92,7 +92,7 @@ def test_a_file_alone_is_merged_without_a_device(few_steps, tmp_path, monkeypatc
     def opens(device):
         raise AssertionError("a device is opened")
 
-    monkeypatch.setattr("clsplat.runs.model_file.open_correct", opens)
+    monkeypatch.setattr("clsplat.runs.model_file.open_verified", opens)
     file = tmp_path / "model.ply"
     file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
     found = clsplat.write_levels(file, tmp_path / "site", levels=2, keep=0.3)

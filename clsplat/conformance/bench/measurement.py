@@ -50,13 +50,13 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
     name = load(pipeline).settings.name
     data = read_json(path, EXPECTED, ConfigError)
     try:
-        found = _Earlier.model_validate(data)
+        actual = _Earlier.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the file"
-        raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: make it again") from error
-    if found.pipeline != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quote(found.pipeline)}")
+        raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: create it again") from error
+    if actual.pipeline != name:
+        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quote(actual.pipeline)}")
     return {key: value for key, value in data.items() if key != "against"}  # its own baseline
 
 

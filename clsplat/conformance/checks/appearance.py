@@ -102,17 +102,17 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
     grids.rate = rate = 0.01
     for step in range(1, 4):
         shares = grids.smoothness(workspace, 1)
-        by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
+        grad_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
         actual, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
         kernel = "color_grid_smoothness"
         yield by_element(kernel, f"value, {label}", actual, wanted, SUM, floor=1e-2)
-        actual, wanted = of_photograph(grids, by_smoothness), weight * slope
+        actual, wanted = of_photograph(grids, grad_smoothness), weight * slope
         largest = max(float(np.abs(wanted).max()), 1e-6)
         yield by_element(kernel, f"derivatives, {label}", actual, wanted, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, 1, device.upload(gradient), step)
-        whole = gradient.astype(np.float64) + by_smoothness
+        whole = gradient.astype(np.float64) + grad_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
         updated = np.stack([of_photograph(grids, values) for values in expected])
         expected = ref.centered_grids(updated).reshape(expected.shape)
@@ -157,12 +157,12 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     yield equal("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     uploaded = planes_of(device, camera, gradient)
     grad_image, waiting = color_gradients(workspace, camera, planes, matrix, uploaded)
-    by_image, by_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
+    by_image, grad_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
     passed = grad_image.get()
     yield by_element("colors_backward", f"gradient, {label}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
     yield equal("colors_backward", f"gradient outside the image, {label}", outside(camera, passed), 0.0)
     size = float(np.sqrt(gradient.size))
-    yield by_element("colors_backward", f"gradient by the matrix, {label}", waiting(), by_matrix, SUM, floor=size)
+    yield by_element("colors_backward", f"gradient by the matrix, {label}", waiting(), grad_matrix, SUM, floor=size)
     if channels > 3:
         yield equal("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
         yield equal("colors_backward", f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])
@@ -196,12 +196,12 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     expected = appearance.taken(exact, row, middle)
     yield by_element(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield equal(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
-    by_image, by_row = appearance.taken_backward(exact, row, middle, given)
+    by_image, grad_row = appearance.taken_backward(exact, row, middle, given)
     largest = max(float(np.abs(by_image).max()), 1.0)
     yield by_element(kernel, f"gradient, {label}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
     yield equal(kernel, f"gradient outside the image, {label}", outside(camera, passed[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield by_element(kernel, f"gradient by the numbers, {label}", by_parameters(row, sums), by_row, SUM, floor=floor)
+    yield by_element(kernel, f"gradient by the numbers, {label}", by_parameters(row, sums), grad_row, SUM, floor=floor)
     if channels > 3:
         yield equal(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
         yield equal(kernel, f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])

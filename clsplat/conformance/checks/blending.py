@@ -152,7 +152,7 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
         frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
         planes = frame.image.get()
         yield equal(
-            "blend_forward", f"colors beside the entropy, {label}", planes[:3], render(device, case).image.get()
+            "blend_forward", f"colors next to the entropy, {label}", planes[:3], render(device, case).image.get()
         )
         expected = ref.weight_entropy(case.project(), width, height)
         yield from check_image("blend_forward", f"entropy, {label}", planes[3:, :height, :width], expected[None])
@@ -251,7 +251,7 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     expected = ref.inverse_depth(splats, width, height)
     yield from check_image("blend_forward", f"inverse depth, {label}", image[3:], expected[None])
     of_image = ref.blend_backward(splats, width, height, background, weights[:3])
-    of_depth, by_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
+    of_depth, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
     mean2d, conic = (getattr(of_image, name) + getattr(of_depth, name) for name in ("mean2d", "conic"))
     opacity = of_image.opacity + of_depth.opacity
     actual = gradients_of_sums(splats, m)
@@ -259,12 +259,12 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     yield by_norm("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
     yield by_norm("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
     yield by_norm("blend_backward", f"colors with depths, {label}", m[:, 6:9], of_image.color, GRADIENT)
-    sums = -by_depth * np.where(splats.visible, splats.depth, 0) ** 2
+    sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
     yield by_norm("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
     upstream = mean2d, conic, opacity, of_image.color
     numbers = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
-    truth = truth + by_depth[:, None] * case.camera().rotation[2]
+    truth = truth + grad_depth[:, None] * case.camera().rotation[2]
     yield by_norm("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
 
 
@@ -325,15 +325,15 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     inside = np.s_[..., :height, :width]
     exact = left.astype(np.float64)
     yield by_element("lay_over", f"both, {label}", both[inside], ref.laid_over(layer, exact, image), 1e-6, floor=1.0)
-    loss, by_left = ref.layer_cover(exact, scale)
-    yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * by_left)[None], 1e-6, floor=scale)
+    loss, grad_left = ref.layer_cover(exact, scale)
+    yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
     yield by_element("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for planes_found in (both, behind):
         yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, planes_found), 0.0)
-    by_both = planes_of(device, camera, gradient)
-    look_behind(workspace, frame, by_both)
+    grad_both = planes_of(device, camera, gradient)
+    look_behind(workspace, frame, grad_both)
     expected = ref.gradient_behind(exact, gradient)
-    yield by_element("look_behind", f"derivatives, {label}", by_both.get()[inside], expected, 1e-6, floor=1.0)
+    yield by_element("look_behind", f"derivatives, {label}", grad_both.get()[inside], expected, 1e-6, floor=1.0)
 
 
 @CHECKS.add("lay_over", "look_behind")

@@ -181,10 +181,10 @@ def check_haar(
     yield by_element("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     derivatives = filter_gradients(planes, numbers, planes_of(device, camera, gradient))()
-    by_taps = ref.haar_gradient(exact, gradient, taps, mask)
-    by_both = np.array([by_taps[0] - by_taps[1], by_taps.sum()]) / np.sqrt(2)
+    grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
+    grad_both = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield by_element("haar_backward", label, actual, by_both, SUM, floor=size)
+    yield by_element("haar_backward", label, actual, grad_both, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")

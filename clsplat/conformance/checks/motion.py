@@ -64,12 +64,12 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     to_centers(model, camera, gradients)
     g = {name: values.astype(np.float64) for name, values in given.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
-    by_motion, by_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
+    grad_motion, grad_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
     actual, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
     for name, columns in motion_fields(width).items():
-        yield by_norm(kernel, f"by {name}, {label}", actual[:, columns], by_motion[:, columns], CONIC)
-    yield by_norm("move_backward", f"by the logit at the center, {label}", center, by_logit, CONIC)
+        yield by_norm(kernel, f"by {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
+    yield by_norm("move_backward", f"by the logit at the center, {label}", center, grad_logit, CONIC)
 
 
 def check_still(device: Device, rng: np.random.Generator) -> Results:
@@ -106,7 +106,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
         values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each, seen=seen)
         values[seen, 4] = np.maximum(values[seen, 4], min_duration)
         update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
-    label = f"{count} of {width} columns" + (", of seen rows alone" if every == 0 else "")
+    label = f"{count} of {width} columns" + (", only of visible rows" if every == 0 else "")
     actual, before = gaussians.get(MOTION), case.parameters[MOTION]
     yield equal("motion_step", f"values of rows not seen, {label}", actual[~seen], before[~seen])
     yield by_element("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)

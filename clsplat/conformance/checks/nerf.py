@@ -224,27 +224,27 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     encoding.read_grid(case.on_device, tiles)
     table, first = case.levels.network.position(tiles)
     features = rows_of(table, first, shape.grid_rows)
-    by_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
-    by_features[:, :, ::3] = 0  # samples without a gradient
+    grad_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
+    grad_features[:, :, ::3] = 0  # samples without a gradient
     gradients = list[NDArray[np.float32]]()
     for parts in (encoding.parts, 1, 3):
         encoding.parts, sums = parts, device.zeros(shape.parameters)
-        encoding.backward(device.upload(by_features), sums)
+        encoding.backward(device.upload(grad_features), sums)
         gradients.append(sums.get())
     actual, *others = gradients
     for parts, gradient in zip((1, 3), others, strict=True):
         yield equal("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
-    by_sample = _by_sample(by_features)
+    by_sample = _by_sample(grad_features)
     at, variances = np.split(_by_sample(places), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
         expected = grid.level.forward(grid.entries(case.parameters), at, variances)
         yield by_element("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
-        expected, by_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(actual)
-        yield by_norm("grid_backward", f"level {number}, {label}", by_entries, expected, GRADIENT)
+        expected, grad_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(actual)
+        yield by_norm("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
         untouched = np.all(expected == 0, axis=1)
-        yield equal("grid_backward", f"entries without samples, level {number}, {label}", by_entries[untouched], 0.0)
+        yield equal("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[untouched], 0.0)
     yield equal("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
 
 
@@ -267,7 +267,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
         case = FieldCase.sample(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
-        by_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
+        grad_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
         parameters = case.on_device
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
             comparison = _Comparison.from_level(case, level, scale)
@@ -275,12 +275,12 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
             case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
-            by_weights, by_position = comparison.backward(count)
-            expected.append(by_weights)
+            grad_weights, grad_position = comparison.backward(count)
+            expected.append(grad_weights)
             for number, grid in enumerate(case.grid_levels()):
-                by_features = by_position[:, FEATURES * number : FEATURES * (number + 1)]
-                by_entries[number] += grid.level.backward(by_features, *case.places(level.edges.get()))
-        for number, (grid, truth) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
+                grad_features = grad_position[:, FEATURES * number : FEATURES * (number + 1)]
+                grad_entries[number] += grid.level.backward(grad_features, *case.places(level.edges.get()))
+        for number, (grid, truth) in enumerate(zip(case.grid_levels(), grad_entries, strict=True)):
             label = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
                 yield by_norm(name, label, grid.entries(gradient.get()), truth, GRADIENT)
@@ -341,10 +341,10 @@ class _Comparison:
         yield by_element("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
-        by_colors = 2 * self.scale * self.differences
-        by_colors[counted:] = 0
-        by_raw, by_densities = self.composite.backward(by_colors)
-        return self.network.backward(self.weights, self.inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
+        grad_colors = 2 * self.scale * self.differences
+        grad_colors[counted:] = 0
+        grad_raw, grad_densities = self.composite.backward(grad_colors)
+        return self.network.backward(self.weights, self.inputs, grad_raw.reshape(-1, 3), grad_densities.reshape(-1, 1))
 
 
 @CHECKS.add("place_colors")

@@ -67,12 +67,12 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     actual = planes.get()
     yield by_element("sky_forward", f"picture, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
     yield equal("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
-    by_texels = view.skies.by_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
+    grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
     shown = view.skies.runs(view.camera, side).shown.get()
     rows = all_texels.reshape(-1, 3)
-    yield by_norm("sky_backward", f"derivatives, {label}", by_texels.get().T, rows[shown], SUM)
-    yield by_norm("sky_gather", f"derivatives by texels, {label}", by_texels.get().T, rows[shown], SUM)
+    yield by_norm("sky_backward", f"derivatives, {label}", grad_texels.get().T, rows[shown], SUM)
+    yield by_norm("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, rows[shown], SUM)
     hidden = np.delete(rows, shown, axis=0)
     yield equal("sky_gather", f"texels that are not shown, {label}", hidden, 0.0)
 
@@ -89,9 +89,9 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
     )
     held = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
     chosen, actual = ref.shows_sky(sky, np.where(held, 9, photograph), difference), behind.get()
-    loss, by_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
+    loss, grad_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
-        expected = view.left * by_left
+        expected = view.left * grad_left
         yield by_element(kernel, f"T dL/dT, {label}", view.inside(actual), expected, NEAR, floor=scale)
     yield equal("sky_cover", f"T dL/dT outside the image, {label}", outside(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])

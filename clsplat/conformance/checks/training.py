@@ -1,4 +1,4 @@
-"""Check what changes tables: Adam, deferred updates, penalties, rows, averages, and dropout."""
+"""Check the kernels that change tables: Adam, deferred updates, penalties, rows, averages, and dropout."""
 
 from dataclasses import replace
 from typing import Any

@@ -23,17 +23,17 @@ def gridded_backward(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the gradients of sum(gradient * gridded) by the image and the grid; clamped values pass none."""
     passed = np.where(changed_by_grid(image, grid) < 1, gradient, 0)
-    by_image, by_grid, with_one = passed.copy(), np.zeros(grid.shape), _with_one(image)
+    grad_image, grad_grid, with_one = passed.copy(), np.zeros(grid.shape), _with_one(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
     levels, inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
     for (k, j, i), weight, slope in _corners(image, grid):
         node = grid[:, :, k, j, i]  # [3, 4, H, W]
-        by_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], passed)
+        grad_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], passed)
         through = np.einsum("abhw,ahw,bhw->hw", node, passed, with_one)
-        by_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * through, 0)
+        grad_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * through, 0)
         for a, b in itertools.product(range(3), range(4)):
-            np.add.at(by_grid[a, b], (k, j, i), weight * passed[a] * with_one[b])
-    return by_image, by_grid
+            np.add.at(grad_grid[a, b], (k, j, i), weight * passed[a] * with_one[b])
+    return grad_image, grad_grid
 
 
 def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
@@ -64,7 +64,7 @@ def changed_by_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
-    """Yield the nodes around each pixel, (k, j, i) each [H, W], their weights, and the derivatives by the level."""
+    """Yield the nodes around each pixel, (k, j, i) each [H, W], their weights, and the gradients of the level."""
     _, _, nz, ny, nx = grid.shape
     _, height, width = image.shape
     y, x = np.mgrid[:height, :width]
@@ -91,11 +91,11 @@ def colored(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
 def colored_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Derivatives of sum(gradient * colored) by the image and by the matrix; those of what is cut are 0."""
+    """Return the gradients of sum(gradient * colored) with respect to image and matrix; 0 where values are clipped."""
     passed = np.where(_changed(image, matrix) < 1, gradient, 0)
-    by_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
+    grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
     with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
-    return by_image, np.einsum("ahw,bhw->ab", passed, with_one)
+    return grad_image, np.einsum("ahw,bhw->ab", passed, with_one)
 
 
 def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
@@ -106,7 +106,7 @@ def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
 
 
 def gain_gradient(exposure: float, red: float, blue: float, grad_matrix: NDArray[Any]) -> NDArray[Any]:
-    """Derivatives by exposure, red and blue, [3], from those by the matrix."""
+    """Return the gradients of exposure, red and blue, [3], from those of the matrix."""
     q = np.diag(grad_matrix) * np.diag(gain_matrix(exposure, red, blue))
     return np.array([q.sum(), q[0] - 0.299 / 0.587 * q[1], q[2] - 0.114 / 0.587 * q[1]])
 
@@ -128,22 +128,22 @@ def taken(image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float]) -
 def taken_backward(
     image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Derivatives of sum(gradient * taken) by the image and by the numbers."""
+    """Return the gradients of sum(gradient * taken) with respect to the image and the numbers."""
     falloff, q, away = _falloff(image, row, middle)
-    light, by_light, by_row = image * falloff, np.zeros(image.shape), np.zeros(17)
+    light, grad_light, grad_row = image * falloff, np.zeros(image.shape), np.zeros(17)
     for i in range(3):
         slopes = _slopes(row, i)
         begin, d = _piece(light[i])
-        by_light[i] = gradient[i] * (slopes[begin] + 4 * (slopes[begin + 1] - slopes[begin]) * d)
-        by_slope = np.array([(gradient[i] * _curve(light[i], unit)).sum() for unit in np.eye(5)])
+        grad_light[i] = gradient[i] * (slopes[begin] + 4 * (slopes[begin + 1] - slopes[begin]) * d)
+        grad_slope = np.array([(gradient[i] * _curve(light[i], unit)).sum() for unit in np.eye(5)])
         areas = np.array([_curve(np.ones(1), unit)[0] for unit in np.eye(5)])
-        by_logs = (np.diag(slopes) - np.outer(slopes, areas * slopes)).T @ by_slope
-        by_row[5 + 4 * i : 9 + 4 * i] = np.delete(by_logs, 2)
-    by_falloff = (by_light * image).sum(axis=0)
-    by_row[2:5] = [(by_falloff * q**power).sum() for power in (1, 2, 3)]
+        grad_logs = (np.diag(slopes) - np.outer(slopes, areas * slopes)).T @ grad_slope
+        grad_row[5 + 4 * i : 9 + 4 * i] = np.delete(grad_logs, 2)
+    grad_falloff = (grad_light * image).sum(axis=0)
+    grad_row[2:5] = [(grad_falloff * q**power).sum() for power in (1, 2, 3)]
     a, b, c = row[2:5]
-    by_row[:2] = [(by_falloff * (a + 2 * b * q + 3 * c * q**2) * -2 * one).sum() for one in away]
-    return by_light * falloff, by_row
+    grad_row[:2] = [(grad_falloff * (a + 2 * b * q + 3 * c * q**2) * -2 * one).sum() for one in away]
+    return grad_light * falloff, grad_row
 
 
 def _falloff(

@@ -191,7 +191,7 @@ def alpha_gradients(
 ) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
     """Each splat front to back with dL/dalpha, [H,W], in the prefix form; where alpha is capped it is zero.
 
-    grad_image: [3,H,W], or [4,H,W] with the derivative by the entropy of weights.
+    grad_image: [3,H,W], or [4,H,W] with the gradient of the entropy of weights.
     """
     grad_image, grad_entropy = grad_image[:3], grad_image[3:]
     entropy = entropy_gradients(splats, width, height, thresholds) if len(grad_entropy) else iter(())
@@ -346,9 +346,9 @@ def inverse_depth_backward(
 ) -> tuple[SplatGradients, Floats]:
     """Gradients of the splats, whose colors have none, and dL/dz, [N]; grad: dL/dD, [H,W]."""
     planes = np.stack([grad, *np.zeros((2, *grad.shape))])
-    found = blend_backward(_painted(splats), width, height, BLACK, planes, thresholds)
-    by_depth = -found.color[:, 0] * _painted(splats).color[:, 0] ** 2
-    return found._replace(color=0 * found.color), by_depth
+    actual = blend_backward(_painted(splats), width, height, BLACK, planes, thresholds)
+    grad_depth = -actual.color[:, 0] * _painted(splats).color[:, 0] ** 2
+    return actual._replace(color=0 * actual.color), grad_depth
 
 
 def inverse_depth_loss(
@@ -375,5 +375,5 @@ def gradient_behind(left: NDArray[Any], gradient: NDArray[Any]) -> NDArray[Any]:
 
 
 def layer_cover(left: NDArray[Any], scale: float) -> tuple[float, NDArray[Any]]:
-    """Return the loss, scale times the sum of 1 - T, and its gradient by T."""
+    """Return the loss, scale times the sum of 1 - T, and its gradient with respect to T."""
     return scale * float((1 - left).sum()), np.full_like(left, -scale)

@@ -1,4 +1,4 @@
-"""Image losses and metrics, with gradients by x.
+"""Image losses and metrics, with gradients with respect to x.
 
 Images are [C,H,W]: x is the render, y the target.
 """
@@ -21,7 +21,7 @@ def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Sum of |gradient (x - y)|, the gradient by x of any losses."""
+    """Sum of |gradient (x - y)|, for the gradient of any losses with respect to x."""
     return float(np.abs(gradient * (x - y)).sum())
 
 
@@ -170,7 +170,7 @@ def haar_filtered(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | 
 def haar_gradient(
     image: NDArray[Any], gradient: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None
 ) -> NDArray[Any]:
-    """Derivatives of sum(gradient * filtered image) by the taps, [2].
+    """Return the gradient of sum(gradient * filtered image) with respect to the taps, [2].
 
     The image is a square in each tap, so that a difference about its middle is exact at any distance.
     """
@@ -190,21 +190,21 @@ def residuals(image: NDArray[Any], photograph: NDArray[Any]) -> NDArray[Any]:
 
 def residual_numbers(values: NDArray[Any]) -> NDArray[np.int64]:
     """The number of residuals by bin: an octave is cut in eight parts of one width."""
-    found = np.zeros(BINS, np.int64)
+    actual = np.zeros(BINS, np.int64)
     for value in values.ravel():
         octave = math.floor(math.log2(value / LEAST)) if value > 0 else -1
         part = math.floor((value / (LEAST * 2.0**octave) - 1) * 8)
-        found[min(max(8 * octave + part, 0), BINS - 1)] += 1
-    return found
+        actual[min(max(8 * octave + part, 0), BINS - 1)] += 1
+    return actual
 
 
 def without_transients(
     values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
 ) -> NDArray[np.bool_]:
-    """Which pixels count: those below the threshold, and those whose box has at least as many below it as not."""
-    found = counted & (values < threshold)
-    below = found.copy()
+    """Return which pixels count: pixels below the threshold, and pixels in whose box at least half are below it."""
+    actual = counted & (values < threshold)
+    below = actual.copy()
     for y, x in zip(*np.nonzero(counted & ~below), strict=True):
         box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-        found[y, x] = 2 * below[box].sum() >= counted[box].sum()
-    return found
+        actual[y, x] = 2 * below[box].sum() >= counted[box].sum()
+    return actual

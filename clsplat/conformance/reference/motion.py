@@ -66,9 +66,9 @@ def moved_backward(
         if factor < PRESENCE_MIN:
             continue
         alpha = 1 / (1 + np.exp(-logit_opacity[n]))
-        by_alpha_t = grad_logit[n] / (alpha * factor * (1 - alpha * factor))
-        grad_center[n] = by_alpha_t * factor * alpha * (1 - alpha)
-        by_factor = by_alpha_t * alpha
+        grad_alpha_t = grad_logit[n] / (alpha * factor * (1 - alpha * factor))
+        grad_center[n] = grad_alpha_t * factor * alpha * (1 - alpha)
+        by_factor = grad_alpha_t * alpha
         for order, vector in enumerate(coefficients(row, degree), 1):
             first = (0, 5, 8)[order - 1]
             grad_motion[n, first : first + 3] = grad_means[n] * dt**order
@@ -82,7 +82,7 @@ def moved_backward(
 
 
 def motion_l2(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Mean of min(s, 1) |v| by extent, and its gradient by the motion, in which s counts as a constant."""
+    """Return the mean of min(s, 1) |v| by extent, and its gradient of the motion; s counts as a constant in it."""
     time = np.minimum(np.exp(motion[:, 4]), 1)
     speed = np.linalg.norm(motion[:, :3], axis=1)
     gradient = np.zeros_like(motion)
@@ -91,7 +91,7 @@ def motion_l2(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]
 
 
 def short_duration(motion: NDArray[Any], below: float) -> tuple[float, NDArray[Any]]:
-    """Mean of max(log(below / s), 0), and its gradient by the motion."""
+    """Return the mean of max(log(below / s), 0), and its gradient with respect to the motion."""
     shorter = np.log(below) - motion[:, 4]
     gradient = np.zeros_like(motion)
     gradient[:, 4] = -1.0 * (shorter > 0) / len(motion)

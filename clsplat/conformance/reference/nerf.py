@@ -38,24 +38,24 @@ class DenseNetwork:
         return hidden @ color[0] + color[1], x @ density[0] + density[1], inputs
 
     def backward(
-        self, weights: Weights, inputs: Inputs, by_colors: Floats, by_densities: Floats
+        self, weights: Weights, inputs: Inputs, grad_colors: Floats, grad_densities: Floats
     ) -> tuple[Weights, Floats]:
-        """Derivatives by the weights, and by the encoded position, [S, features], from those by the raw outputs."""
+        """Return the gradients of weights and encoded position, [S, features], from those of the raw outputs."""
         density, bottleneck, condition, color = weights[self.depth :]
         width = bottleneck[0].shape[1]
-        by_hidden = (by_colors @ color[0].T) * (inputs[-1] > 0)
-        by_bottleneck = (by_hidden @ condition[0].T)[:, :width]
-        by_outputs = [by_densities, by_bottleneck, by_hidden, by_colors]
-        by_x = by_densities @ density[0].T + by_bottleneck @ bottleneck[0].T
-        by_position = np.zeros_like(inputs[0])
+        grad_hidden = (grad_colors @ color[0].T) * (inputs[-1] > 0)
+        grad_bottleneck = (grad_hidden @ condition[0].T)[:, :width]
+        grad_outputs = [grad_densities, grad_bottleneck, grad_hidden, grad_colors]
+        grad_x = grad_densities @ density[0].T + grad_bottleneck @ bottleneck[0].T
+        grad_position = np.zeros_like(inputs[0])
         for i in reversed(range(self.depth)):
             after = inputs[i + 1]  # with the position, where it joins
             if i == self.skip:
-                by_position += by_x[:, weights[i][0].shape[1] :]
-            by_layer = by_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
-            by_outputs.insert(0, by_layer)
-            by_x = by_layer @ weights[i][0].T
-        return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, by_outputs, strict=True)], by_position + by_x
+                grad_position += grad_x[:, weights[i][0].shape[1] :]
+            grad_layer = grad_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
+            grad_outputs.insert(0, grad_layer)
+            grad_x = grad_layer @ weights[i][0].T
+        return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, grad_outputs, strict=True)], grad_position + grad_x
 
 
 @dataclass(frozen=True)
@@ -84,15 +84,15 @@ class Composite:
         weights = self.weights()[0][..., None]
         return np.asarray((weights * self.samples[0]).sum(axis=1) + (1 - weights.sum(axis=1)) * self.background)
 
-    def backward(self, by_colors: Floats) -> tuple[Floats, Floats]:
-        """Derivatives by the raw colors and densities, from those by the colors of the rays, [R, 3]."""
+    def backward(self, grad_colors: Floats) -> tuple[Floats, Floats]:
+        """Return the gradients of the raw colors and densities from those of the colors of the rays, [R, 3]."""
         (colors, _), (weights, left) = self.samples, self.weights()
         part = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
-        by_raw = by_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * part * (1 - part)
-        by_weights = (by_colors[:, None] * (colors - self.background)).sum(axis=-1)
-        behind = np.cumsum((weights * by_weights)[:, ::-1], axis=1)[:, ::-1] - weights * by_weights
+        grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * part * (1 - part)
+        grad_weights = (grad_colors[:, None] * (colors - self.background)).sum(axis=-1)
+        behind = np.cumsum((weights * grad_weights)[:, ::-1], axis=1)[:, ::-1] - weights * grad_weights
         slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
-        return by_raw, (left * by_weights - behind) * self.lengths * slope
+        return grad_raw, (left * grad_weights - behind) * self.lengths * slope
 
 
 # Cones of pixels, their samples, and the encodings of these, in float64 (Barron et al. 2021, "Mip-NeRF").
@@ -103,7 +103,7 @@ PIXELS, COARSE, FINE = 8, 9, 10  # which random numbers: cl_kernels/rays.cl
 
 
 def drawn_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
-    """A pixel of `count` for each ray of a step from `first` on, [rays]."""
+    """Return a pixel out of `count` for each ray of a step, starting at ray `first`, [rays]."""
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 
@@ -178,7 +178,7 @@ def encoded_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
 
 
 def encoded_directions(rays: Floats, degrees: int) -> Floats:
-    """Directions of length 1, with their sines and cosines, [R, 3 + 6 degrees]."""
+    """Return directions of length 1, with their sines and cosines, [R, 3 + 6 degrees]."""
     directions = rays[:, 3:6] / rays[:, 7:8]
     angles = (directions[:, None, :] * 2.0 ** np.arange(degrees)[:, None]).reshape(len(rays), -1)
     return np.concatenate([directions, np.sin(angles), np.cos(angles)], axis=1)
@@ -222,15 +222,15 @@ class HashLevel:
         entries, shares = self._inside(at, variances)
         return np.asarray((table[entries] * shares[..., None]).sum(axis=1))
 
-    def backward(self, by_features: Floats, at: Floats, variances: Floats) -> Floats:
-        """Derivatives by the table, [entries, F], from those by the features."""
+    def backward(self, grad_features: Floats, at: Floats, variances: Floats) -> Floats:
+        """Return the gradients of the table, [entries, F], from those of the features."""
         entries, shares = self._inside(at, variances)
-        found = np.zeros((self.entries, by_features.shape[1]))
-        np.add.at(found, entries, shares[..., None] * by_features[:, None])
-        return found
+        actual = np.zeros((self.entries, grad_features.shape[1]))
+        np.add.at(actual, entries, shares[..., None] * grad_features[:, None])
+        return actual
 
     def _inside(self, at: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """The corners, with the weight of the level; without any outside of the cube."""
+        """Return the corners inside the cube, with the weight of the level."""
         inside = np.all((at >= 0) & (at <= 1), axis=1)
         entries, shares = self.corners(np.where(inside[..., None], at, 0.5))
         return entries, shares * (inside * self.weights(variances))[:, None]

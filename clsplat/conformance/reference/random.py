@@ -20,7 +20,7 @@ def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[in
 
 
 def dropped(probability: float, seed: int, step: int, count: int) -> NDArray[np.bool_]:
-    """Which of `count` Gaussians a step leaves out, [N]: by one word each (Park et al. 2025)."""
+    """Return which of `count` Gaussians a step drops, [N], by one random word each (Park et al. 2025)."""
     words = [philox((row, step, 2, 0), (seed, 0))[0] for row in range(count)]
     return np.array([word / 2**32 < probability for word in words])
 

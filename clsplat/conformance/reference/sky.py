@@ -15,7 +15,7 @@ Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
 def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
-    """Directions through the centers of pixels."""
+    """Return the directions through the centers of pixels."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
@@ -50,12 +50,12 @@ def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
 
 
 def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any], grad: NDArray[Any]) -> NDArray[Any]:
-    """Derivatives of sum(grad * T * sky_image) by the map.  grad: [C, H, W]; transmittance: [H, W]."""
-    by_texels = np.zeros((side, side, len(grad)))
+    """Return the map's gradient of sum(grad * T * sky_image).  grad: [C, H, W]; transmittance: [H, W]."""
+    grad_texels = np.zeros((side, side, len(grad)))
     for v, u in np.ndindex(*transmittance.shape):
         for row, column, weight in map_entries(directions[v, u], side):
-            by_texels[row, column] += weight * transmittance[v, u] * grad[:, v, u]
-    return by_texels
+            grad_texels[row, column] += weight * transmittance[v, u] * grad[:, v, u]
+    return grad_texels
 
 
 def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
@@ -67,6 +67,6 @@ def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) ->
 
 
 def sky_cover(chosen: NDArray[Any], transmittance: NDArray[Any], weight: float) -> tuple[float, NDArray[Any]]:
-    """The loss of what covers the sky, and its derivative by the transmittance, [H, W]."""
+    """Return the loss of Gaussians that cover the sky, and its gradient with respect to the transmittance, [H, W]."""
     share = chosen / chosen.size
     return float(weight * (share * (1 - transmittance)).sum()), -weight * share

@@ -1,4 +1,4 @@
-"""Compute what changes Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared vectors."""
+"""Compute changes of Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared vectors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -37,7 +37,7 @@ def adam_step(
     return np.where(rows, updated, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
 
 
-# Penalties on scales and opacities, with their gradients by log_scales and logit_opacity.
+# Penalties on scales and opacities, with their gradients with respect to log_scales and logit_opacity.
 
 
 def covariance_trace(
@@ -104,12 +104,12 @@ def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
 
     grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  It is the length of L^T g, with L L^T the covariance.
     """
-    found = np.zeros(len(conic))
+    actual = np.zeros(len(conic))
     for i, (xx, xy, yy) in enumerate(conic):
         if xx > 0:
             lower = np.linalg.cholesky(np.linalg.inv([[xx, xy], [xy, yy]]))
-            found[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
-    return found
+            actual[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
+    return actual
 
 
 def mean_gradient(total: NDArray[Any], count: NDArray[Any]) -> NDArray[Any]:
@@ -176,15 +176,15 @@ def screen_splitting(
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
     """Σ dL/dalpha · (Hessian of alpha by the splat's mean) over pixels, one after another: [N,2,2] px⁻²."""
-    found = np.zeros((len(splats.opacity), 2, 2))
+    actual = np.zeros((len(splats.opacity), 2, 2))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         a, b, c = splats.conic[step.splat]
         conic = np.array([[a, b], [b, c]])
         for row, column in np.argwhere(grad_alpha != 0):
             slope = conic @ [step.dx[row, column], step.dy[row, column]]
             hessian = step.alpha[row, column] * (np.outer(slope, slope) - conic)
-            found[step.splat] += grad_alpha[row, column] * hessian
-    return found
+            actual[step.splat] += grad_alpha[row, column] * hessian
+    return actual
 
 
 def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
@@ -196,11 +196,11 @@ def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
 
 def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
     """Lift matrices on the screen, [N,2,2], to the scene, with a form of the splat that stays: [N,3,3]."""
-    found = np.zeros((len(on_screen), 3, 3))
+    actual = np.zeros((len(on_screen), 3, 3))
     for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
         jacobian = mean_jacobian(camera, gaussians.means[n])
-        found[n] = jacobian.T @ on_screen[n] @ jacobian
-    return found
+        actual[n] = jacobian.T @ on_screen[n] @ jacobian
+    return actual
 
 
 def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:

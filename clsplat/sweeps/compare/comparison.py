@@ -40,7 +40,7 @@ def flat(settings: dict[str, Any]) -> dict[str, str]:
 def differing(settings: Sequence[dict[str, str]]) -> list[str]:
     """Return the key paths at which flat settings differ from the first ones."""
     first, *others = settings
-    return list(dict.fromkeys(one.place for other in others for one in differences(first, other)))
+    return list(dict.fromkeys(difference.key_path for other in others for difference in differences(first, other)))
 
 
 def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
@@ -149,7 +149,7 @@ class RunComparison:
                 distinct.append(settings)
         variants = []
         for i, settings in enumerate(distinct):
-            runs = [run for run, own in zip(self.runs, by_run, strict=True) if own == settings]
+            runs = [run for run, values in zip(self.runs, by_run, strict=True) if values == settings]
             color = COLORS[i % len(COLORS)]
             variants.append(Variant(_letter(i), _name(settings, distinct), color, settings, _folders(runs)))
         return variants
@@ -191,8 +191,8 @@ def _settings(run: RunFolder) -> dict[str, str]:
     settings = {key: value for key, value in run.settings.items() if key not in ("scene", "seed", "adapt")}
     adapt = run.settings.get("adapt") or {}
     decided = [decision["key"] for decision in adapt.get("decisions") or ()]
-    kept = {path: value for path, value in flat(settings).items() if not any(_is_below(path, key) for key in decided)}
-    return {**kept, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
+    chosen = {path: value for path, value in flat(settings).items() if not any(_is_below(path, key) for key in decided)}
+    return {**chosen, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
 
 
 def _is_below(key_path: str, key: str) -> bool:
@@ -209,7 +209,7 @@ def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
     alike = [other for other in distinct if other.get("name") == settings.get("name")]
     words: list[str] = []
     for key_path in differing(alike):
-        text, *others = (_in_words(key_path, one, alike) for one in (settings, *alike))
+        text, *others = (_in_words(key_path, variant, alike) for variant in (settings, *alike))
         if 2 * others.count(text) <= len(alike) and text not in words:
             words.append(text)
     more = [f"and {len(words) - MAX_DIFFERENCES} more"] if len(words) > MAX_DIFFERENCES else []
@@ -221,12 +221,12 @@ def _in_words(key_path: str, settings: dict[str, str], alike: Sequence[dict[str,
     parts = key_path.split(".")
     for depth in range(1, len(parts) + 1):
         prefix = ".".join(parts[:depth])
-        below = [{path: v for path, v in one.items() if f"{path}.".startswith(f"{prefix}.")} for one in alike]
+        below = [{path: v for path, v in values.items() if f"{path}.".startswith(f"{prefix}.")} for values in alike]
         if not all(below):  # a stage, rule or key that only some variants have
             words = " ".join(parts[:depth][-2:]).replace("_", " ")
             if not any(f"{path}.".startswith(f"{prefix}.") for path in settings):
                 return f"without {words}"
-            if all(one == next(filter(None, below)) for one in below if one):
+            if all(values == next(filter(None, below)) for values in below if values):
                 return f"with {words}"
             break
     return f"{' '.join(parts[-2:]).replace('_', ' ')} {shorten(settings.get(key_path, 'unset'), MAX_VALUE)}"

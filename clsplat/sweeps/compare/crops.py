@@ -22,7 +22,7 @@ OVERVIEW_WIDTH = 340  # px
 
 @dataclass(frozen=True)
 class ImageCrop:
-    """A square of one view."""
+    """A square crop of one view."""
 
     view: str
     whole_photograph: Image
@@ -34,17 +34,17 @@ class ImageCrop:
 
     @property
     def photograph(self) -> Image:
-        """The square of the photo."""
+        """The crop of the photo."""
         return self._of(self.whole_photograph)
 
     @property
     def renders(self) -> list[Image]:
-        """The square of each run's render."""
+        """The crop of each run's render."""
         return [self._of(image) for image in self.whole_renders]
 
     @property
     def psnrs(self) -> list[float]:
-        """PSNR in the square, dB, by run."""
+        """PSNR of the crop, dB, by run."""
         return [psnr(render, self.photograph) for render in self.renders]
 
     @property

@@ -137,14 +137,14 @@ def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
 def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
     """Yield sentences about conditions that differ between runs, which makes the values of a column incomparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
-    averages = [one for split in splits for one in split.values()]
+    averages = [average for split in splits for average in split.values()]
     for key, name in CONDITIONS.items():
-        values = {str(value) for one in averages if (value := getattr(one, key, None)) is not None}
+        values = {str(value) for average in averages if (value := getattr(average, key, None)) is not None}
         if len(values) > 1:
             yield f"The {name} differs between runs ({', '.join(sorted(values))})."
     for split, downscale in _measured(rows):
         measured = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
-        counts = {one.color_views for one in measured if one is not None and one.figure("psnr_color") is not None}
+        counts = {mean.color_views for mean in measured if mean is not None and mean.figure("psnr_color") is not None}
         if len(counts) > 1:
             name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colors"
             yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
@@ -378,7 +378,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
 
 
 def _figure(crop: ImageCrop) -> dict[str, Any]:
-    """Return the crop for the page, with images as data URLs; the squares are PNG, which is lossless."""
+    """Return the crop for the page, with images as data URLs; the crops are PNG, which is lossless."""
     return dict(
         view=crop.view,
         overview=data_url(crop.overview),

@@ -1,4 +1,4 @@
-"""What takes part in a training step next to the Gaussians: one file a module, with its settings and its state."""
+"""Modules that take part in a training step next to the Gaussians: one file each, with settings and state."""
 
 from clsplat.core.settings import import_modules
 

@@ -264,7 +264,11 @@ def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
 
 def implicit_modules() -> dict[str, type[TrainingModule]]:
     """Return the classes of modules that are in no list, by type."""
-    return {one.implicit_type: one for one in Settings.defined if issubclass(one, TrainingModule) and one.implicit_type}
+    return {
+        module.implicit_type: module
+        for module in Settings.defined
+        if issubclass(module, TrainingModule) and module.implicit_type
+    }
 
 
 def restore_modules(run: Run, saved: Mapping[str, tuple[Scalars, Tables]]) -> dict[str, ModuleState]:

@@ -143,18 +143,22 @@ class GridState(ColorState):
         step.save(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if (kept := step.saved(self)) and step.view is not None:
-            step.gradient, by_grid = self.differentiated(step.workspace, step.camera, kept[0], step.gradient, step.view)
-            kept[1].append(by_grid)
+        if (saved := step.saved(self)) and step.view is not None:
+            step.gradient, grad_grid = self.differentiated(
+                step.workspace, step.camera, saved[0], step.gradient, step.view
+            )
+            saved[1].append(grad_grid)
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.saved(self)) and step.view is not None:
-            self.learn(step.workspace, step.view, kept[1][0], step.number)
+        if (saved := step.saved(self)) and step.view is not None:
+            self.learn(step.workspace, step.view, saved[1][0], step.number)
 
     def report(self) -> ColorReport:
         values = self.arrays["values"].get()
         grids = values.reshape(-1, 3, 4, *values.shape[2:]).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
-        means = {view: one.mean(axis=(0, 1, 2), dtype=np.float64) for view, one in zip(self.names, grids, strict=True)}
+        means = {
+            view: grid.mean(axis=(0, 1, 2), dtype=np.float64) for view, grid in zip(self.names, grids, strict=True)
+        }
         rows = {view: {"row": row, "matrix": means[view].tolist()} for row, view in enumerate(self.names)}
         facts = {
             "meaning": GRID_MEANING,
@@ -166,23 +170,23 @@ class GridState(ColorState):
         return ColorReport(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
     def changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
-        found = workspace.array("colored", image.shape)
+        result = workspace.array("colored", image.shape)
         workspace.device.program("color_grid.cl").color_grid_forward(
-            groups=(1, camera.rows), image=image, colored=found, **self._arguments(camera, image, view)
+            groups=(1, camera.rows), image=image, colored=result, **self._arguments(camera, image, view)
         )
-        return found
+        return result
 
     def smoothness(self, workspace: Workspace, view: int) -> Array:
         """Write the gradient of the total variation loss; return its terms."""
         nodes, row = dict(zip("xyz", self.settings.grid_shape, strict=True)), row_length(self.settings.grid_shape)
         sizes: dict[str, Any] = {f"n{axis}": n for axis, n in nodes.items()}
-        by_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
+        grad_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
         differences = {axis: row // n * (n - 1) for axis, n in nodes.items()}
         sizes |= {f"weight_{axis}": self.settings.weight / max(number, 1) for axis, number in differences.items()}
         workspace.device.program("color_grid_table.cl").color_grid_smoothness(
             items=row,
             values=self.arrays["values"],
-            by_smoothness=by_smoothness,
+            grad_smoothness=grad_smoothness,
             shares=shares,
             first=self.row(view) * row,
             count=row,
@@ -195,15 +199,15 @@ class GridState(ColorState):
     ) -> tuple[Array, Array]:
         """Return the gradients of the input image and of the grid, [row], from that of the image `changed` returned."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
-        found = workspace.array("grad_colored", image.shape)
+        result = workspace.array("grad_colored", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
-        sums, by_grid = (
+        sums, grad_grid = (
             workspace.array("grid row sums", (ENTRIES * nz * nx, camera.rows)),
             workspace.array("by grid", row),
         )
         program, arguments = workspace.device.program("color_grid.cl"), self._arguments(camera, image, view)
         program.color_grid_backward(
-            groups=(1, camera.rows), image=image, gradient=gradient, grad_image=found, passed=passed, **arguments
+            groups=(1, camera.rows), image=image, gradient=gradient, grad_image=result, passed=passed, **arguments
         )
         of_rows = ("nx", "nz", "per_column", "width", "rows", "stride")
         program.color_grid_row_sums(
@@ -215,9 +219,9 @@ class GridState(ColorState):
         )
         of_nodes = ("nx", "ny", "per_row", "height", "rows")
         program.color_grid_gather(
-            items=row, row_sums=sums, by_grid=by_grid, count=row, **{name: arguments[name] for name in of_nodes}
+            items=row, row_sums=sums, grad_grid=grad_grid, count=row, **{name: arguments[name] for name in of_nodes}
         )
-        return found, by_grid
+        return result, grad_grid
 
     def _arguments(self, camera: DeviceCamera, image: Array, view: int) -> dict[str, Any]:
         nx, ny, nz = self.settings.grid_shape
@@ -230,18 +234,18 @@ class GridState(ColorState):
             **camera.plane_arguments(),
         }
 
-    def learn(self, workspace: Workspace, view: int, by_grid: Array, step: int) -> None:
+    def learn(self, workspace: Workspace, view: int, grad_grid: Array, step: int) -> None:
         """Update the grid of a view by Adam, with its own update count, then center all grids.
 
-        by_grid: gradient of the image losses, [row]; that of the total variation is still in the workspace.
+        grad_grid: gradient of the image losses, [row]; that of the total variation is still in the workspace.
         """
         key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.grid_shape)
         self.scalars[key] = updates = self.scalars.get(key, 0.0) + 1
         arguments: dict[str, Any] = dict(self.arrays)
         workspace.device.program("color_grid_table.cl").color_grid_update(
             items=row,
-            by_grid=by_grid,
-            by_smoothness=workspace.array("grid smoothness", row),
+            grad_grid=grad_grid,
+            grad_smoothness=workspace.array("grid smoothness", row),
             **arguments,
             first=self.row(view) * row,
             rate=at_step(self.rate, step) / (1 - ADAM["BETA1"] ** updates),

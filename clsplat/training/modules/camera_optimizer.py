@@ -146,17 +146,17 @@ class PoseChange:
         pivot = self.depth * before[2] - before.T @ world_to_camera[:, 3]
         return np.column_stack([after, self.depth * np.array([0, 0, 1]) - after @ (pivot + self.translation)])
 
-    def gradients(self, pose: Floats, by_translation: Floats, by_rotation: Floats) -> tuple[Floats, Floats]:
+    def gradients(self, pose: Floats, grad_translation: Floats, grad_rotation: Floats) -> tuple[Floats, Floats]:
         """Return the gradients of the rotation vector and of the translation, each [3].
 
-        pose: the changed pose, [3, 4]; by_translation, by_rotation: gradients of a translation of all Gaussians, and
-        of a rotation of them about the camera, [3].
+        pose: the changed pose, [3, 4]; grad_translation, grad_rotation: gradients of a translation of all Gaussians
+        and of a rotation of them about the camera, [3].
         """
-        about_pivot = by_rotation - np.cross(self.depth * pose[2, :3], by_translation)
-        return _by_rotation_vector(self.rotation, about_pivot), -by_translation
+        about_pivot = grad_rotation - np.cross(self.depth * pose[2, :3], grad_translation)
+        return _by_rotation_vector(self.rotation, about_pivot), -grad_translation
 
 
-def _by_rotation_vector(vector: Floats, by_rotation: Floats) -> Floats:
+def _by_rotation_vector(vector: Floats, grad_rotation: Floats) -> Floats:
     """Return the gradient of a rotation vector from that of a small rotation after it (right Jacobian of SO(3))."""
     angle, x, y, z = math.hypot(*vector), *vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -164,7 +164,7 @@ def _by_rotation_vector(vector: Floats, by_rotation: Floats) -> Floats:
         first, second = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
     else:
         first, second = 0.5, 1 / 6
-    return np.asarray(by_rotation + first * cross @ by_rotation + second * cross @ cross @ by_rotation)
+    return np.asarray(grad_rotation + first * cross @ grad_rotation + second * cross @ cross @ grad_rotation)
 
 
 class CameraState(ModuleState):
@@ -216,21 +216,21 @@ class CameraState(ModuleState):
             return
         sums, name, (rotations, translations) = wait(), self.views[step.view].name, self.pose_tables
         change, (rotation, translation, focal) = self.pose_change(name), [at_step(r, step.number) for r in self.rates]
-        by_rotation, by_translation = change.gradients(self.pose(step.view), sums[:3], sums[3:6])
-        rotations.update(self.scalars, name, by_rotation, rotation)
-        translations.update(self.scalars, name, by_translation, change.depth * translation)
+        grad_rotation, grad_translation = change.gradients(self.pose(step.view), sums[:3], sums[3:6])
+        rotations.update(self.scalars, name, grad_rotation, rotation)
+        translations.update(self.scalars, name, grad_translation, change.depth * translation)
         self.zoom(name, float(sums[6]), focal)
 
-    def zoom(self, view: str, by_log: float, rate: float) -> None:
-        """Update the focal lengths of a view's camera by Adam.  by_log: gradient of the logarithm of their factor."""
+    def zoom(self, view: str, grad_log: float, rate: float) -> None:
+        """Update the focal lengths of a view's camera by Adam.  grad_log: gradient of the logarithm of their factor."""
         if rate:
             key = self._key(view)
-            adam_step(self.scalars, {key: self.scalars.get(key, 0.0)}, {key: by_log}, rate)
+            adam_step(self.scalars, {key: self.scalars.get(key, 0.0)}, {key: grad_log}, rate)
 
     @property
     def zoomed(self) -> list[str]:
         """The cameras whose focal lengths were learned."""
-        return [one for one in dict.fromkeys(self.cameras.values()) if self._key(one) in self.scalars]
+        return [camera for camera in dict.fromkeys(self.cameras.values()) if self._key(camera) in self.scalars]
 
     def pose_change(self, view: str) -> PoseChange:
         """Return the learned change of a view's pose."""

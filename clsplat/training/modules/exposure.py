@@ -168,7 +168,7 @@ class ColorModel(Settings):
         """Return [E | b], [3, 4], from the parameters, [columns]."""
 
     @abstractmethod
-    def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
+    def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
         """Return the gradient of the parameters, [columns], from that of the matrix, [3, 4]."""
 
     @abstractmethod
@@ -196,8 +196,8 @@ class Gain(Gains, ColorModel):
         green = -(LUMINANCE[0] * red + LUMINANCE[2] * blue) / LUMINANCE[1]
         return np.column_stack([np.diag(np.exp(exposure + np.array([red, green, blue]))), np.zeros(3)])
 
-    def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
-        red, green, blue = np.diag(by_matrix) * np.diag(self.matrix(row))
+    def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
+        red, green, blue = np.diag(grad_matrix) * np.diag(self.matrix(row))
         tied = green * LUMINANCE / LUMINANCE[1]
         return np.array([red + green + blue, red - tied[0], blue - tied[2]])
 
@@ -224,8 +224,8 @@ class Affine(ColorModel):
     def matrix(self, row: Floats) -> Floats:
         return IDENTITY + row.reshape(3, 4)
 
-    def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
-        return by_matrix.ravel()
+    def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
+        return grad_matrix.ravel()
 
     def from_gains(self, log_gains: Floats) -> Floats:
         return (np.column_stack([np.diag(np.exp(log_gains)), np.zeros(3)]) - IDENTITY).ravel()
@@ -333,20 +333,20 @@ class ExposureState(ColorState):
         step.module_losses.append(LossValue("colors", lambda: penalty))
 
     def backward(self, step: TrainingStep) -> None:
-        if kept := step.saved(self):
-            image, matrix, waits = kept
+        if saved := step.saved(self):
+            image, matrix, waits = saved
             step.gradient, wait = color_gradients(step.workspace, step.camera, image, matrix, step.gradient)
             waits.append(wait)
 
     def update(self, step: TrainingStep) -> None:
-        if not (kept := step.saved(self)) or step.view is None:
+        if not (saved := step.saved(self)) or step.view is None:
             return
-        self.learn(step.view, kept[2][0](), step.number)
+        self.learn(step.view, saved[2][0](), step.number)
 
-    def learn(self, view: int, by_matrix: Floats, step: int) -> None:
-        """Update the parameters of a view.  by_matrix: gradient of its matrix, [3, 4]."""
+    def learn(self, view: int, grad_matrix: Floats, step: int) -> None:
+        """Update the parameters of a view.  grad_matrix: gradient of its matrix, [3, 4]."""
         row = self.table.row(self.scalars, self.views[view])
-        gradient = self.settings.model.gradient(row, by_matrix) + self.settings.model.penalty(row)[1]
+        gradient = self.settings.model.gradient(row, grad_matrix) + self.settings.model.penalty(row)[1]
         self.table.update(self.scalars, self.views[view], gradient, at_step(self.rate, step))
 
     def matrix(self, view: int) -> Floats:

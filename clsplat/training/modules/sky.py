@@ -32,7 +32,7 @@ class SkyModule(TrainingModule):
         return cls(type=SKY) if has_sky else None
 
     def create_state(self, run: Run) -> "LearnedSky":
-        """Return the run's sky, made by its init stage, or an empty one to load."""
+        """Return the sky that the init stage made, or an empty one to load a saved state into."""
         settings = run.model_settings.sky
         assert settings
         blank = Sky(np.zeros((settings.side**2, 3), np.float32))
@@ -95,7 +95,7 @@ class LearnedSky(ModuleState):
     def backward(self, step: TrainingStep) -> None:
         """Compute the gradient of the texels that the view shows, [3, shown]."""
         frame = step.frame
-        step.save(self, step.rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
+        step.save(self, step.rasterizer.skies.grad_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 
     def update(self, step: TrainingStep) -> None:
         """Update the texels that the view shows by Adam."""

@@ -37,7 +37,7 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
     Raises ConfigError if a module excludes a sky that the settings require.
     """
     background = settings.background
-    rival = next((one for one in modules if SKY in one.conflicts and one.is_active(run.scene)), None)
+    rival = next((module for module in modules if SKY in module.conflicts and module.is_active(run.scene)), None)
     conflict = rival and f"'{rival.type}' cannot be combined with sky: {rival.conflicts[SKY]}"
     if conflict and settings.sky:
         raise ConfigError(f"model.background: {conflict}; leave one of them out")
@@ -81,7 +81,7 @@ def sky_advice(run: Run) -> list[str]:
 
 
 def _reason_unknown(run: Run) -> str:
-    """Why the photographs do not tell whether they show a sky; empty if they do."""
+    """Return why the photographs cannot be searched for a sky; empty if they can."""
     if run.scene.points is None:
         return "the dataset has no points, and what is far from them is not known"
     return "the photographs have transparency" if is_transparent(run.scene) else ""
@@ -90,7 +90,7 @@ def _reason_unknown(run: Run) -> str:
 def _count(run: Run, share: float) -> tuple[int, int]:
     """Count the photographs with at least this share of sky in their upper third, and all photographs."""
     evidence = _evidence(run, run.scene.merge_validation())
-    return sum(one.share >= share for one in evidence), len(evidence)
+    return sum(photo.share >= share for photo in evidence), len(evidence)
 
 
 def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
@@ -114,7 +114,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
     evidence = _evidence(run, run.scene)
     if texels := panorama(evidence, side):
         return texels
-    uppers = [one.upper.mean(axis=0) / 255 for one in evidence if len(one.upper)]
+    uppers = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
     if not uppers:
         LOG.warning("masks leave out the upper thirds of all photographs: the sky starts black")
     mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
@@ -126,4 +126,4 @@ def _evidence(run: Run, scene: Scene) -> list[SkyEvidence]:
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     counted = run.status.counted(views, "photographs", len(views))
     photographs = ((view, run.photographs.get(view)) for view in counted)
-    return list(detect_sky(scene, ((view, one.image(), one.counted()) for view, one in photographs)))
+    return list(detect_sky(scene, ((view, photo.image(), photo.counted()) for view, photo in photographs)))
