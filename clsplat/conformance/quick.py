@@ -17,7 +17,7 @@ from clsplat.core.machine import cache_folder
 from clsplat.core.resources import __version__, resource_dir
 from clsplat.opencl.device import BUILD_OPTIONS, Device, open_device
 from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
-from clsplat.opencl.kernel_caches import damaged_kernels
+from clsplat.opencl.kernel_caches import kernel_cache_advice
 from clsplat.render.tiles import Sort, resolve_sort
 
 LOG = logging.getLogger("clsplat")
@@ -26,7 +26,7 @@ Resolved = Literal["wide", "simt"]
 SORTS = ("radix", "bitonic")  # each has its record
 
 
-def open_correct(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
+def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
     """Open a device as `open_device` does, log its name, and ensure that it computes correctly.
 
     All code that renders or trains opens its device here.
@@ -55,7 +55,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; close other programs that use its memory")
         if result.damaged_cache:
-            raise DeviceError(f"{device.text}: {damaged_kernels()}")
+            raise DeviceError(f"{device.text}: {kernel_cache_advice()}")
         if not result.passes:
             how = "cannot be trusted" if result.fault else "computes wrongly"
             raise DeviceError(f"{device.text} {how}: {result.failures[0]}; run `clsplat doctor` for details")

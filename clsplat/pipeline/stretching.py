@@ -36,7 +36,7 @@ class Axis:
     """Factor of all other steps: the next multiple of 1 / PARTS."""
 
     @classmethod
-    def by(cls, factor: float | Fraction) -> "Axis":
+    def from_factor(cls, factor: float | Fraction) -> "Axis":
         """Return the axis of a factor; a float counts as the decimal number that it prints as."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))

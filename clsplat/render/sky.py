@@ -159,7 +159,7 @@ class Skies:
         )
         return behind, sums
 
-    def by_texels(self, sky: DeviceSky, camera: DeviceCamera, transmittance: Array, gradient: Array) -> Array:
+    def grad_texels(self, sky: DeviceSky, camera: DeviceCamera, transmittance: Array, gradient: Array) -> Array:
         """Return the gradient of the texels in the view, [3, shown], from that of the image."""
         runs = self.runs(camera, sky.side)
         count, shown = runs.runs.shape[0], runs.shown.shape[0]
@@ -179,24 +179,24 @@ class Skies:
             run_sums=sums,
             first_entry=runs.first_entry,
             entries=runs.entries,
-            by_texels=result,
+            grad_texels=result,
             shown=shown,
         )
         return result
 
     def update(
-        self, sky: DeviceSky, camera: DeviceCamera, by_texels: Array, moments: Mapping[str, Array], rate: float
+        self, sky: DeviceSky, camera: DeviceCamera, grad_texels: Array, moments: Mapping[str, Array], rate: float
     ) -> None:
         """Update the texels in the view with Adam.
 
-        by_texels: [3, shown] gradient; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
+        grad_texels: [3, shown] gradient; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
         and `free`, [1, side * side], 1 for trained texels, otherwise 0.
         """
         runs = self.runs(camera, sky.side)
         self._program.sky_update(
             items=runs.shown.shape[0],
             shown_texels=runs.shown,
-            by_texels=by_texels,
+            grad_texels=grad_texels,
             texels=sky.texels,
             free=moments["free"],
             moment1=moments["moment1"],
