@@ -137,7 +137,7 @@ def map_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[K
 
 def stretched(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; the `step_keys` of each class say what that changes."""
-    return _stretched(value, Axis.by(factor))  # type: ignore[no-any-return]
+    return _stretched(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
 
 
 def _stretched(value: Any, axis: Axis) -> Any:
