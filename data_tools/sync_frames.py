@@ -34,7 +34,7 @@ def write_sync_frames(scene: Path, moments: int, long_side: int | None = None) -
     lengths = {video: _length(video) for video in videos}
     least = min(lengths.values())
     if longer := [video.name for video, length in lengths.items() if length > least]:
-        LOG.warning("%s: the end of %s is left out: another video has %d frames", folder, first_few(longer), least)
+        LOG.warning("%s: the end of %s is left out: another video has only %d frames", folder, first_few(longer), least)
     if not 2 <= moments <= least:
         raise DataError(f"{folder}: {moments} moments of videos with {least} frames; expected 2 to {least}")
     places = np.linspace(0, least - 1, moments).round().astype(int).tolist()

@@ -72,8 +72,8 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
     if record and record != settings:
         changed = [name for name, value in settings.items() if record.get(name) != value]
         raise DataError(
-            f"{out}: holds frames that were taken with another {' and another '.join(changed)}; give another folder, "
-            "or remove it"
+            f"{out}: holds frames that were extracted with another {' and another '.join(changed)}; use another "
+            "folder, or remove it"
         )
     count = len(chosen) if chosen else settings["frames"] if record else 0
     own = {_file(out, i) for i in range(1, count + 1)}
@@ -81,7 +81,7 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
     if others:
         raise DataError(
             f"{out}: holds {len(others)} images already, such as {others[0].name}, with which the frames would mix; "
-            "give another folder"
+            "use another folder"
         )
     return chosen
 

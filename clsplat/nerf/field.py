@@ -188,7 +188,7 @@ class Levels:
         self.encoding.forward(parameters, Samples(rays.cones, edges))
         raw_colors, raw_densities = self.network.forward(parameters, tiles)
         weights, left = (
-            self.workspace.array(f"field {name} {what}", (rays.count, samples)) for what in ("weights", "left")
+            self.workspace.array(f"field {name} {kind}", (rays.count, samples)) for kind in ("weights", "left")
         )
         colors = self.workspace.array(f"field {name} rays", (rays.count, 3))
         self._composite.composite_forward(

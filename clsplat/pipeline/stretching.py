@@ -145,7 +145,7 @@ def _stretched(value: Any, axis: Axis) -> Any:
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, axis) if is_points else [_stretched(item, axis) for item in value]
     if isinstance(value, dict):
-        return {key: _stretched(one, axis) for key, one in value.items()}
+        return {key: _stretched(entry, axis) for key, entry in value.items()}
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}

@@ -172,4 +172,4 @@ class ExportField(Stage):
             load_field(file)
         except DataError as error:
             raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
-        LOG.info("a field of %s parameters written to %s", f"{field.shape.learned:,}", file)
+        LOG.info("wrote a field with %s parameters to %s", f"{field.shape.learned:,}", file)

@@ -115,5 +115,5 @@ def _array(data: bytes) -> NDArray[Any]:
     np.lib.format.read_magic(stream)
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)
     if fortran or dtype.hasobject:
-        raise DataError("an array has another layout than that of a checkpoint")
+        raise DataError("an array does not have the layout of a checkpoint")
     return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
