@@ -10,7 +10,7 @@ DIALECT = re.compile(
     r"|so many|those that|lies)\b",
     re.IGNORECASE,
 )
-MAX_DIALECT_WORDS = 60  # some uses are right: "the point lies on the ray", "beside" as a position
+MAX_DIALECT_WORDS = 45  # some uses are right: "the point lies on the ray", "beside" as a position
 BRITISH = re.compile(
     r"colour|\bgrey|centre|licence|neighbour|behaviour|favour|learnt|\bmetres?\b|(?:normal|quant|optim|minim|recogn)is(?:e|i|ation)",
     re.IGNORECASE,
