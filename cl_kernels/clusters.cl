@@ -6,8 +6,8 @@
 #define FARTHEST 3.0e38f  // beyond all products
 #define TOGETHER 8        // vectors that an item compares with its points together, in registers
 
-/* Continue with some of the vectors: the ones from `first` on, few enough to stay in a cache.  Of vectors with equal products
- * the first counts; 0 for a point that is not a number.  One item = LANES points. */
+/* Continue with some of the vectors: the ones from `first` on, few enough to stay in a cache.  Of vectors with equal
+ * products the first counts; 0 for a point that is not a number.  One item = LANES points. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void most_alike(
     __global const float *restrict points,   // [components,S]

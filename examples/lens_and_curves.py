@@ -75,13 +75,13 @@ class CameraResponseState(ModuleState):
             step.image = respond(step.workspace, step.camera, step.image, row)
 
     def backward(self, step: TrainingStep) -> None:
-        if kept := step.saved(self):
-            step.gradient = respond(step.workspace, step.camera, kept[0], kept[1], step.gradient)
-            kept[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
+        if saved := step.saved(self):
+            step.gradient = respond(step.workspace, step.camera, saved[0], saved[1], step.gradient)
+            saved[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.saved(self)) and step.view is not None:
-            gradient, rate = by_parameters(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
+        if (saved := step.saved(self)) and step.view is not None:
+            gradient, rate = by_parameters(saved[1], saved[3][0]()) + saved[2], at_step(self.settings.rate, step.number)
             TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 
     def apply_to(self, scene: Scene) -> Scene:
@@ -106,9 +106,9 @@ def slopes_of(row: Floats) -> Floats:
 def by_parameters(row: Floats, sums: Floats) -> Floats:
     """Return the gradient of a camera's parameters, [17], from the sums of rows of pixels, [20, rows]."""
     totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
-    by_logs = slopes * totals[5:].reshape(3, 5)
-    by_logs -= slopes * AREAS * by_logs.sum(axis=1, keepdims=True)
-    return np.concatenate([totals[:5], np.delete(by_logs, 2, axis=1).ravel()])
+    grad_logs = slopes * totals[5:].reshape(3, 5)
+    grad_logs -= slopes * AREAS * grad_logs.sum(axis=1, keepdims=True)
+    return np.concatenate([totals[:5], np.delete(grad_logs, 2, axis=1).ravel()])
 
 
 def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
@@ -120,7 +120,7 @@ def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Float
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
     numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
-    given: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
-    given |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
-    workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **given, **camera.plane_arguments())
+    arguments: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
+    arguments |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **arguments, **camera.plane_arguments())
     return result

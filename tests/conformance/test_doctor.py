@@ -220,7 +220,7 @@ def test_page_shows_every_comparison_and_the_build_log(info):
         "gradients of conics, 17 Gaussians",
         "gradients of colors",
         "error: &lt;unknown&gt;",
-        "<i>worst</i>: the largest error",
+        "<i>worst</i> is the largest error",
     ):
         assert text in page
 

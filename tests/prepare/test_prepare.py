@@ -335,7 +335,7 @@ def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path)
     out = tmp_path / "runs" / "a"
     runner.execute(checked, opening.open_run(checked, out, None), "new", lambda progress: None)
     (photos / "p.txt").write_text("other")
-    with pytest.raises(ConfigError, match="other photographs"):
+    with pytest.raises(ConfigError, match="other photos"):
         opening.open_run(checked, out, None)
 
 

@@ -96,7 +96,7 @@ def test_a_wrong_number_in_a_file_is_refused(rng, tmp_path):
 def test_it_is_not_merged_with_another(rng, tmp_path):
     boxed(rng).save(tmp_path / "a.ply")
     replace(boxed(rng), rendering=Rendering(0.05, 0.1, 1.0)).save(tmp_path / "b.ply")
-    with pytest.raises(DataError, match=r"is a mip model, .*a.ply is one of the pixel's box; expected the same"):
+    with pytest.raises(DataError, match=r"is a mip model, but .*a.ply is a model with a pixel box filter; merge"):
         clsplat.convert([tmp_path / "a.ply", tmp_path / "b.ply"], tmp_path / "c.ply")
 
 

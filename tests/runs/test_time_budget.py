@@ -169,7 +169,7 @@ def test_training_is_not_cut_below_what_keeps_edits_apart():
 
 
 def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):
-    with pytest.raises(ConfigError, match="leave it out to go on"):
+    with pytest.raises(ConfigError, match="omit it to continue"):
         clsplat.run(few_steps / "pipeline.yaml", out=few_steps, start="resume", minutes=1)
     with pytest.raises(ConfigError, match="a matrix has several"):
         clsplat.run(Path("examples/growth.yaml").absolute(), tiny_scene, tmp_path / "m", minutes=1)
