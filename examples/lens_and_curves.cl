@@ -8,7 +8,7 @@
 #include "planes.h"
 
 #define NODES 5
-#define SUMS (5 + 3 * NODES)  // derivatives by the center, by a, b, c, and by the slopes of each channel
+#define SUMS (5 + 3 * NODES)  // gradients of the center, of a, b, c, and of the slopes of each channel
 
 /* Forward: the response to an image.  Backward: the gradient with respect to the image, from that with respect to the
  * response, and the row sums that give the derivatives.  numbers: a, b, c, then the slopes of each channel; center:
@@ -27,7 +27,7 @@ void camera_response(
     for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
         const VF dx = (to_VF(LANE_INDEX + (int)x) + 0.5f - center_x) * per_px, q = dx * dx + dy * dy;
         const VF falloff = one + q * (numbers[0] + q * (numbers[1] + q * numbers[2])), inside = inside_row(x, columns);
-        VF by_falloff = zero;
+        VF grad_falloff = zero;
         for (uint i = 0; i < 3; i++) {
             const uint at = (i * rows + y) * stride + x, first = 3 + NODES * i;
             const VF c = VLOAD(image + at), light = falloff * c, passed = inside * VLOAD(gradient + at);
@@ -41,16 +41,16 @@ void camera_response(
                 slope += numbers[first + k] * hat;
                 total[2 + first + k] += passed * part;
             }
-            by_falloff += passed * slope * c;
+            grad_falloff += passed * slope * c;
             VSTORE(back ? passed * slope * falloff : inside * value, found + at);
         }
         if (channels > 3)
             VSTORE(VLOAD((back ? gradient : image) + (3 * rows + y) * stride + x), found + (3 * rows + y) * stride + x);
-        const VF by_q = by_falloff * (numbers[0] + q * (2.0f * numbers[1] + q * 3.0f * numbers[2]));
-        total[0] -= 2.0f * dx * by_q;
-        total[1] -= 2.0f * dy * by_q;
+        const VF grad_q = grad_falloff * (numbers[0] + q * (2.0f * numbers[1] + q * 3.0f * numbers[2]));
+        total[0] -= 2.0f * dx * grad_q;
+        total[1] -= 2.0f * dy * grad_q;
         for (uint k = 2; k < 5; k++)
-            total[k] += by_falloff *= q;
+            total[k] += grad_falloff *= q;
     }
     for (uint k = 0; k < SUMS; k++)
         sums[k][item] = sum_lanes(total[k]);

@@ -126,9 +126,7 @@ def test_the_files_of_a_run_of_a_field_are_checked(finished):
 
 def test_commands_on_models_say_that_a_run_has_none(finished):
     for path in (finished, finished / "field.npz"):
-        with pytest.raises(
-            DataError, match=r"is a field, a network instead of Gaussians; expected Gaussians; .*ren"
-        ):
+        with pytest.raises(DataError, match=r"is a field, a network instead of Gaussians; expected Gaussians; .*ren"):
             require_model(path)
     with pytest.raises(DataError, match="is a field"):
         clsplat.convert(finished, finished / "a.ply")

@@ -246,7 +246,9 @@ def test_a_choice_that_is_wrong_is_explained(setting, fault):
     assert fault in str(raised.value)
 
 
-@pytest.mark.parametrize(("count", "warned"), [(1, "only 1 photo for training"), (2, "only 2 photos for training"), (3, "")])
+@pytest.mark.parametrize(
+    ("count", "warned"), [(1, "only 1 photo for training"), (2, "only 2 photos for training"), (3, "")]
+)
 def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, count, warned):
     scene = read_scene(tiny_scene, Split(0))
     RunScene.of(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
