@@ -42,7 +42,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         LOG.info("%s: looking for sharp frames", video)
         sharp, moved = _measured(video)
         if len(sharp) == 1:
-            raise DataError(f"{video}: has one frame; expected a video, and photographs need no such step")
+            raise DataError(f"{video}: has only one frame; a photograph can be used without `clsplat data video`")
         chosen = sharpest(sharp, moved, frames)
         LOG.info("%d frames, of which %d are written", len(sharp), len(chosen))
         write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")

@@ -169,7 +169,7 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
     if schedule not in ("wide", "simt"):
-        raise ConfigError(f"no schedule named '{schedule}'; there are auto, wide and simt")
+        raise ConfigError(f"unknown schedule '{schedule}'; expected auto, wide or simt")
     return schedule
 
 

@@ -105,7 +105,7 @@ def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
 
 
 def _of_training(training: Optimize, size: tuple[int, int], first: int, units: int) -> Estimate:
-    """Estimate a training, from the fewest steps and Gaussians to the most."""
+    """Estimate a training, for the smallest and the largest number of steps and Gaussians."""
     pixels = size[0] * size[1]
     most = max(first, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
     low, high = step_seconds(units, size, first)[0], step_seconds(units, size, most)[1]

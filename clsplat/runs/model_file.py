@@ -301,7 +301,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
     own = _rendered(out)
     for path in paths:
         if path_exists(path) and path.relative_to(out).as_posix() not in own:
-            raise ConfigError(f"{path}: exists, and is no render of an earlier call; give another --out")
+            raise ConfigError(f"{path}: exists, and is not from an earlier render; give another --out")
 
 
 def _rendered(out: Path) -> dict[str, bool]:

@@ -70,7 +70,7 @@ class _Enough(Exception):
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
     """Execute the pipeline in as many steps as fit into `minutes`, including the rehearsal.
 
-    Raises ConfigError unless exactly one stage trains and its fewest steps fit, and what `execute` raises.
+    Raises ConfigError unless exactly one stage trains and its smallest number of steps fits, and what `execute` raises.
     """
     until = time.perf_counter() + 60 * minutes
     _require_one_training(pipeline)
@@ -151,7 +151,7 @@ def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, until: float) 
 def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: float) -> Rehearsal:
     """Run all stages of the pipeline with few steps, without changing the run.
 
-    until: s, on the clock.  Raises ConfigError as soon as the fewest steps turn out not to fit.
+    until: s, on the clock.  Raises ConfigError as soon as the smallest number of steps turns out not to fit.
     """
     LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
     short = stretched(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
@@ -187,7 +187,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
 
 
 def min_steps_of(pipeline: Pipeline) -> int:
-    """Return the fewest steps of a shortened training: its edits stay apart, and a rehearsal is not longer."""
+    """Return the smallest number of steps of a training: its edits stay apart, and a rehearsal is not longer."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsed), min_steps(training))
 

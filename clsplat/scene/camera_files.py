@@ -200,7 +200,9 @@ def check_nerfstudio(views: list[PosedView]) -> None:
         kinds[DISTORTION[one.lens.model][0]] = one.name
     if len(kinds) > 1:
         model, name = kinds.popitem()
-        raise DataError(f"{name}: {model}, and others are {next(iter(kinds))}; nerfstudio takes one; {REMEDY}")
+        raise DataError(
+            f"{name}: is {model}, other views are {next(iter(kinds))}; nerfstudio allows one model per file; {REMEDY}"
+        )
 
 
 def _lens(one: PosedView) -> dict[str, Any]:

@@ -238,8 +238,8 @@ class Split:
             test = _chosen(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
-                    "train on: name fewer of them, or raise `every`"
+                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; name fewer of them, "
+                    "or raise `every`, to leave some for training"
                 )
             if not test:
                 remedy = "lower its offset" if self.holdout.every else "name others, whose photographs are there"

@@ -159,7 +159,7 @@ def test_not_a_video(tmp_path):
 def test_a_picture_is_no_video(tmp_path):
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((60, 80, 3), np.uint8))
     text = refusal(write_frames, tmp_path / "a.jpg", tmp_path / "out")
-    assert text.startswith(f"{tmp_path / 'a.jpg'}: has one frame; expected a video")
+    assert text.startswith(f"{tmp_path / 'a.jpg'}: has only one frame")
     assert not list(tmp_path.glob("out/*.png"))
 
 

@@ -133,7 +133,7 @@ def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path)
 
 def test_two_kinds_of_lenses_are_refused_for_nerfstudio(scene_of, tmp_path):
     views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
-    with pytest.raises(DataError, match=r"right/4\.png: OPENCV_FISHEYE, and others are OPENCV; nerfstudio takes one"):
+    with pytest.raises(DataError, match=r"right/4\.png: is OPENCV_FISHEYE, other views are OPENCV"):
         clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
 
 

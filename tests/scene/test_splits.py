@@ -94,7 +94,7 @@ def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_f
         (ViewSelection(file="test.txt"), "test.txt: cannot be read"),
         (
             ViewSelection(names=list(LETTERS)),
-            "scene.holdout takes all 24 photographs for testing; expected some to train on",
+            "scene.holdout takes all 24 photographs for testing; name fewer",
         ),
         (ViewSelection(every=1), "scene.holdout takes all 24 photographs"),
     ],

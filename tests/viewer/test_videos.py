@@ -81,10 +81,10 @@ def test_frames_can_be_written_as_images(few_steps, tiny_scene, tmp_path):
     found = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.*") if path.is_file())
     frames = ["frame_00001.npy", "frame_00001.png", "frame_00002.png", "frame_00007.png"]
     assert found == [".renders.json", *frames, *renders]
-    with pytest.raises(ConfigError, match=r"frame_00007\.png: exists, and is no render"):
+    with pytest.raises(ConfigError, match=r"frame_00007\.png: exists, and is not from an earlier render"):
         clsplat.render_path(few_steps, **options, frames=7)
     (out / "frame_00003.png").write_bytes(b"a drawing")
-    with pytest.raises(ConfigError, match=r"frame_00003\.png: exists, and is no render"):
+    with pytest.raises(ConfigError, match=r"frame_00003\.png: exists, and is not from an earlier render"):
         clsplat.render_path(few_steps, **options, frames=3)
 
 

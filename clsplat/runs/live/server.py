@@ -83,7 +83,7 @@ class Request:
 def read(target: str, host: str, token: str) -> Request:
     """Parse a request.  Raises Refused: 400, 403, 404."""
     if host_name(host.strip().lower()) not in NAMES:
-        raise Refused(403, "this page answers to 127.0.0.1 and localhost alone")
+        raise Refused(403, "this page only answers requests to 127.0.0.1 and localhost")
     try:
         parts = urlsplit(target)
         query = parse_qsl(parts.query, keep_blank_values=True, max_num_fields=FIELDS)
