@@ -103,7 +103,7 @@ __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_forward(
     __global const float *restrict image,   // [channels,H',stride] 3 or 4 channels
     __global const float *restrict values,  // [photographs,ENTRIES,nz,ny,nx]
-    __global float *restrict colored,      // [channels,H',stride]
+    __global float *restrict colored,       // [channels,H',stride]
     const uint first,                       // value of the photograph
     const uint nx,
     const uint ny,

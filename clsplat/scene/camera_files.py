@@ -74,7 +74,7 @@ def warn_center_lost(path: Path, cameras: Sequence[Camera]) -> None:
         )
 
 
-# cameras.json, as the reference implementation of 3DGS writes it beside a model (Kerbl et al. 2023).
+# cameras.json, as the reference implementation of 3DGS writes it next to a model (Kerbl et al. 2023).
 
 INRIA_FILE = "cameras.json"
 MAX_BYTES = 1 << 27
@@ -143,7 +143,7 @@ def _array(one: JsonFrame, key: str, shape: tuple[int, ...]) -> "np.ndarray[Any,
     return array
 
 
-# nerfstudio's transforms.json, with points3d.ply beside it.
+# nerfstudio's transforms.json, with points3d.ply next to it.
 
 NERFSTUDIO_FILE, POINTS = "transforms.json", "points3d.ply"
 DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the names of what follows the middle
@@ -265,8 +265,8 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
             "`clsplat data undistort` first, or write the cameras alone"
         )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
-    beside = [out / IMAGES / EXPOSURES_FILE] if copies else []
-    for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *beside):
+    sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
+    for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     written = WRITERS[format_](out, views, scene.points, scene.tracks)

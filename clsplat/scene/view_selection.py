@@ -139,8 +139,8 @@ def _taken(place: str, name: str, key: TakenBy) -> DataError:
         "holdout": ("is a test view", "from scene.holdout"),
         "train": ("is left out by scene.train", "add it to scene.train"),
     }[key]
-    told = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
-    return MissingViewError(f"{place}: {told}")
+    message = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
+    return MissingViewError(f"{place}: {message}")
 
 
 def choose(

@@ -10,7 +10,7 @@ const choices = (group, key, action) => find(group).addEventListener("click", ({
   if (target.dataset[key]) action(target.dataset[key]);
 });
 const thousands = number => number.toLocaleString("en");
-const TOLD = 4000; // ms
+const CAPTION_MS = 4000;
 
 class Panel {
   constructor(viewer) {
@@ -61,7 +61,7 @@ class Panel {
   tell(text) {
     const caption = find("caption");
     caption.textContent = text;
-    setTimeout(() => { if (caption.textContent === text) caption.textContent = ""; }, TOLD);
+    setTimeout(() => { if (caption.textContent === text) caption.textContent = ""; }, CAPTION_MS);
   }
 
   caption(view) {

@@ -107,4 +107,4 @@ def test_page_that_missed_the_end_does_not_count_as_informed():
 
     desk = Ending()
     state = json.loads(Answers(desk)(Request("state.json", {})).body)
-    assert desk.told == state["ended"]
+    assert desk.is_end_sent == state["ended"]

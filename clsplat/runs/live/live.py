@@ -59,7 +59,7 @@ class Live:
         desk.ended = True
         try:
             end = time.monotonic() + FAREWELL
-            while desk.silent() < LOOKING and not desk.told and time.monotonic() < end:
+            while desk.silent() < LOOKING and not desk.is_end_sent and time.monotonic() < end:
                 self._leave()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
         finally:

@@ -313,7 +313,7 @@ class Desk:
     step: int = 0  # of the model that can be rendered; 0: there is none
     paused: bool = False
     ended: bool = False
-    told: bool = False  # whether a page knows that it ended
+    is_end_sent: bool = False  # whether a page knows that it ended
     fault: str = ""  # why there are no previews
     heard: float = float("-inf")  # time of the last request of a page
 

@@ -258,7 +258,7 @@ class Answers:
         state |= {"paused": desk.paused, "ended": ended, "fault": desk.fault}
         if shown:
             state["points"] = shown.curves.after(request.number("after", 0, 1 << 40))
-        desk.told = desk.told or ended
+        desk.is_end_sent = desk.is_end_sent or ended
         return Answer.json(state)
 
     def _scene(self, request: Request) -> Answer:
