@@ -60,10 +60,10 @@ class ValidatedTraining(Training):
             raise ValueError(f"'{'patience' if self.patience else 'refit'}' needs 'keep: best'; set both or neither")
         if self.keep != "best" and any(getattr(stage, "patience", None) for stage in self.during):
             raise ValueError("'densify.patience' needs 'keep: best'; set both or neither")
-        if self.keep == "best" and any("average" in stage.makes for stage in self.during):
+        if self.keep == "best" and any(stage.stage == "average" for stage in self.during):
             raise ValueError(
                 "'keep: best' keeps the model of one step, not an average; remove one of them, or use a pipeline "
-                "without 'add_to_average' and 'take_average', such as splat_7k"
+                "without 'average', such as splat_7k"
             )
         return self
 
@@ -279,6 +279,11 @@ class Optimize(ValidatedTraining):
         super().check_run(run)
         for module in (*implied_modules(run, self), *self.modules):
             module.check_run(run)
+
+    def leave(self, run: Run) -> None:
+        super().leave(run)
+        for stage in self.during:
+            stage.finish(run)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; yields ViewGradients unless a step is skipped, valid until the next step."""

@@ -214,7 +214,7 @@ def _totals(run: Run) -> list[Line]:
 
 REMEDY = (
     "More photos, taken between the existing ones, help most; `scene.validation: auto` with `optimize.keep: best`, in "
-    "a pipeline without `take_average` such as splat_7k, keeps the model that is best at views it was not trained on."
+    "a pipeline without `average`, such as splat_7k, keeps the model that is best at views it was not trained on."
 )
 
 

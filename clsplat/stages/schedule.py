@@ -1,5 +1,6 @@
 """Change the model at a cadence: SH degree, opacities, the filter, and averages of the parameters."""
 
+import logging
 from collections.abc import Collection
 from typing import Annotated, ClassVar, Literal
 
@@ -8,7 +9,9 @@ from pydantic import Field
 from clsplat.density.control import cap_opacity
 from clsplat.training import adam
 from clsplat.training.run import Run
-from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
+from clsplat.training.stage import ALL_HARMONICS, Scheduled
+
+LOG = logging.getLogger("clsplat")
 
 
 class RaiseSh(Scheduled):
@@ -67,16 +70,17 @@ class RefreshFilter(Scheduled):
         run.refresh_filter()
 
 
-class AddToAverage(Scheduled):
-    """Add every parameter to its average over the steps at which this stage runs (Polyak and Juditsky 1992).
+class AverageParameters(Scheduled):
+    """Average every parameter over the steps at which this stage runs (Polyak and Juditsky 1992).
 
-    Training continues from the parameters, not from the average.  A new Gaussian is averaged since it exists.  Edits of
-    existing Gaussians, such as a reset of opacities, are averaged with the values before: set `start` after them.
+    While learning rates are large, the parameters oscillate around a better model, which their average approaches.
+    Training continues from the parameters; the average replaces them after its last step.  A new Gaussian is averaged
+    since it exists.  Edits of existing Gaussians, such as a reset of opacities, are averaged with the values before:
+    set `start` after them.
     """
 
-    stage: Literal["add_to_average"] = "add_to_average"
+    stage: Literal["average"] = "average"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    makes: ClassVar[frozenset[str]] = frozenset({"average"})
     edits: ClassVar[bool] = True
     conflicts = ALL_HARMONICS
 
@@ -87,18 +91,10 @@ class AddToAverage(Scheduled):
         self.attach(run)
         adam.add(run.model.gaussians)
 
-
-class TakeAverage(Stage):
-    """Replace the parameters by their averages, right after the training.
-
-    While learning rates are large, the parameters oscillate around a better model, which their average approaches.
-    """
-
-    stage: Literal["take_average"] = "take_average"
-    needs: ClassVar[frozenset[str]] = frozenset({"model", "average"})
-    takes: ClassVar[frozenset[str]] = frozenset({"average"})
-    edits: ClassVar[bool] = True
-
-    def run(self, run: Run) -> None:
-        adam.take(run.model.gaussians)
-        run.refresh_filter()
+    def finish(self, run: Run) -> None:
+        if adam.has_average(run.model.gaussians):  # a resumed run may have replaced the parameters before
+            if not any(map(self.due, range(run.step - run.stage_step + 1, run.step))):  # no edit follows the last step
+                LOG.info("average: the training ended before its first step; the model is that of the last step")
+            with run.editing_tables():
+                adam.take(run.model.gaussians)
+                run.refresh_filter()

@@ -245,9 +245,14 @@ FOLDER = "average/"  # prefix of the names of parameters
 NUMBER = f"{FOLDER}number"  # of steps in the average of a row
 
 
+def has_average(gaussians: Gaussians) -> bool:
+    """Return whether there are tables for averages."""
+    return NUMBER in gaussians.tables
+
+
 def attach(gaussians: Gaussians) -> None:
     """Add empty tables for averages, if missing.  Rows of new Gaussians start empty."""
-    if NUMBER not in gaussians.tables:
+    if not has_average(gaussians):
         for name in gaussians.trained:
             gaussians.add(FOLDER + name, gaussians.tables[name].components, zero_fresh=True)
         gaussians.add(NUMBER, 1, zero_fresh=True)

@@ -116,6 +116,9 @@ class Scheduled(Stage):
     def attach(self, run: Run) -> None:
         """Add the tables that the stage needs, before the first step; a resumed run already has them."""
 
+    def finish(self, run: Run) -> None:
+        """Do what follows the last step of the training; a resumed run may do it again."""
+
     def due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step.  is_last: whether it is the last of the training."""
         if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):

@@ -26,11 +26,11 @@ from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_s
 
 # The pruning ladder: models with fewer and fewer Gaussians, each fine-tuned from the previous one.
 
-STAGES = ("init", "prune_least", "optimize", "take_average")  # of the recipe; each rung writes a PLY
+STAGES = ("init", "prune_least", "optimize")  # of the recipe; each rung writes a PLY
 PALETTE = "palette_sh"
 # stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded ones
-VECTORS = ("reduce_sh", PALETTE, "optimize", "take_average", "share_palette", PALETTE)
-FITTING = ("init", *VECTORS, "round_tables", "optimize", "take_average", "round_tables")
+VECTORS = ("reduce_sh", PALETTE, "optimize", "share_palette", PALETTE)
+FITTING = ("init", *VECTORS, "round_tables", "optimize", "round_tables")
 FITTED, SOG = "fitted", "model.sog"
 
 

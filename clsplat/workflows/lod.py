@@ -28,7 +28,7 @@ from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_s
 
 MAX_LEVELS = 12  # a million Gaussians halved 11 times are 500
 STEPS = 500
-STAGES = ("init", "optimize", "take_average")  # of the recipe
+STAGES = ("init", "optimize")  # of the recipe
 RECORD = "lod.json"
 
 

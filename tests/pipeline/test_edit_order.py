@@ -79,7 +79,7 @@ def test_an_average_begins_after_growth_in_the_fewest_steps_too(steps):
     """It began before in 200 steps: 40 cadences of 2.9 steps, each cut to 2, end sooner than 2 of 47."""
     training = in_steps(load("fast").settings, steps).training
     last = [max([0, *(n for n in range(1, steps) if stage.due(n))]) for stage in training.during]
-    (average,) = [stage for stage in training.during if stage.stage == "add_to_average"]
+    (average,) = [stage for stage in training.during if stage.stage == "average"]
     assert all(
         average.start >= step for step, stage in zip(last, training.during, strict=True) if stage.stage == "densify"
     )

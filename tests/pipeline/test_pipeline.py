@@ -222,7 +222,7 @@ DIFFERENCES = {
         *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
         *(f"rates.means.{key}" for key in ("over", "start", "until")),
         *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
-        *(f"{stage}.{key}" for stage in ("add_to_average", "reset_opacity~2") for key in ("every", "start", "stop")),
+        *(f"{stage}.{key}" for stage in ("average", "reset_opacity~2") for key in ("every", "start", "stop")),
         *(f"reset_opacity{key}" for key in (".every", ".start", ".stop", ".value", ".when_background")),
         *(
             "reset_opacity~2.value",
@@ -235,8 +235,8 @@ DIFFERENCES = {
         *("densify.start", "densify.stop", "stages.init.count", "stages.init.min_points", "stages.init.transparent"),
     },
     ("fast", "fast_30k"): {
-        *(f"{stage}.every" for stage in ("raise_sh", "densify~2", "add_to_average", "evaluate", "checkpoint")),
-        *("raise_sh.stop", "densify.stop", "densify~2.stop", "add_to_average.start"),
+        *(f"{stage}.every" for stage in ("raise_sh", "densify~2", "average", "evaluate", "checkpoint")),
+        *("raise_sh.stop", "densify.stop", "densify~2.stop", "average.start"),
         *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
         *(f"rates.means.{key}" for key in ("over", "start", "until")),
         *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),

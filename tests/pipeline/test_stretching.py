@@ -105,7 +105,7 @@ def test_stretched_average_begins_at_the_same_share_of_training(tmp_path, steps)
     settings = load("fast").settings
     new = checked_again("fast", in_steps(settings, steps), tmp_path).settings.training
     assert new == in_steps(settings, steps).training
-    (average,) = [stage for stage in new.during if stage.stage == "add_to_average"]
+    (average,) = [stage for stage in new.during if stage.stage == "average"]
     assert average.start == 2000 * steps // 3400
     assert sum(average.due(step) for step in range(1, steps)) == 27
 

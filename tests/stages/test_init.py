@@ -2,8 +2,6 @@
 
 import pytest
 
-from clsplat.core.errors import ConfigError
-from clsplat.pipeline.loading import load
 from tests.support.runs import train
 
 PIPELINE = """\
@@ -11,7 +9,7 @@ name: again
 model: {sh_degree: 1}
 stages:
   - init: {source: random, count: 500, opacity: 0.3}
-  - optimize: {steps: 4, losses: [l1], during: [{raise_sh: {every: 2}}, {add_to_average: {every: 1}}]}
+  - optimize: {steps: 4, losses: [l1], during: [{raise_sh: {every: 2}}, {average: {every: 1}}]}
   - init: {source: random, count: 700}
   - optimize: {steps: 4, losses: [l1]}
   - export
@@ -24,9 +22,3 @@ def test_a_second_init_forgets_the_first_training(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "x.yaml"))
     assert run.model.gaussians.count == 700
     assert set(run.adam.updates.values()) == {4}
-
-
-def test_averages_end_with_a_second_init(tmp_path):
-    (tmp_path / "x.yaml").write_text(PIPELINE.replace("  - export", "  - take_average"))
-    with pytest.raises(ConfigError, match="take_average needs 'average'"):
-        load(str(tmp_path / "x.yaml"))

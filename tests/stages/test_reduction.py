@@ -239,8 +239,7 @@ ROUNDED = PALETTE.replace(
       steps: 4
       rates: {means: 0, quats: 0, log_scales: 0, sh_rest: 0, sh_base: 0.01}
       losses: [l1]
-      during: [add_to_average: {every: 1}]
-  - take_average
+      during: [average: {every: 1}]
   - round_tables: {sh_base: 0.04}
 """,
 ).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")

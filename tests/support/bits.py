@@ -205,7 +205,7 @@ def adjust(name: str, settings: dict[str, Any]) -> None:
         settings["every"] = 10**6
     elif name == "checkpoint":
         settings["every"] = STEPS // 3
-    elif name not in ("raise_sh", "add_to_average") and settings["every"] != 1:
+    elif name not in ("raise_sh", "average") and settings["every"] != 1:
         settings["every"] = max(EDITS_EVERY, settings["every"])
         if "stop" in settings and settings["stop"] <= settings["every"]:
             settings["stop"] = settings["every"] + 1

@@ -30,7 +30,7 @@ def short(name: str, scene: Path, *overrides: str, saved: int = 4) -> Pipeline:
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
     stages = [often(old, stage, saved) if isinstance(stage, Optimize) else stage for old, stage in pairs]
-    kept = [stage for stage in stages if stage.stage in ("init", "optimize", "take_average", "export")]
+    kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
     return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
 
 
@@ -41,7 +41,7 @@ def often(old: Stage, loop: Optimize, saved: int) -> Optimize:
         stage.model_copy(
             update={
                 "every": saved if stage.stage == "checkpoint" else 4,
-                **({"start": 0} if stage.stage == "add_to_average" else {}),
+                **({"start": 0} if stage.stage == "average" else {}),
             }
         )
         if before.every != 1 and stage.stage != "raise_sh"

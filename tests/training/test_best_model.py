@@ -337,7 +337,7 @@ def test_what_has_nothing_to_choose_by_is_refused(pipeline, settings, fault):
 
 def test_other_models_at_the_end_are_refused(tmp_path):
     head = "name: x\nscene: {validation: auto}\nstages:\n  - init: {}\n"
-    one = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{add_to_average: {every: 2}}]}\n"
+    one = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{average: {every: 2}}]}\n"
     two = "  - optimize: {steps: 9, losses: [l1]}\n  - optimize: {steps: 9, keep: best, refit: true, losses: [l1]}\n"
     for stages, fault in ((one, "not an average"), (two, "expected a single stage that trains, got 2")):
         (tmp_path / "x.yaml").write_text(head + stages)

@@ -179,7 +179,7 @@ def test_harmonics_stay_where_views_see_all_of_them(tiny_scene, tmp_path, info):
 def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
     """A stage needs them on the device, there are none, or the device's memory is the host's."""
     own = f"scene.path='{tiny_scene}'"
-    average = "optimize.during=[{add_to_average: {every: 2}}]"
+    average = "optimize.during=[{average: {every: 2}}]"
     found = [load("smoke", [own, *more]).settings.harmonics for more in ([], [average], ["model.sh_degree=0"])]
     assert found == ["auto", "device", "device"]
     apart, shared = (replace(info, unified=unified) for unified in (False, True))
@@ -205,10 +205,10 @@ def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp
 
 
 def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
-    own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
+    own = f"scene.path='{tiny_scene}'", "optimize.during=[{average: {every: 2}}]"
     assert load("smoke", own)
     with pytest.raises(
-        ConfigError, match=r"add_to_average: .* harmonics on the host \(rasterizer\): it changes the harmonics"
+        ConfigError, match=r"average: .* harmonics on the host \(rasterizer\): it changes the harmonics"
     ):
         load("smoke", [*own, HOST])
 

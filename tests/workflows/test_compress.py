@@ -300,7 +300,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
     assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
     assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 20, 20)
-    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "take_average", "export"]
+    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "export"]
 
 
 @pytest.mark.parametrize(("steps", "lengths", "starts"), [(None, (400, 200), (200, 500)), (100, (40, 20), (20, 50))])

@@ -13,6 +13,7 @@ from clsplat.core.progress import Progress
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.runs.live.preview import RESERVE, Curves, Desk, PageCamera, Pictures, Preview, ShownRun
 from clsplat.runs.live.server import LOOPBACK, Answers, Server, scene_data
+from clsplat.scene.scene import position_text
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
@@ -94,6 +95,8 @@ class Live:
         desk, scene = self.desk, run.scene.downscaled(run.downscale)
         number = desk.shown.number + 1 if desk.shown else 1
         title, test = f"{run.name} · {run.scene_name}", scene.split("test")
+        if scene.origin.any():
+            title += f" · origin {position_text(scene.origin)}"
         points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
         stand = Viewpoint.from_points(points, scene.views, (test or scene.views)[0])
         data = scene_data(number, title, scene.views, {view.name for view in test}, stand)
