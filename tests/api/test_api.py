@@ -30,7 +30,7 @@ def loaded_after(code: str) -> set[str]:
     return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.split())
 
 
-def test_the_import_loads_nothing_heavy():
+def test_import_loads_no_heavy_module():
     loaded = loaded_after("import clsplat")
     assert {name for name in loaded if name.startswith("clsplat")} == {"clsplat"}
     assert not loaded & {"numpy", "pyopencl", "cv2", "pydantic", "scipy", "jinja2", "typer", "rich", "torch"}
@@ -43,7 +43,7 @@ def test_models_and_scenes_open_no_device():
     assert "torch" not in loaded_after(code)
 
 
-def test_names_for_readers_and_for_type_checkers_agree():
+def test_lazy_names_match_those_for_type_checkers():
     tree = ast.parse(Path(clsplat.__file__).read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If) and isinstance(node.test, ast.Name)]
     typed = {}
@@ -58,7 +58,7 @@ def test_names_for_readers_and_for_type_checkers_agree():
     assert {*clsplat.__all__, "__version__"} == set(dir(clsplat))
 
 
-def test_every_name_is_there_and_says_what_it_is():
+def test_every_public_name_exists_and_is_documented():
     faults = [f"{name}: has no docstring" for name in clsplat.__all__ if not getattr(clsplat, name).__doc__]
     for name in set(clsplat.__all__) - set(clsplat._MODULES):
         if getattr(clsplat, name) is not getattr(importlib.import_module(clsplat._MODULE_OF[name]), name):
@@ -68,12 +68,12 @@ def test_every_name_is_there_and_says_what_it_is():
     assert not faults, "\n".join(faults)
 
 
-def test_a_name_that_is_not_there_is_an_attribute_error():
+def test_unknown_name_raises_attribute_error():
     with pytest.raises(AttributeError, match="module 'clsplat' has no attribute 'splat'"):
         _ = clsplat.splat
 
 
-def test_a_wheel_has_every_room_and_its_types():
+def test_wheel_contains_every_package_and_py_typed():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     rooms = {path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in ROOT.glob("clsplat/**/*.py")}
     assert rooms - set(setup["packages"]) == set()
@@ -81,7 +81,7 @@ def test_a_wheel_has_every_room_and_its_types():
     assert (ROOT / "clsplat" / "py.typed").is_file()
 
 
-def test_settings_are_those_of_the_command_line():
+def test_settings_match_the_command_line():
     assert overrides({"a.b": 1, "c": [True, None], "d": "x y", "e": {"f": 1e-5}}) == [
         *("a.b=1", "c=[true, null]", 'd="x y"', 'e={"f": 1e-05}'),
     ]
@@ -127,7 +127,7 @@ def test_a_pose_of_another_shape_is_refused():
     assert clsplat.View("front", CAMERA, np.eye(4)[:3].tolist()).position.shape == (3,)
 
 
-def test_views_can_be_compared_and_kept_in_sets():
+def test_views_are_comparable_and_hashable():
     one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
     assert one == one
     assert one != other
@@ -136,7 +136,7 @@ def test_views_can_be_compared_and_kept_in_sets():
 
 
 @on_one_setting
-def test_a_view_made_by_hand_renders(device, rng):
+def test_hand_made_view_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
     view = clsplat.View.looking_at(middle - (0, 4, -1), middle, [0, 0, 1], CAMERA)
@@ -154,7 +154,7 @@ def hand_made_scene() -> Scene:
 
 
 @on_one_setting
-def test_a_scene_made_by_hand_is_for_rendering(device, rng):
+def test_hand_made_scene_is_for_rendering_only(device, rng):
     scene, model = hand_made_scene(), model_of(random_case(rng, 30))
     renderer = Renderer(model, device)
     assert [renderer.render(view).image.shape for view in scene.split("all")] == [(32, 48, 3)] * 3
@@ -163,13 +163,13 @@ def test_a_scene_made_by_hand_is_for_rendering(device, rng):
         clsplat.Trainer(scene, "smoke", device=device)
 
 
-def test_a_split_that_there_is_not_is_refused():
+def test_unknown_split_is_refused():
     with pytest.raises(ValueError, match="no split 'tset'; expected train, test, validation or all"):
         hand_made_scene().split("tset")
 
 
 @on_one_setting
-def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, tmp_path):
+def test_device_is_a_name_or_an_open_device(device, rng, tiny_scene, tmp_path):
     case = random_case(rng, 5)
     assert Renderer(model_of(case), device).device is device
     name, schedule = device.info.name, {"rasterizer.schedule": device.schedule}
@@ -193,7 +193,7 @@ def test_open_device_of_another_schedule_is_refused(function, device, tiny_scene
     ("metric", "kind"),
     [(clsplat.metrics.psnr, np.uint16), (clsplat.metrics.ssim, np.int64), (clsplat.metrics.psnr, np.bool_)],
 )
-def test_images_of_other_integers_are_refused_by_metrics(metric, kind):
+def test_metrics_refuse_images_of_unsupported_integers(metric, kind):
     image = np.full((12, 12, 3), 1, np.uint8)
     assert metric(image, image) == metric(np.float64(image), np.float64(image))
     with pytest.raises(ValueError, match=f"values of type {np.dtype(kind)}; expected uint8, or floats in"):
@@ -207,7 +207,7 @@ def test_devices_are_context_managers():
 
 
 @pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
-def test_images_that_cannot_be_compared_are_refused_by_metrics(metric):
+def test_metrics_refuse_incomparable_images(metric):
     black = np.zeros((5, 6, 3))
     for value in (np.nan, np.inf):
         broken = black.copy()
@@ -234,25 +234,25 @@ def test_images_that_cannot_be_compared_are_refused_by_metrics(metric):
         (np.diag([1, 1, -1]) @ np.eye(3, 4), "has no rotation .* without reflection"),
     ],
 )
-def test_a_pose_that_is_none_is_refused(pose, message):
+def test_invalid_pose_is_refused(pose, message):
     with pytest.raises(ValueError, match=f"^the pose of 'front' {message}"):
         clsplat.View("front", CAMERA, pose)
 
 
-def test_a_pose_with_few_digits_is_taken():
+def test_low_precision_pose_is_accepted():
     turned = clsplat.View.looking_at([1, 2, 3], [0, 0, 0], [0, 0, 1], CAMERA).world_to_camera
     clsplat.View("front", CAMERA, np.round(turned, 3))
 
 
 @pytest.mark.parametrize("downscale", [0, -1, np.nan, np.inf])
-def test_a_view_of_no_size_is_refused(downscale):
+def test_view_of_size_zero_is_refused(downscale):
     with pytest.raises(ValueError, match=r"^the downscale of 'front' is .*; expected a divisor above 0"):
         clsplat.View("front", CAMERA, np.eye(3, 4)).resized(downscale)
 
 
 @on_one_setting
 @pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
-def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
+def test_fractional_image_size_is_refused(changes, device, rng):
     view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
     with pytest.raises(ValueError, match=r"^the camera is .*; expected integers"):
         Renderer(model_of(random_case(rng, 5)), device).render(view)
@@ -260,7 +260,7 @@ def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
 
 @on_one_setting
 @pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
-def test_a_background_that_is_no_color_is_refused(background, device, rng):
+def test_background_that_is_not_a_color_is_refused(background, device, rng):
     view = clsplat.View("front", CAMERA, np.eye(3, 4))
     for paint in (Renderer(model_of(random_case(rng, 5)), device).render, lambda view, color: view.photograph(color)):
         with pytest.raises(ValueError, match=r"^the background is .*; expected one number or three in \[0, 1\]$"):

@@ -56,14 +56,14 @@ def test_a_run(runs):
         assert without_times(by_command[name]) == without_times(by_function[name])
 
 
-def test_the_log_of_a_function_is_that_of_the_command(runs):
+def test_function_logs_what_the_command_logs(runs):
     logs = [(folder / "log.txt").read_text() for folder in runs]
     lines = [re.findall(r"^\S+ \S+ \w+ (?!checking)(\w+)", log, re.MULTILINE) for log in logs]  # devices: once only
     assert lines[0] == lines[1]
     assert {"device", "scene", "step"} <= set(lines[1])
 
 
-def test_the_log_has_its_level_back_after_a_run(tmp_path):
+def test_run_restores_the_log_level(tmp_path):
     log = terminal.LOG
     before = log.level
     try:
@@ -76,7 +76,7 @@ def test_the_log_has_its_level_back_after_a_run(tmp_path):
     assert (tmp_path / "log.txt").read_text().endswith("DEBUG fine points\n")
 
 
-def test_a_run_that_is_resumed_and_one_that_is_only_described(runs, tiny_scene, tmp_path):
+def test_resume_and_dry_run(runs, tiny_scene, tmp_path):
     assert clsplat.resume(runs[1]) == runs[1]
     assert contents(runs[1])["point_cloud.ply"] == contents(runs[0])["point_cloud.ply"]
     text = clsplat.describe_run("smoke", tiny_scene, tmp_path / "new", set=SET)
@@ -95,7 +95,7 @@ def test_renders(runs, tmp_path, kind):
     assert contents(tmp_path / "command") == contents(tmp_path / "function")
 
 
-def test_rendered_files_are_pictures_of_the_renderer(runs, tiny_scene, tmp_path):
+def test_rendered_files_match_the_renderer(runs, tiny_scene, tmp_path):
     clsplat.render_views(runs[0], out=tmp_path, kind="npy")
     renderer = clsplat.Renderer(clsplat.load(runs[0]))
     for view in clsplat.read_scene(tiny_scene).split("test"):
@@ -143,7 +143,7 @@ def test_views_of_other_kinds_and_splits_are_refused(runs, tmp_path, arguments, 
     assert not (tmp_path / "out").exists()
 
 
-def test_a_comparison_of_no_runs_is_refused(tmp_path):
+def test_comparison_without_runs_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"^no runs to compare; give the folder of at least one run$"):
         clsplat.compare_runs([], tmp_path / "c.html")
     assert not (tmp_path / "c.html").exists()
@@ -175,13 +175,13 @@ def test_measurements(runs, tiny_scene, tmp_path):
         (lambda: clsplat.load_plugin("nowhere.py"), ConfigError, "no such file"),
     ],
 )
-def test_errors_are_those_of_the_commands(call, error, message):
+def test_functions_raise_the_errors_of_the_commands(call, error, message):
     with pytest.raises(error) as raised:
         call()
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-def test_a_picture_of_no_size_is_refused(few_steps, tmp_path):
+def test_render_of_size_zero_is_refused(few_steps, tmp_path):
     with pytest.raises(DataError, match="raise the downscale to 1"):
         clsplat.render_views(few_steps, out=tmp_path / "out", downscale=0)

@@ -24,7 +24,7 @@ def model_of(case) -> Model:
     return Model(**case.parameters, rendering=Rendering(screen_variance=case.variance, compensate=case.compensate))
 
 
-def test_alpha_is_what_the_background_does_not_show_through(device, rng):
+def test_alpha_is_one_minus_background_weight(device, rng):
     case = random_case(rng, 40, *SIZE)
     renderer = Renderer(model_of(case), device)
     black, white = (renderer.render(case.view, background) for background in (0.0, 1.0))
@@ -33,7 +33,7 @@ def test_alpha_is_what_the_background_does_not_show_through(device, rng):
     np.testing.assert_allclose(white.image - black.image, 1 - black.alpha[..., None].repeat(3, 2), atol=2e-6)
 
 
-def test_depth_is_that_of_a_single_gaussian(device, rng):
+def test_depth_of_a_single_gaussian_is_its_own(device, rng):
     case = random_case(rng, 1, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view, depth=True)
     pose = case.view.world_to_camera
@@ -54,7 +54,7 @@ def test_depth_changes_neither_image_nor_alpha(device, rng):
 
 @on_one_setting
 @pytest.mark.parametrize(("array", "values"), [("image", np.nan), ("image", -np.inf), ("transmittance", np.nan)])
-def test_a_picture_with_values_that_are_not_finite_is_an_error(device, rng, monkeypatch, array, values):
+def test_nonfinite_render_is_an_error(device, rng, monkeypatch, array, values):
     """Of a device, or a model, that gives them, as `clsplat render` says; one pixel is enough."""
     case = random_case(rng, 20, *SIZE)
     renderer = Renderer(model_of(case), device)
@@ -116,7 +116,7 @@ def test_gradients_by_image_and_by_alpha_add_up(device, rng):
 
 
 @on_one_setting
-def test_no_gaussian_gives_the_background(device, rng):
+def test_empty_model_renders_the_background(device, rng):
     case = random_case(rng, 3, *SIZE)
     picture = Renderer(model_of(case)[:0], device).render(case.view, 0.25, depth=True)
     assert (picture.image == np.float32(0.25)).all()
@@ -133,13 +133,13 @@ def test_derivatives_of_another_shape_are_refused(device, rng):
 
 
 @on_one_setting
-def test_pictures_show_themselves(device, rng):
+def test_render_has_a_rich_display(device, rng):
     case = random_case(rng, 3, *SIZE)
     assert Renderer(model_of(case), device).render(case.view)._repr_png_().startswith(b"\x89PNG")
 
 
 @on_one_setting
-def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
+def test_renderers_on_one_device_are_independent(device, rng):
     cases = [random_case(rng, count, *size) for count, size in ((40, SIZE), (90, (64, 48)))]
     renderers = [Renderer(model_of(case), device) for case in cases]
     grad_image = [np.ones((case.size[1], case.size[0], 3)) for case in cases]
@@ -220,7 +220,7 @@ def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
 
 
 @on_one_setting
-def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
+def test_gradients_belong_to_the_rendered_model(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, plain = model_of(case), model_of(case)
     plain = Model(**{**plain.tables(), "sh_rest": plain.sh_rest[:, :9]}, rendering=plain.rendering)
@@ -236,7 +236,7 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
 
 
 @on_one_setting
-def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
+def test_in_place_changes_do_not_affect_gradients(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, grad_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
     renderer = Renderer(model, device)
@@ -251,7 +251,7 @@ def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
 
 
 @on_one_setting
-def test_arrays_of_a_picture_are_the_callers_own(device, rng):
+def test_render_arrays_are_independent_copies(device, rng):
     case = random_case(rng, 20, *SIZE)
     renderer = Renderer(model_of(case), device)
     picture = renderer.render(case.view, depth=True)
@@ -273,7 +273,7 @@ def test_impossible_backgrounds_and_cameras_are_refused(device, rng):
 
 
 @on_one_setting
-def test_the_background_is_that_of_the_model(device, rng):
+def test_background_defaults_to_the_models(device, rng):
     case = random_case(rng, 3, *SIZE)
     model = model_of(case)
     white = replace(model, rendering=replace(model.rendering, background="white"))

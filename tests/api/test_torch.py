@@ -21,7 +21,7 @@ def parameters_of(model) -> dict:
     return {name: torch.tensor(getattr(model, name), requires_grad=True) for name in PARAMETERS}
 
 
-def test_image_and_alpha_are_those_of_the_renderer(device, rng):
+def test_image_and_alpha_match_the_renderer(device, rng):
     case = random_case(rng, 30, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view, 0.25)
     image, alpha = clsplat.torch.render(
@@ -66,7 +66,7 @@ def test_backward_may_be_called_twice_and_adds_up(device, rng):
         np.testing.assert_array_equal(table.grad.numpy(), 2 * once[name].numpy())
 
 
-def test_an_optimiser_lowers_a_loss(device, rng):
+def test_optimizer_lowers_the_loss(device, rng):
     case = random_case(rng, 30, *SIZE)
     wanted = torch.tensor(Renderer(model_of(random_case(rng, 30, *SIZE)), device).render(case.view).image)
     renderer, parameters = Renderer(model_of(case), device), parameters_of(model_of(case))
@@ -109,7 +109,7 @@ def test_count_that_differs_from_the_world_filter_is_refused(device, rng):
         clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)[:3]))
 
 
-def test_a_model_that_moves_is_refused_and_its_moment_is_not(device, rng):
+def test_moving_model_is_refused_but_not_its_snapshot(device, rng):
     case = random_case(rng, 5, *SIZE)
     model = replace(model_of(case), motion=static_motion(5, 5))
     with pytest.raises(

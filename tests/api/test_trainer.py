@@ -36,7 +36,7 @@ MIP = {
 
 
 @pytest.mark.parametrize("name", ["smoke", "splat_7k"])
-def test_a_trainer_gives_the_bits_of_the_command(name, tiny_scene, tmp_path):
+def test_trainer_gives_the_bits_of_the_command(name, tiny_scene, tmp_path):
     settings = {"optimize.steps": 40, "densify.start": 10} if name != "smoke" else {}
     out = clsplat.run(name, tiny_scene, tmp_path / "run", set=settings)
     trainer = clsplat.Trainer(clsplat.read_scene(tiny_scene), name, set=settings)
@@ -59,7 +59,7 @@ def test_threads_may_share_a_trainer(tiny_scene, tmp_path):
     assert equal(trainer.model, expected.model)
 
 
-def test_the_bits_with_a_world_filter_are_those_of_the_raw_file(tiny_scene, tmp_path):
+def test_world_filtered_model_matches_the_raw_file(tiny_scene, tmp_path):
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=MIP)
     trainer = clsplat.Trainer(tiny_scene, "smoke", set=MIP)
     trainer.run()
@@ -120,7 +120,7 @@ def test_a_temporary_folder_goes_away_with_its_trainer(tiny_scene):
     assert not folder.exists()
 
 
-def test_a_loss_of_ones_own_has_the_gradient_of_the_built_in_one(device, rng):
+def test_custom_loss_matches_the_built_in_gradient(device, rng):
     workspace, camera = Workspace(device), upload_camera(device, random_case(rng, 1, 37, 21).view)
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     inside = np.s_[:, : camera.height, : camera.width]
@@ -143,7 +143,7 @@ def test_a_loss_of_ones_own_has_the_gradient_of_the_built_in_one(device, rng):
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-6 * np.abs(found[0][1]).max())
 
 
-def test_a_loss_that_is_added_acts_from_the_next_step_on(tiny_scene):
+def test_added_loss_acts_from_the_next_step(tiny_scene):
     seen = []
 
     def darkness(image, photograph):
@@ -172,7 +172,7 @@ def test_a_loss_that_is_added_acts_from_the_next_step_on(tiny_scene):
         (("smoke", {}, None, "resume"), ConfigError, "start='resume': expected a run folder as `out`"),
     ],
 )
-def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, message):
+def test_untrainable_input_is_one_sentence(tiny_scene, arguments, error, message):
     pipeline, settings, out, start = (*arguments, *({}, None, "new")[len(arguments) - 1 :])
     with pytest.raises(error) as raised:
         clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, start=start)
@@ -180,12 +180,12 @@ def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, mess
     assert "\n" not in str(raised.value)
 
 
-def test_photographs_are_left_to_a_run(tiny_scene):
+def test_recipes_that_prepare_scenes_are_refused(tiny_scene):
     with pytest.raises(ConfigError, match="prepares its scene; use clsplat"):
         clsplat.Trainer(tiny_scene / "train", "photos")
 
 
-def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
+def test_missing_or_occupied_folders_are_refused(tiny_scene, tmp_path):
     with pytest.raises(DataError, match="nowhere"):
         clsplat.Trainer(tmp_path / "nowhere", "smoke")
     clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
@@ -197,7 +197,7 @@ def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
         clsplat.Trainer(tiny_scene, no_training)
 
 
-def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
+def test_documented_training_loop_runs(tiny_scene, device, capsys):
     lines = inspect.getdoc(steps.StepTrainer).split("clsplat.load`:\n\n")[1].split("\n\nBetween")[0]
     from clsplat.render.rasterizer import Rasterizer
     from clsplat.training.adam import Adam, Rates
@@ -214,7 +214,7 @@ def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
     assert losses[-1] < losses[0]
 
 
-def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):
+def test_output_folder_is_a_run(tiny_scene, tmp_path):
     settings = {"optimize.steps": 10}
     trainer = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run")
     trainer.run(9)

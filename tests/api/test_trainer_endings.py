@@ -50,7 +50,7 @@ def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
     assert not (tmp_path / "run").exists(), "a folder that was removed stays so"
 
 
-def test_a_trainer_writes_over_no_file_of_others(tiny_scene, tmp_path):
+def test_trainer_overwrites_no_foreign_file(tiny_scene, tmp_path):
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(ConfigError, match=r"report.html: exists, and is not from a run"):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path)
@@ -82,7 +82,7 @@ def test_nonfinite_loss_stops_before_the_model_changes(tiny_scene, broken):
     assert equal(trainer.model, before)
 
 
-def test_error_of_a_step_is_in_the_status_and_raised(tiny_scene, tmp_path):
+def test_step_error_is_raised_and_in_the_status(tiny_scene, tmp_path):
     def broken(image, photograph):
         raise RuntimeError("no such teapot")
 
@@ -96,7 +96,7 @@ def test_error_of_a_step_is_in_the_status_and_raised(tiny_scene, tmp_path):
     assert "no such teapot" in status["message"]
 
 
-def test_edit_failing_between_trainings_leaves_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
+def test_failed_edit_between_steps_prevents_saving(tiny_scene, tmp_path, monkeypatch):
     two = tmp_path / "two.yaml"
     part = "  - optimize: {steps: 2, losses: [l1]}\n"
     two.write_text(f"name: two\nstages:\n  - init\n{part}  - raise_sh\n{part}")
@@ -113,7 +113,7 @@ def test_edit_failing_between_trainings_leaves_nothing_to_save(tiny_scene, tmp_p
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, monkeypatch):
+def test_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("no such teapot")
 
@@ -123,7 +123,7 @@ def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, m
     assert clsplat.status(tmp_path / "run")["state"] == "failed"
 
 
-def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
+def test_training_can_continue_after_an_interrupt(tiny_scene):
     trainer, whole = (clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 20}) for _ in range(2))
     pressed = []
 
@@ -141,7 +141,7 @@ def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
     assert equal(trainer.model, whole.model)
 
 
-def test_second_interrupt_keeps_the_step_before_or_nothing(tiny_scene, tmp_path, monkeypatch):
+def test_second_interrupt_saves_the_last_whole_step_or_none(tiny_scene, tmp_path, monkeypatch):
     few = {"optimize.steps": 4}
     for place, step in ((Photographs, 2), (SplatStats, 3)):
         out = tmp_path / place.__name__

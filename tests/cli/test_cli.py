@@ -23,7 +23,7 @@ def model(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "point_cloud.ply"
 
 
-def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_path):
+def test_run_prints_the_device_and_the_output_paths(tiny_scene, tmp_path):
     done = process("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
     lines = done.stdout.splitlines()
     assert lines[0].startswith("device: ")
@@ -44,7 +44,7 @@ def test_dry_run_touches_nothing(tiny_scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_dry_run_says_when_a_stage_acts(tiny_scene, tmp_path):
+def test_dry_run_prints_when_each_stage_acts(tiny_scene, tmp_path):
     done = clsplat("run", "splat_7k", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
     assert "reset_opacity every 500 (stop 501, when_background white)" in done.stdout
 
@@ -56,7 +56,7 @@ def test_set_takes_several_values(tiny_scene, tmp_path):
     assert (metrics["steps"], metrics["seed"]) == (3, 4)
 
 
-def test_a_run_that_cannot_start_says_so_in_its_status(tmp_path):
+def test_failed_start_is_in_the_status(tmp_path):
     (tmp_path / "scene").mkdir()
     (tmp_path / "run").mkdir()
     clsplat("run", "smoke", "--scene", tmp_path / "scene", "--out", tmp_path / "run", expect=3)
@@ -154,7 +154,7 @@ def test_bad_settings(tiny_scene, tmp_path):
     clsplat("evaluate", tiny_scene / "points3d.ply", "--scene", tiny_scene, "--downscales", "a", expect=2)
 
 
-def test_unknown_device_names_what_exists(tiny_scene, tmp_path):
+def test_unknown_device_error_lists_devices(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "x", "--device", "no such chip", expect=4)
     assert "no device matches 'no such chip'; there are: " in done.stderr
 

@@ -65,7 +65,7 @@ CAUSES: dict[str, tuple[int, str | Callable[[Path, Path], list[str]], str, str |
 
 
 @pytest.mark.parametrize("name", CAUSES)
-def test_every_exit_code_comes_with_a_sentence_and_a_status(name, tiny_copy, tmp_path):
+def test_every_exit_code_has_a_message_and_a_status(name, tiny_copy, tmp_path):
     code, cause, words, state = CAUSES[name]
     if state:
         (tmp_path / "run").mkdir()  # a folder that was there keeps the status, whenever the run ends
@@ -98,7 +98,7 @@ def in_this_process(monkeypatch, capsys, *arguments: str) -> tuple[int, str]:
     return end.value.code, capsys.readouterr().err
 
 
-def test_a_defect_is_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
+def test_internal_error_exits_with_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
     def defect(*arguments, **values):
         raise IndexError("list index out of range")
 
@@ -110,7 +110,7 @@ def test_a_defect_is_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
     check_status(out, 1, "failed", errors)
 
 
-def test_a_plugin_that_fails_is_code_2(tiny_scene, tmp_path, without_plugins):
+def test_failing_plugin_exits_with_code_2(tiny_scene, tmp_path, without_plugins):
     plugin, out = tmp_path / "faulty.py", tmp_path / "run"
     out.mkdir()  # one that a run makes does not outlive its refusal
     plugin.write_text(BROKEN_PLUGIN)
@@ -134,7 +134,7 @@ class Stopping(Scheduled):
 
 
 @pytest.mark.parametrize("error", ["StopIteration", "SystemExit(0)", "GeneratorExit"])
-def test_plugin_stage_that_stops_is_code_2_and_loses_no_step(error, tiny_scene, tmp_path, without_plugins):
+def test_failing_plugin_stage_exits_with_2_and_keeps_steps(error, tiny_scene, tmp_path, without_plugins):
     plugin, out = tmp_path / "stopping.py", tmp_path / "run"
     plugin.write_text(STOPPING_PLUGIN.replace("ERROR", error))
     sets = ["--set", "optimize.during=[{stage: stopping, every: 3}]", "optimize.steps=5"]
@@ -144,7 +144,7 @@ def test_plugin_stage_that_stops_is_code_2_and_loses_no_step(error, tiny_scene, 
     assert (out / "checkpoints" / "step_000003.npz").exists()
 
 
-def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
+def test_out_of_memory_exits_with_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
     """A device with 2 MiB, for a scene that needs 10."""
     small = Device.__init__
 
@@ -160,7 +160,7 @@ def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
     check_status(out, 5, "failed", errors)
 
 
-def test_a_signal_is_code_130(tiny_scene, tmp_path):
+def test_signal_exits_with_code_130(tiny_scene, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
     command += ["--set", "optimize.steps=1000000"]
@@ -173,7 +173,7 @@ def test_a_signal_is_code_130(tiny_scene, tmp_path):
     check_interrupted(out, process.returncode, errors)
 
 
-def test_sigterm_within_a_step_is_code_130(tiny_scene, tmp_path, monkeypatch, capsys):
+def test_sigterm_within_a_step_exits_with_code_130(tiny_scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
 
     def stop(*arguments):
@@ -193,13 +193,17 @@ def check_interrupted(out: Path, code: int, errors: str) -> None:
     check_status(out, 130, "interrupted", errors)
 
 
-def test_all_codes_of_the_errors_are_tested_here():
+def test_every_error_code_is_tested_here():
     codes, kinds = {0}, [ClsplatError]
     while kinds:
         kind = kinds.pop()
         codes.add(kind.exit_code)
         kinds += kind.__subclasses__()
-    others = {1: test_a_defect_is_code_1, 5: test_too_little_memory_is_code_5, 130: test_a_signal_is_code_130}
+    others = {
+        1: test_internal_error_exits_with_code_1,
+        5: test_out_of_memory_exits_with_code_5,
+        130: test_signal_exits_with_code_130,
+    }
     assert all(test.__name__.endswith(f"_{code}") for code, test in others.items())
     assert codes == {code for code, *_ in CAUSES.values()} | others.keys()
 
@@ -225,7 +229,7 @@ LONG = "x" * 300  # longer than a name of any file system
     ids=lambda value: " ".join(value).replace(LONG, "LONG") if isinstance(value, list) else value,
 )
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows says that there is no such file")
-def test_a_name_that_is_too_long_is_that_of_a_missing_file(arguments, code, monkeypatch, capsys, tmp_path):
+def test_too_long_input_name_is_reported_like_a_missing_file(arguments, code, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     found, errors = in_this_process(monkeypatch, capsys, *arguments)
     assert found == code, errors
@@ -235,6 +239,6 @@ def test_a_name_that_is_too_long_is_that_of_a_missing_file(arguments, code, monk
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows says that there is no such file")
-def test_an_output_whose_name_is_too_long_cannot_be_written(tmp_path):
+def test_too_long_output_name_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match=r"xxx\.ply: cannot be written \(File name too long\)"):
         write_text(tmp_path / f"{LONG}.ply", "")

@@ -38,7 +38,7 @@ def test_version():
     assert clsplat("--version").stdout == f"clsplat {full_version()}\n"
 
 
-def test_no_command_shows_the_help_and_says_what_is_missing():
+def test_missing_command_prints_help_and_an_error():
     done = clsplat(expect=2)
     assert "Usage: clsplat" in done.stdout
     assert "error: expected a command" in done.stderr
@@ -59,7 +59,7 @@ def test_help_fits_a_terminal_of_80_columns_and_shows_examples(monkeypatch):
     assert not faults, "\n".join(faults)
 
 
-def test_help_names_all_that_a_scene_may_be():
+def test_help_lists_every_kind_of_scene():
     texts = {name: " ".join(clsplat(name, "--help").stdout.replace("│", " ").split()) for name in ("run", "inspect")}
     assert all("COLMAP, Blender, nerfstudio" in text for text in texts.values())
     assert "for `photos`, a folder of photos" in texts["run"]
@@ -109,17 +109,17 @@ NEAR = {
 
 
 @pytest.mark.parametrize("arguments", NEAR)
-def test_near_misses_say_what_is_near(arguments):
+def test_misspelled_names_get_suggestions(arguments):
     code = 3 if arguments.startswith(("resume", "status")) or arguments == "evaluate x.ply" else 2
     assert NEAR[arguments] in clsplat(*arguments.split(), expect=code).stderr
 
 
-def test_synonyms_are_no_commands_and_lead_to_some():
+def test_synonyms_map_to_existing_commands():
     assert not SYNONYMS.keys() & set(ORDER)
     assert {name for name in SYNONYMS.values() if name[0] != "-"} <= set(ORDER)
 
 
-def test_the_device_stands_before_the_command_or_after_it(finished):
+def test_device_option_works_before_and_after_the_command(finished):
     wrong = "no device matches 'no such chip'"
     assert wrong in clsplat("--device", "no such chip", "evaluate", finished, expect=4).stderr
     assert wrong in clsplat("evaluate", finished, "--device", "no such chip", expect=4).stderr
@@ -141,7 +141,7 @@ JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines s
         (process, "evaluate RUN/point_cloud.ply --scene SCENE --json"),
     ],  # runtimes print too
 )
-def test_json_is_all_that_stdout_holds(run, arguments, finished, tiny_scene, tmp_path):
+def test_stdout_holds_only_json(run, arguments, finished, tiny_scene, tmp_path):
     places = {"RUN": str(finished), "SCENE": str(tiny_scene), "FILE": str(tmp_path / "x.yaml")}
     for name, place in places.items():
         arguments = arguments.replace(name, place)
@@ -156,7 +156,7 @@ def test_pipelines_lists_every_recipe_on_a_line():
     assert summary(shipped()["splat_7k"]).endswith("in 7,000 steps: a good scene in minutes.")
 
 
-def test_pipelines_shows_the_keys_of_one_as_set_takes_them():
+def test_pipelines_prints_keys_in_set_notation():
     lines = clsplat("pipelines", "splat_7k").stdout.splitlines()
     keys = [line.split("  ")[0] for line in lines[lines.index("Keys, as for --set:") + 1 :]]
     assert keys == [key.text for key in settable(load("splat_7k").settings)]
@@ -194,7 +194,7 @@ def test_a_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
     assert table[1].split()[:2] == ["test", "1/2"]
 
 
-def test_a_run_folder_that_is_no_model_says_why(finished, tmp_path):
+def test_run_folder_without_model_is_explained(finished, tmp_path):
     assert "expected a model file or a run folder" in clsplat("evaluate", tmp_path, expect=3).stderr
     (tmp_path / "a.JPG").touch()
     for command in ("evaluate", "view"):
@@ -212,7 +212,7 @@ def test_a_run_folder_that_is_no_model_says_why(finished, tmp_path):
     )
 
 
-def test_resume_goes_on_to_the_same_bits(finished, tmp_path):
+def test_resume_gives_the_same_bits(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     newest = max((run / "checkpoints").iterdir())
@@ -224,7 +224,7 @@ def test_resume_goes_on_to_the_same_bits(finished, tmp_path):
     assert "made with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
 
 
-def test_a_plugin_may_stand_after_the_command(tmp_path, without_plugins):
+def test_plugin_option_works_after_the_command(tmp_path, without_plugins):
     plugin = Path(__file__).parents[2] / "examples" / "opacity_entropy.py"
     assert plugin.is_file()
     for option in (["--plugin", str(tmp_path / "x.py")], [f"--plugin={tmp_path / 'x.py'}"]):
@@ -245,7 +245,7 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
 
 
 @pytest.mark.parametrize("line", ["null", '{"step": null}', '{"step": 3}', '{"step": "3", "kind": "train"}'])
-def test_damaged_records_are_told_with_their_line(line, tmp_path, caplog):
+def test_damaged_records_are_reported_with_their_line(line, tmp_path, caplog):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
     write_status(tmp_path, state="done", step=7)
     fault = r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"
@@ -256,7 +256,7 @@ def test_damaged_records_are_told_with_their_line(line, tmp_path, caplog):
     assert re.search(fault, caplog.text)
 
 
-def test_status_tells_from_files(finished, tmp_path):
+def test_status_reads_only_files(finished, tmp_path):
     text = clsplat("status", finished).stdout
     assert f"{finished}: done at step 50\n" in text
     assert "test 1/2: psnr " in text
@@ -281,7 +281,7 @@ def test_status_tells_from_files(finished, tmp_path):
     )
 
 
-def test_no_two_recipes_have_one_description():
+def test_recipe_descriptions_are_unique():
     described = [one["summary"] for one in summaries()]
     assert len(set(described)) == len(described)
     assert all("7,000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))

@@ -21,7 +21,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.mark.parametrize("place", [".", "test", "test/new", ".."])
-def test_renders_do_not_mix_with_photographs(place, finished, tiny_scene, tmp_path):
+def test_renders_are_not_written_among_photographs(place, finished, tiny_scene, tmp_path):
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     before = contents(tmp_path)
@@ -30,7 +30,7 @@ def test_renders_do_not_mix_with_photographs(place, finished, tiny_scene, tmp_pa
     assert contents(tmp_path) == before
 
 
-def test_renders_replace_renders_alone(finished, tmp_path):
+def test_renders_replace_only_renders(finished, tmp_path):
     out = tmp_path / "images"
     command("render", finished, "--out", out)
     image = next(out.rglob("*.png"))
@@ -57,7 +57,7 @@ def test_renders_replace_renders_alone(finished, tmp_path):
         (["evaluate", "RUN", "--out"], "metrics.json", "is a file of a run"),
     ],
 )
-def test_no_file_of_a_run_is_replaced(before, name, expected, finished, tiny_scene):
+def test_files_of_a_run_are_not_replaced(before, name, expected, finished, tiny_scene):
     kept = (finished / name).read_bytes()
     words = [{"RUN": finished, "SCENE": tiny_scene}.get(word, word) for word in before]
     assert expected in command(*words, finished / name, expect=2).stderr

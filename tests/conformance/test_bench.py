@@ -31,7 +31,7 @@ SIZE = (64, 48, 300)  # width, height, Gaussians
         ),
     ],
 )
-def test_a_case_does_what_its_pipeline_names_and_changes_nothing(device, pipeline, losses, columns):
+def test_case_runs_its_pipeline_and_changes_nothing(device, pipeline, losses, columns):
     timed = case(device, *SIZE, load(pipeline).settings)
     trainer = timed.trainer
     assert (INTERVAL2 in trainer.model.gaussians.tables) == (pipeline == "micro_splatting_v2")
@@ -52,7 +52,7 @@ def test_a_case_does_what_its_pipeline_names_and_changes_nothing(device, pipelin
     assert 0 < result.memory < 2 * result.planned
 
 
-def test_a_case_that_moves_changes_nothing(device, rng):
+def test_moving_case_changes_nothing(device, rng):
     parameters, view = synthetic(*SIZE)
     parameters[MOTION] = rng.normal(0, 0.3, (SIZE[2], 5)).astype(np.float32)
     pixels = rng.integers(0, 256, (3, SIZE[1], SIZE[0]), dtype=np.uint8)
@@ -78,7 +78,7 @@ def measurement(**changes):
     return {"device": "a chip", "pipeline": "splat", "peaks": PEAKS, "scenes": {"A": TIMES}, **changes}
 
 
-def test_measurement_is_read_without_its_own_baseline(tmp_path):
+def test_measurement_is_read_without_its_baseline(tmp_path):
     (tmp_path / "x.json").write_text(json.dumps(measurement(against=measurement())))
     assert read_measurement(tmp_path / "x.json", "splat") == measurement()
 
@@ -99,7 +99,7 @@ def test_an_invalid_measurement_is_refused_with_its_key(data, place, tmp_path):
         read_measurement(tmp_path / "x.json", "splat")
 
 
-def test_the_same_device_as_fast_as_before_needs_no_remark():
+def test_unchanged_speed_gets_no_remark():
     assert compare_conditions(measurement(), measurement()) == ["earlier: 60 GFLOP/s, 3.0 Gexp/s, copy 10.0 GB/s"]
 
 
@@ -113,7 +113,7 @@ def test_a_slower_machine_is_reported():
     assert changes in "".join(compare_conditions(slower, measurement()))
 
 
-def test_a_scene_that_was_not_measured_is_reported():
+def test_unmeasured_scene_is_reported():
     assert "  without scenes: B; it has A" in compare_conditions(
         measurement(scenes={"A": TIMES, "B": TIMES}), measurement()
     )

@@ -70,7 +70,7 @@ VERDICTS = {
 
 
 @pytest.mark.parametrize("case", VERDICTS)
-def test_the_verdict_says_what_to_do(case):
+def test_verdict_has_a_remedy(case):
     schedules, usable, text = VERDICTS[case]
     verdict = judge("wide", schedules, [])
     assert verdict.usable == usable
@@ -78,7 +78,7 @@ def test_the_verdict_says_what_to_do(case):
     assert bool(verdict.advice) == (case != "all is right")
 
 
-def test_wrong_memory_does_not_hide_behind_right_kernels():
+def test_memory_faults_are_reported_although_kernels_pass():
     verdict = judge("wide", {"wide": result(RIGHT)}, result(Deviation("fill_words", "samples", 3, 0, counts=True)))
     assert verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
 
@@ -92,7 +92,7 @@ def test_checks_continue_after_a_runtime_crashes(monkeypatch, info):
     assert results[3].fault == "the process exits with code 3 (noise of a runtime)"
 
 
-def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
+def test_hanging_runtime_is_stopped(monkeypatch, info):
     monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
     (one,) = run_checks(info, "simt", checks("hangs"), 1)
     assert one.fault == "gives no answer within 1 s"
@@ -105,7 +105,7 @@ def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
         ("time.sleep(600)", "closes its output but does not exit"),
     ],
 )
-def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
+def test_worker_gets_time_to_exit(monkeypatch, info, end, fault):
     """Its output closes before it has one."""
     monkeypatch.setattr(supervision, "EXIT_TIMEOUT_S", 5, raising=False)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
@@ -188,7 +188,7 @@ def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_pat
         ("GPU", 1, "0.3", ["simt"]),
     ],
 )
-def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cache, kind, width, value, schedules):
+def test_wide_schedule_is_tried_where_it_could_run(monkeypatch, info, empty_cache, kind, width, value, schedules):
     worker(monkeypatch, value)
     device = Device(info)
     device.info = replace(info, kind=kind, float_width=width)
@@ -199,7 +199,7 @@ def report_of(info, **schedules: list[CheckResult]) -> DeviceReport:
     return DeviceReport(info, "wide", schedules, seconds=2.0)
 
 
-def test_a_report_is_json_whatever_the_values_are(info):
+def test_report_is_valid_json_for_any_value(info):
     report = report_of(info, wide=result(WRONG, Deviation("exp", "x", float("nan"), 1.0)))
     data = json.loads(json.dumps(report.data(), allow_nan=False))
     assert data["schema"] == 2
@@ -259,14 +259,14 @@ def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, 
 
 
 @pytest.mark.parametrize("largest", [2**30 + 4, 2**28])
-def test_a_buffer_that_was_given_and_holds_other_values_is_wrong(monkeypatch, largest):
+def test_wrong_values_in_a_large_buffer_are_a_fault(monkeypatch, largest):
     failures, report = memory_of(monkeypatch, largest, Deviation("fill_words", "samples", 3, 0, counts=True))
     assert failures
     assert report.verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
 
 
 @pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])
-def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, capsys, info, empty_cache, value, code):
+def test_faulty_device_exits_with_code_4(monkeypatch, capsys, info, empty_cache, value, code):
     worker(monkeypatch, value)
     monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--json", "--device", f"{info.platform} {info.name}"])
     with pytest.raises(SystemExit) as ended:
@@ -298,7 +298,7 @@ def test_page_that_cannot_be_written_is_refused_first(monkeypatch, info, tmp_pat
         clsplat.doctor(Device(info), tmp_path / name)
 
 
-def test_the_verdict_is_printed_where_the_page_fails_at_the_end(monkeypatch, capsys, info, empty_cache, tmp_path):
+def test_verdict_is_printed_although_the_page_fails(monkeypatch, capsys, info, empty_cache, tmp_path):
     def full(*_):
         raise OutputError("page.html: cannot be written (No space left on device)")
 
@@ -312,7 +312,7 @@ def test_the_verdict_is_printed_where_the_page_fails_at_the_end(monkeypatch, cap
 
 
 @pytest.mark.slow
-def test_a_device_that_is_right_is_not_refused(info, empty_cache, monkeypatch):
+def test_correct_device_is_not_refused(info, empty_cache, monkeypatch):
     """By some checks in processes of their own; each of them is run in tests/conformance/test_checks_kernels.py."""
     monkeypatch.setattr(doctor, "KERNELS", [BY_NAME["blur"], KERNELS[-1]])
     monkeypatch.setattr(doctor, "SPEED", SPEED[:1])

@@ -29,7 +29,7 @@ def test_ray_meets_pixel_center_and_cone_has_its_width(rng):
     assert ray[7] == pytest.approx(np.linalg.norm(ray[3:6]))
 
 
-def test_the_moments_of_a_frustum_are_those_of_points_in_it(rng):
+def test_frustum_moments_match_those_of_its_points(rng):
     (ray,) = some_cones(rng, 1)
     ray[6] = 0.2  # a wide cone
     t0, t1 = 1.0, 2.5
@@ -58,7 +58,7 @@ def test_features_are_mean_sines_of_a_normal_distribution(rng):
     np.testing.assert_allclose(nerf.encoded_frustums(mean, variance, 3)[0, 0], np.concatenate(expected), atol=1e-9)
 
 
-def test_fine_edges_are_where_the_weights_are():
+def test_fine_edges_follow_the_weights():
     edges = np.linspace(2, 6, 9)
     weights = np.zeros(8)
     weights[5] = 1.0
@@ -73,7 +73,7 @@ def test_even_weights_leave_edges_even():
     np.testing.assert_allclose(nerf.fine_edges(edges, np.full(8, 0.1), 16), np.linspace(2, 6, 17), atol=1e-6)
 
 
-def test_drawn_coarse_edges_keep_their_order(rng):
+def test_sampled_coarse_edges_stay_sorted(rng):
     edges = nerf.coarse_edges(2, 6, 8, rng.random(9))
     assert (np.diff(edges) > 0).all()
     assert edges[0] >= 2
@@ -81,7 +81,7 @@ def test_drawn_coarse_edges_keep_their_order(rng):
 
 
 @pytest.mark.parametrize("skip", [None, 0, 1])
-def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
+def test_field_gradient_matches_finite_differences(rng, skip):
     network, rays, width, position, direction = nerf.DenseNetwork(3, skip), 2, 4, 6, 5
     joined = [position if i - 1 == skip and skip is not None else 0 for i in range(3)]
     shapes = [(position, width), (width + joined[1], width), (width + joined[2], width)]
@@ -116,7 +116,7 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
             np.testing.assert_allclose(derivative, numeric, atol=1e-7)
 
 
-def test_weights_of_a_ray_and_what_is_left_sum_to_one(rng):
+def test_ray_weights_and_transmittance_sum_to_one(rng):
     found = nerf.Composite(rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5)), np.full((2, 5), 0.3), np.ones(3))
     weights, left = found.weights()
     np.testing.assert_allclose(weights.sum(axis=1) + left[:, -1], 1)

@@ -19,7 +19,7 @@ def rng() -> np.random.Generator:
 
 
 @pytest.mark.parametrize("level", [HashLevel(3, 64), HashLevel(7, 16)], ids=["dense", "shared"])
-def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
+def test_grid_and_network_gradient_matches_differences(rng, level):
     """Through a network that reads the position twice, for samples inside and outside of the cube."""
     samples, network = 12, nerf.DenseNetwork(2, 0)
     at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
@@ -54,7 +54,7 @@ def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     np.testing.assert_allclose(found, numeric, atol=1e-7)
 
 
-def test_a_linear_function_is_kept_by_the_mean_of_the_corners(rng):
+def test_interpolation_reproduces_a_linear_function(rng):
     """Where a level tells all: entries that are the coordinates give the place, also at the faces of the cube."""
     level = HashLevel(5, 6**3)
     corners = np.stack(np.meshgrid(*3 * [np.arange(6)], indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
@@ -62,12 +62,12 @@ def test_a_linear_function_is_kept_by_the_mean_of_the_corners(rng):
     np.testing.assert_allclose(level.forward(corners / 5, at, np.full(23, 1e-9)), at, atol=1e-12)
 
 
-def test_places_outside_of_the_cube_have_no_features(rng):
+def test_points_outside_the_cube_have_no_features(rng):
     outside = np.array([[-1e-9, 0.5, 0.5], [0.5, 1 + 1e-9, 0.5], [0.5, 0.5, 7.0]])
     np.testing.assert_array_equal(HashLevel(4, 16).forward(rng.normal(size=(16, 4)), outside, np.ones(3)), 0.0)
 
 
-def test_the_weight_of_a_level_is_nearly_that_of_the_paper():
+def test_level_weight_is_close_to_the_papers():
     """erf(1 / sqrt(8 v n^2)), and so half of a cell's width under a normal distribution of the sample's size."""
     variances = 10.0 ** np.linspace(-8, 2, 60)
     expected = [math.erf(1 / math.sqrt(8 * v * 16**2)) for v in variances]
@@ -98,7 +98,7 @@ def test_grid_parameters_follow_the_networks_and_start_near_zero():
         ({"corner": [0.0, 1.0]}, "at least 3 items"),
     ],
 )
-def test_a_grid_that_cannot_be_is_refused(keys, complaint):
+def test_invalid_grid_is_refused(keys, complaint):
     with pytest.raises(ValidationError, match=complaint):
         GridShape(**keys)
 

@@ -42,7 +42,7 @@ def like(device, **changes):
     ("team", "sort", "bitonic"),
     [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
 )
-def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
+def test_bitonic_is_checked_if_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
     found = []
     monkeypatch.setattr(quick, "run_checks", lambda info, schedule, checks, seconds: found.extend(checks) or [])
     device = like(Device(info), tuning={"TEAM": team})
@@ -55,11 +55,11 @@ def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty
     assert bool(found) != bitonic
 
 
-def test_no_check_of_every_run_needs_bitonic():
+def test_checks_of_every_run_need_no_bitonic():
     assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
 
 
-def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_cache):
+def test_doctor_deletes_the_record_of_a_faulty_device(monkeypatch, info, empty_cache):
     worker(monkeypatch)
     device = Device(info)
     quick.ensure_correct(device)
@@ -69,7 +69,7 @@ def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_ca
         quick.ensure_correct(device)
 
 
-def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+def test_lack_of_memory_is_no_device_fault(monkeypatch, info, empty_cache):
     def check(device, rng):
         raise MemoryLimitError("no buffer")
         yield
@@ -82,7 +82,7 @@ def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache
         quick.ensure_correct(Device(info))
 
 
-def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+def test_damaged_kernel_cache_is_no_device_fault(monkeypatch, info, empty_cache):
     worker(monkeypatch)
     monkeypatch.setattr(checks, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
     with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
@@ -90,7 +90,7 @@ def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info,
     assert not list(empty_cache.iterdir())
 
 
-def test_an_exception_of_a_runtime_is_a_sentence():
+def test_runtime_exception_is_one_sentence():
     def check(device, rng):
         raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
         yield
@@ -100,14 +100,14 @@ def test_an_exception_of_a_runtime_is_a_sentence():
     assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
 
 
-def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
+def test_start_of_a_check_is_logged(monkeypatch, info, empty_cache, caplog):
     worker(monkeypatch)
     with caplog.at_level("INFO", "clsplat"):
         quick.ensure_correct(Device(info))
     assert f"checking {info.name}; this takes a few seconds" in caplog.text
 
 
-def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
+def test_faulty_device_is_refused(monkeypatch, info, empty_cache):
     worker(monkeypatch, "0.3")
     device = Device(info)
     for _ in range(2):  # it is not remembered
@@ -115,7 +115,7 @@ def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cach
             quick.ensure_correct(device)
 
 
-def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty_cache):
+def test_correct_device_is_checked_once(monkeypatch, info, empty_cache):
     worker(monkeypatch)
     device = Device(info)
     before = device.allocated, device.peak, dict(device.tuning)
@@ -137,14 +137,14 @@ def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty
 
 
 @pytest.mark.parametrize("variable", ["PYOPENCL_BUILD_OPTIONS", "POCL_VECTORIZER_PREFER_VECTOR_WIDTH", "CL_CONFIG_X"])
-def test_a_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
+def test_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
     before = quick._record(info, "wide", "radix")
     monkeypatch.setenv(variable, "-DTILE=8")
     assert quick._record(info, "wide", "radix") != before
     assert host.system()["environment"][variable] == "-DTILE=8"
 
 
-def test_the_place_of_a_cache_does_not_change_the_record(monkeypatch, info, tmp_path):
+def test_cache_path_does_not_change_the_record(monkeypatch, info, tmp_path):
     before = quick._record(info, "wide", "radix")
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     assert quick._record(info, "wide", "radix") == before
@@ -170,7 +170,7 @@ def test_device_is_checked_each_time_without_a_writable_cache(monkeypatch, info,
     assert len(started) == 2
 
 
-def test_the_two_second_form_holds(info, empty_cache):
+def test_quick_check_passes_and_is_recorded(info, empty_cache):
     opened = Device(info)
     quick.ensure_correct(opened)
     records = list((empty_cache / "conformance").iterdir())
@@ -198,7 +198,7 @@ WORK: dict[str, Callable[[Path, Path, Path, object], object]] = {
 
 
 @pytest.mark.parametrize(("work", "given"), list(zip(WORK, 2 * ["default", "name", "open"], strict=True)))
-def test_a_wrong_device_makes_no_picture_and_no_model(
+def test_faulty_device_writes_no_render_and_no_model(
     work, given, monkeypatch, info, empty_cache, tiny_scene, model, tmp_path
 ):
     worker(monkeypatch, "0.3")
@@ -208,7 +208,7 @@ def test_a_wrong_device_makes_no_picture_and_no_model(
     assert not list((tmp_path / "out").rglob("*"))
 
 
-def test_a_device_is_proved_once_for_all_that_it_does(monkeypatch, info, empty_cache, tiny_scene, model, tmp_path):
+def test_device_is_checked_once_for_all_work(monkeypatch, info, empty_cache, tiny_scene, model, tmp_path):
     started = []
     run_checks = quick.run_checks
     monkeypatch.setattr(quick, "run_checks", lambda *arguments: started.append(1) or run_checks(*arguments))

@@ -583,7 +583,7 @@ def test_ssim_border_is_zero_padded():
     np.testing.assert_allclose(ref.ssim_map(x, y)[0, 0, 0], luminance * structure, rtol=1e-12)
 
 
-def test_adam_is_the_sum_it_stands_for(rng):
+def test_adam_matches_its_closed_form(rng):
     """Pixel sums after t steps: (1-β) Σ β^(t-k) g_k^p, divided by 1-β^t."""
     steps, rate = 6, 0.01
     gradients = rng.normal(0, 1, (steps, 4))
@@ -598,7 +598,7 @@ def test_adam_is_the_sum_it_stands_for(rng):
         np.testing.assert_allclose(parameter, expected, rtol=1e-12)
 
 
-def test_adam_of_seen_rows_leaves_the_others(rng):
+def test_adam_of_visible_rows_leaves_other_rows(rng):
     state, seen = rng.normal(1, 0.1, (4, 3, 2)), np.array([True, False, True])
     parameter, gradient, moment1, moment2 = state
     whole = ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01)
@@ -696,7 +696,7 @@ def test_gradients_of_a_grid_of_colors(rng, nodes):
     assert relative_error(slope, five_point(lambda: ref.grid_smoothness(grid)[0], grid)) < FD_TOLERANCE
 
 
-def test_grid_of_one_matrix_is_it_and_corners_are_nodes(rng):
+def test_grid_of_equal_matrices_is_constant_and_meets_its_nodes(rng):
     image, grid = rng.uniform(0, 1, (3, 6, 7)), rng.normal(0, 0.2, (3, 4, 1, 1, 1))
     expected = ref.colored(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
     np.testing.assert_allclose(ref.gridded(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
@@ -706,7 +706,7 @@ def test_grid_of_one_matrix_is_it_and_corners_are_nodes(rng):
     np.testing.assert_allclose(ref.gridded(gray, grid), ref.colored(gray, matrix))
 
 
-def test_mean_of_grids_is_removed_and_local_differences_stay(rng):
+def test_removing_the_grid_mean_keeps_local_differences(rng):
     vignette = np.zeros((4, 3, 4, 2, 3, 3))
     vignette[..., 1, 1] = 0.3  # in the middle of all photographs
     found = ref.centered_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))

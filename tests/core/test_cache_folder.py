@@ -50,7 +50,7 @@ def own(machine: Path) -> Path:
 
 
 @linux
-def test_the_users_folder_is_used_where_it_can_be_written(machine, caplog):
+def test_writable_user_folder_is_used(machine, caplog):
     assert cache_folder() == machine / "home" / ".cache" / "clsplat"
     assert cache_folder().is_dir()
     assert "XDG_CACHE_HOME" not in os.environ
@@ -65,7 +65,7 @@ def put_file(machine: Path, place: str) -> None:
 
 @linux
 @pytest.mark.parametrize("place", ["home", "home/.cache", "home/.cache/pocl", "home/.cache/pytools"])
-def test_caches_move_where_home_or_library_cache_is_read_only(machine, own, place, caplog):
+def test_caches_move_if_home_or_library_cache_is_read_only(machine, own, place, caplog):
     put_file(machine, place)
     assert cache_folder() == own / "clsplat"
     assert os.environ["XDG_CACHE_HOME"] == str(own)
@@ -79,7 +79,7 @@ def test_caches_move_where_home_or_library_cache_is_read_only(machine, own, plac
 
 
 @linux
-def test_caches_move_where_the_user_has_no_home(machine, own, monkeypatch, caplog):
+def test_caches_move_if_the_user_has_no_home(machine, own, monkeypatch, caplog):
     monkeypatch.delenv("HOME")
     monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
     assert cache_folder() == own / "clsplat"
@@ -87,7 +87,7 @@ def test_caches_move_where_the_user_has_no_home(machine, own, monkeypatch, caplo
 
 
 @linux
-def test_caches_move_where_the_named_pocl_folder_is_read_only(machine, own, monkeypatch):
+def test_caches_move_if_the_pocl_folder_is_read_only(machine, own, monkeypatch):
     put_file(machine, "kernels")
     monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
     cache_folder()
@@ -95,7 +95,7 @@ def test_caches_move_where_the_named_pocl_folder_is_read_only(machine, own, monk
 
 
 @linux
-def test_a_named_folder_of_pocl_stays_where_it_can_be_written(machine, monkeypatch):
+def test_writable_pocl_folder_stays(machine, monkeypatch):
     monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
     cache_folder()
     assert os.environ["POCL_CACHE_DIR"] == str(machine / "kernels")
@@ -103,7 +103,7 @@ def test_a_named_folder_of_pocl_stays_where_it_can_be_written(machine, monkeypat
 
 @linux
 @pytest.mark.parametrize("trap", ["open to all", "a link", "a file", "dangling"])
-def test_a_temporary_folder_that_others_can_write_is_not_used(machine, own, trap):
+def test_world_writable_temporary_folder_is_not_used(machine, own, trap):
     put_file(machine, "home")
     if trap == "open to all":
         own.mkdir()
@@ -122,7 +122,7 @@ def test_a_temporary_folder_that_others_can_write_is_not_used(machine, own, trap
 
 
 @linux
-def test_without_a_writable_folder_the_error_says_what_to_set(machine, monkeypatch):
+def test_error_without_writable_folder_names_the_variable(machine, monkeypatch):
     put_file(machine, "home")
     put_file(machine, "tmp")
     with pytest.raises(OutputError, match=r"no cache folder works .*; set XDG_CACHE_HOME or TMPDIR"):
@@ -131,7 +131,7 @@ def test_without_a_writable_folder_the_error_says_what_to_set(machine, monkeypat
 
 @linux
 @pytest.mark.slow
-def test_a_device_works_without_a_home(tmp_path):
+def test_device_works_without_a_home(tmp_path):
     """As in a container: a user without a name, a home that is not there, nothing that can be written but /tmp."""
     (tmp_path / "file").write_text("")
     variables = {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
@@ -145,7 +145,7 @@ def test_a_device_works_without_a_home(tmp_path):
 
 @linux
 @pytest.mark.parametrize("free", [0, 2**30])
-def test_a_full_folder_is_not_called_damaged(machine, monkeypatch, free):
+def test_full_folder_is_not_reported_as_damaged(machine, monkeypatch, free):
     cache_folder()
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
     text = kernel_cache_advice()
@@ -169,7 +169,7 @@ def kernel(base: str, name: str) -> str:
 
 
 @linux
-def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
+def test_only_truncated_kernels_are_removed(machine, caplog):
     """Nor those that another process writes now, nor what others keep in the folder."""
     pocl, pytools = (machine / "home" / ".cache" / name for name in ("pocl", "pytools"))
     whole, database = library(3), b"SQLite format 3\0" + bytes(84)
@@ -262,7 +262,7 @@ def broken(machine: Path) -> Path:
 
 
 @linux
-def test_a_device_is_tested_without_the_kernels_that_are_cut_off(broken, monkeypatch):
+def test_device_is_tested_without_its_truncated_kernels(broken, monkeypatch):
     def probe(*arguments, **values):
         assert not broken.exists()
         return subprocess.CompletedProcess([], 0, "", "")
@@ -280,6 +280,6 @@ def test_known_device_opens_without_its_truncated_kernels(broken, info):
 
 
 @linux
-def test_the_remedy_names_every_folder_of_kernels(machine):
+def test_remedy_names_every_kernel_folder(machine):
     caches = machine / "home" / ".cache"
     assert kernel_caches() == f"{caches}/pyopencl, {caches}/pytools and {caches}/pocl"

@@ -37,21 +37,21 @@ VALUES = [
 
 
 @pytest.mark.parametrize("value", VALUES, ids=[type(value).__name__ for value in VALUES])
-def test_a_value_in_a_message_is_one_line_of_limited_length(value):
+def test_value_in_a_message_is_one_short_line(value):
     assert 1 <= len(quote(value)) <= QUOTE_LIMIT
     assert "\n" not in quote(value)
 
 
-def test_one_is_no_plural():
+def test_pluralize_keeps_the_singular_for_one():
     assert [pluralize(count, "view") for count in (0, 1, 2000)] == ["0 views", "1 view", "2,000 views"]
 
 
-def test_a_short_value_in_a_message_is_whole():
+def test_short_value_in_a_message_is_not_cut():
     for value in (3, -0.5, "a b", None, True, ["a", 1], {"b": 1, "a": {"c": [2]}}, (1.0, 2.0), float("inf")):
         assert quote(value) == repr(value)
 
 
-def test_a_list_that_holds_itself_can_be_shown():
+def test_recursive_list_can_be_shown():
     endless: list[object] = []
     endless.append(endless)
     assert len(quote(endless)) <= QUOTE_LIMIT
@@ -71,13 +71,13 @@ def test_message_is_one_line_without_control_characters():
     assert len(one_line(DataError("\0" * 5000))) <= MESSAGE_LIMIT
 
 
-def test_an_override_is_cut():
+def test_long_override_is_cut():
     assert len(str(OverrideError("k" * 5000, "r" * 5000))) < 600
     assert str(OverrideError("a\n=\r1", "b\nc")) == "--set a = 1: b c"
 
 
 @pytest.mark.slow
-def test_a_plug_in_that_exits_is_an_error_of_the_plug_in(tmp_path):
+def test_plugin_that_exits_is_a_plugin_error(tmp_path):
     (tmp_path / "scene").mkdir()
     (tmp_path / "quits.py").write_text(
         "import sys\n"
@@ -111,7 +111,7 @@ UNEXPECTED = [
     [(raised, i % 2 == 1) for i, raised in enumerate(UNEXPECTED)],
     ids=[type(error).__name__ for error, _ in UNEXPECTED],
 )
-def test_whatever_is_raised_ends_as_one_line_with_a_code(raised, in_thread, monkeypatch, capsys):
+def test_every_exception_is_one_line_with_a_code(raised, in_thread, monkeypatch, capsys):
     error, code = raised
 
     def fail(*_: object) -> None:
@@ -135,7 +135,7 @@ def test_whatever_is_raised_ends_as_one_line_with_a_code(raised, in_thread, monk
 NO_PATHS = {"lower_rate(run, broken)", "2 * state.stage_step", "2 * metrics['steps']", "pipeline"}
 
 
-def test_a_path_in_a_command_is_one_word_of_a_shell():
+def test_path_in_a_command_is_one_shell_word():
     assert shell_quote("runs/a-1.b_2") == "runs/a-1.b_2", "no quotes where none are needed"
     for name in ("my ü/a 'b' $c", "(x)", "a;b"):
         assert shlex.split(f"clsplat resume {shell_quote(Path(name))} --steps 2") == [
@@ -147,7 +147,7 @@ def test_a_path_in_a_command_is_one_word_of_a_shell():
         ]
 
 
-def test_every_command_in_a_message_has_its_paths_quoted():
+def test_paths_in_suggested_commands_are_quoted():
     packages = [Path(package.__file__).parent for package in (clsplat, clsplat.data_tools)]
     sources = "".join(path.read_text() for folder in packages for path in folder.rglob("*.py"))
     commands = re.findall(r"`clsplat [^`\n]*`", sources)

@@ -78,7 +78,7 @@ def reads(path: Path) -> set[str]:
     return found
 
 
-def test_files_are_read_in_one_place():
+def test_files_are_read_only_by_the_read_module():
     found = {one for room in ("clsplat", "data_tools") for path in (ROOT / room).rglob("*.py") for one in reads(path)}
     known = {one for one in found for place in ALLOWED if one == place or one.startswith(f"{place}:")}
     assert sorted(found - known) == [], "read with clsplat.core.reading, or say in ALLOWED why not"
@@ -89,12 +89,12 @@ def test_files_are_read_in_one_place():
 @pytest.mark.parametrize(
     "text", ["p.open()", "p.open('rb')", "open(p)", "open(p, 'r')", "p.read_text()", "json.load(f)", "p.open(mode='r')"]
 )
-def test_the_search_finds_a_read(text):
+def test_search_finds_reads(text):
     assert read_by(ast.parse(text).body[0].value)
 
 
 @pytest.mark.parametrize("text", ["p.open('wb')", "open(p, 'a')", "json.loads(s)", "open_device()", "Job.open(a, b)"])
-def test_the_search_passes_over_other_calls(text):
+def test_search_ignores_other_calls(text):
     assert not read_by(ast.parse(text).body[0].value)
 
 
@@ -124,7 +124,7 @@ def test_a_pipe_is_refused_at_once(name, pipe):
         read(pipe)
 
 
-def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
+def test_records_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
     with failing("the reader waits", seconds=20):
         pipe.rename(tmp_path / ".manifest.jsonl")
         assert not Manifest(tmp_path).lists(tmp_path / "x.png")
@@ -135,14 +135,14 @@ def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeyp
         assert identity.DecodedSizes()._known == {}
 
 
-def test_a_pipeline_that_is_no_text_is_not_copied(tmp_path):
+def test_binary_pipeline_is_not_copied(tmp_path):
     (tmp_path / "x.yaml").write_bytes(b"# one\n# tw\xf6\nname: x\n")
     with pytest.raises(ConfigError, match=r"x\.yaml:2: expected UTF-8 text, found the byte 0xf6"):
         clsplat.copy_pipeline(tmp_path / "x.yaml", tmp_path / "y.yaml")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", json.dumps({"test": 1, "gaussians": 2})])
-def test_metrics_that_are_damaged_are_one_sentence_after_a_run(text, tmp_path):
+def test_damaged_metrics_are_one_sentence_after_a_run(text, tmp_path):
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics\.json: "):
         summary(tmp_path)

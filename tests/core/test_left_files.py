@@ -49,7 +49,7 @@ def test_only_temporary_files_of_killed_runs_are_swept(tiny_scene, tmp_path):
     assert [name for name in mine if not (out / name).exists()] == []
 
 
-def test_what_a_process_still_writes_is_not_swept(tmp_path):
+def test_files_of_a_live_process_are_not_swept(tmp_path):
     other, old = tmp_path / f".a.{os.getppid()}-0.partial", tmp_path / f".b.{os.getpid()}-99999999.partial"
     for path in (other, old):
         path.write_text("x")
@@ -62,7 +62,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
     assert not old.exists(), "left by an earlier process of this number, as in a container"
 
 
-def test_process_killed_at_any_write_leaves_what_is_swept_next(tmp_path):
+def test_temporary_files_of_a_killed_write_are_swept_next(tmp_path):
     code = (
         "import os, signal, sys; from pathlib import Path; from clsplat.core.files import open_atomic\n"
         "with open_atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
@@ -107,7 +107,7 @@ has_proc = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="the na
 
 
 @has_proc
-def test_checkpoint_and_records_are_synced_before_old_ones_go(tiny_scene, tmp_path, calls):
+def test_checkpoint_is_synced_before_old_ones_are_removed(tiny_scene, tmp_path, calls):
     few = {"optimize.steps": 4, "init.count": 20, "checkpoint.every": 100, "optimize.log_every": 100}
     trainer = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run")
     trainer.step()
@@ -130,14 +130,14 @@ def test_checkpoint_and_records_are_synced_before_old_ones_go(tiny_scene, tmp_pa
 
 
 @has_proc
-def test_a_run_folder_is_on_the_disk_with_the_folders_above_it(tmp_path, calls):
+def test_run_folder_is_synced_with_its_parents(tmp_path, calls):
     with run_folder.opened(RunState.read(tmp_path / "a" / "run"), "new"):
         synced = [name for kind, name in calls if kind == "sync"]
     assert {tmp_path.name, "a"} <= {*synced}
 
 
 @has_proc
-def test_a_folder_that_is_made_is_on_the_disk_with_its_file(tmp_path, calls):
+def test_new_folder_is_synced_with_its_file(tmp_path, calls):
     with open_atomic(tmp_path / "a" / "b" / "c.txt") as file:
         file.write(b"x")
     synced = [name for kind, name in calls if kind == "sync"]
@@ -178,7 +178,7 @@ def test_photograph_model_is_synced_before_it_is_renamed(tmp_path, calls):
 
 
 @has_proc
-def test_a_line_of_a_tool_is_on_the_disk_before_its_file_is_made(tmp_path, calls):
+def test_manifest_line_is_synced_before_its_file_is_written(tmp_path, calls):
     assert Manifest(tmp_path / "frames").needs_writing(tmp_path / "frames" / "a.png", "x")
     assert calls == [("sync", tmp_path.name), ("sync", RECORD_OF_A_TOOL), ("sync", "frames")]
     calls.clear()
@@ -187,7 +187,7 @@ def test_a_line_of_a_tool_is_on_the_disk_before_its_file_is_made(tmp_path, calls
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EACCES])
-def test_a_folder_that_cannot_be_synced_is_no_failure(number, tmp_path, monkeypatch):
+def test_unsyncable_folder_is_no_failure(number, tmp_path, monkeypatch):
     real = os.open
     monkeypatch.setattr(
         os, "open", lambda path, *a, **k: real(path, *a, **k) if Path(path).is_file() else _raise(number)
@@ -206,7 +206,7 @@ def _raise(number: int) -> None:
 
 
 @pytest.mark.parametrize("before", [None, b"", b"first"])
-def test_where_nothing_can_be_appended_a_file_is_as_it_was(before, tmp_path, monkeypatch):
+def test_failed_append_leaves_the_file_unchanged(before, tmp_path, monkeypatch):
     path = tmp_path / "a"
     if before is not None:
         path.write_bytes(before)
@@ -216,7 +216,7 @@ def test_where_nothing_can_be_appended_a_file_is_as_it_was(before, tmp_path, mon
     assert (path.read_bytes() if path.exists() else None) == before
 
 
-def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
+def test_threads_can_write_the_same_file(tmp_path):
     faults = []
 
     def write(letter: bytes) -> None:
@@ -237,7 +237,7 @@ def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have names on POSIX systems")
-def test_what_is_no_file_is_not_replaced(tmp_path):
+def test_only_regular_files_are_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OutputError, match=r"pipe: cannot be written \(it is not a file\)"):
         write_text(tmp_path / "pipe", "text")

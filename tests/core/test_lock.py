@@ -55,7 +55,7 @@ def test_another_process_is_refused_and_learns_the_owner(tmp_path):
         process.wait()
 
 
-def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
+def test_lock_ends_with_its_process(tmp_path):
     for end in (subprocess.Popen.kill, subprocess.Popen.terminate):
         process = holder(tmp_path)
         end(process)
@@ -84,7 +84,7 @@ def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
         os.kill(child, getattr(signal, "SIGKILL", signal.SIGTERM))
 
 
-def test_one_process_holds_a_folder_once_by_whatever_name(tmp_path):
+def test_process_locks_a_folder_once_under_any_name(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").symlink_to("a")
     with lock.lock_folder(tmp_path / "a"):
@@ -110,7 +110,7 @@ no_windows = pytest.mark.skipif(sys.platform == "win32", reason="has no fcntl to
 @pytest.mark.parametrize(
     "before", [pytest.param("", id="with locks"), pytest.param(NO_LOCKS, id="without", marks=no_windows)]
 )
-def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
+def test_one_of_many_concurrent_processes_gets_the_folder(before, tmp_path):
     code = before + (
         "import sys, time; from pathlib import Path; from clsplat.core import lock\n"
         "from clsplat.core.errors import OutputError\n"
@@ -129,7 +129,7 @@ def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
     assert sum(int(out) for out, _ in ends) > 0
 
 
-def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monkeypatch):
+def test_removed_lock_file_is_no_lock(tmp_path, monkeypatch):
     system_lock, calls = lock._system_lock, []
 
     def late(file):
@@ -143,7 +143,7 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
         assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
 
 
-def test_two_runs_in_one_folder(tiny_scene, tmp_path):
+def test_second_run_in_a_folder_is_refused(tiny_scene, tmp_path):
     """The second is refused while the first goes on, with and without --resume; the first ends undisturbed."""
     out = tmp_path / "run"
     arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out), "--set", "optimize.steps=1000000"]
@@ -201,7 +201,7 @@ def test_run_just_starting_in_the_default_folder_is_not_joined(tmp_path):
     assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
-def test_the_lock_of_a_killed_start_gives_no_other_name(tmp_path):
+def test_killed_start_does_not_change_the_default_folder(tmp_path):
     (tmp_path / "splat").mkdir()
     process = holder(tmp_path / "splat")
     assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
@@ -274,7 +274,7 @@ def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, 
 
 
 @pytest.mark.parametrize("ahead", [-2, 86400])
-def test_run_silent_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, monkeypatch, caplog):
+def test_run_silent_for_a_minute_is_taken_over_despite_clocks(ahead, tmp_path, monkeypatch, caplog):
     """As a job that is started again on another machine right after the first was killed."""
     caplog.set_level("INFO", "clsplat")
     start = time.time()
@@ -316,7 +316,7 @@ def test_lock_of_a_run_that_ended_elsewhere_is_taken_over(owner, status, tmp_pat
     assert [line for line in caplog.messages if "taken over" in line] == lines
 
 
-def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monkeypatch):
+def test_run_that_wakes_up_notices_the_takeover(tmp_path, monkeypatch):
     """As one that was suspended for a minute, where locks count on each machine alone."""
     monkeypatch.setattr(lock, "_system_lock", lambda file: True)
     own = lock.owner_record
@@ -336,7 +336,7 @@ def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monke
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
+def test_heartbeat_stops_when_the_run_folder_is_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
         pass
@@ -346,7 +346,7 @@ def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     assert (tmp_path / "run" / "status.json").read_text() == "of the next"
 
 
-def test_windows_locks_one_byte_behind_the_text(tmp_path, monkeypatch):
+def test_windows_locks_one_byte_after_the_text(tmp_path, monkeypatch):
     """With a stand-in for its module: who locks a byte twice is refused, and nothing is truncated or written there."""
     locked: set[tuple[int, int]] = set()
     fake = ModuleType("msvcrt")

@@ -10,7 +10,7 @@ from clsplat.core import machine
 from clsplat.core.machine import Owner
 
 
-def test_a_number_counts_in_its_own_namespace(monkeypatch):
+def test_process_id_is_local_to_its_namespace(monkeypatch):
     this = Owner.current()
     assert this.is_local
     assert not this.has_ended
@@ -24,7 +24,7 @@ def test_a_number_counts_in_its_own_namespace(monkeypatch):
     assert this.has_ended
 
 
-def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_path):
+def test_process_from_before_a_reboot_has_ended(monkeypatch, tmp_path):
     """Its number may be another's by now.  In containers, host name and namespace may be those of two machines."""
     boot = tmp_path / "boot_id"
     monkeypatch.setattr(machine, "BOOT_ID", boot)
@@ -44,7 +44,7 @@ def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_p
 
 
 @pytest.mark.parametrize("process", [None, "7", 7.0, True, 0, -1])
-def test_a_file_that_names_no_process_has_no_owner(process):
+def test_file_without_a_process_has_no_owner(process):
     assert Owner.from_record({"process": process, "host": "a"}) is None
 
 
@@ -61,7 +61,7 @@ class Function:
 @pytest.mark.parametrize(
     ("code", "error", "alive"), [(259, 0, True), (1, 0, False), (None, 87, False), (None, 5, True)]
 )
-def test_a_process_of_windows_is_probed_without_ending_it(code, error, alive, monkeypatch):
+def test_windows_process_is_probed_without_ending_it(code, error, alive, monkeypatch):
     """As Windows answers: the exit code of a process, or the error where there is none or it is another user's."""
     handles: list[int] = []
 

@@ -23,7 +23,7 @@ def now(monkeypatch):
     return clocked
 
 
-def test_the_time_left_follows_from_what_this_call_has_done(now):
+def test_time_left_follows_from_work_of_this_call(now):
     count = Count("photographs", 30)
     assert count.seconds_left is None
     now[0] += 10
@@ -34,7 +34,7 @@ def test_the_time_left_follows_from_what_this_call_has_done(now):
     assert count.seconds_left == 0
 
 
-def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
+def test_work_of_an_earlier_call_takes_no_time(now, monkeypatch):
     began = Count("photographs", 30)
     began.reach(20)  # at once: it was there
     now[0] += 5
@@ -42,14 +42,14 @@ def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
     assert began.seconds_left == pytest.approx(5, rel=0.9)
 
 
-def test_pieces_that_differ_much_tell_no_time(now):
+def test_uneven_work_has_no_time_left(now):
     count = Count("steps of the preparation", 4, is_even=False)
     now[0] += 10
     count.reach(1)
     assert count.seconds_left is None
 
 
-def test_nothing_to_count_is_not_heard(tmp_path):
+def test_empty_count_is_not_reported(tmp_path):
     heard = []
     with listening(lambda *what, seconds_left: heard.append((*what, seconds_left))):
         prepare([], tmp_path, tmp_path)
@@ -60,7 +60,7 @@ def test_nothing_to_count_is_not_heard(tmp_path):
     assert heard == [("steps of the preparation", done, 2, None) for done in (0, 0, 1)]
 
 
-def test_everyone_around_hears(now):
+def test_nested_listeners_all_hear(now):
     inner, outer = [], []
     with (
         listening(lambda *what, seconds_left: outer.append((*what, seconds_left))),
@@ -74,7 +74,7 @@ def test_everyone_around_hears(now):
     assert outer == [("pairs", 0, 4, None), ("pairs", 1, 4, 9)]
 
 
-def test_work_that_does_not_count_is_watched(monkeypatch):
+def test_uncounted_work_is_polled(monkeypatch):
     monkeypatch.setattr(progress, "FIRST_POLL", 0.001)
     heard, seen = [], threading.Event()
 
@@ -102,7 +102,7 @@ def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
     assert status.now.seconds_left is None
 
 
-def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
+def test_bar_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch, capsys):
     with terminal.counts_on_terminal():
         Count("pairs matched", 4).reach(2)
     assert capsys.readouterr().out == ""
@@ -157,7 +157,7 @@ def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
     assert text_of(bar) == "evaluate: 2 of 8 views"
 
 
-def test_warnings_stand_above_the_bar(screen, log_shown):
+def test_warnings_are_printed_above_the_bar(screen, log_shown):
     with terminal.counts_on_terminal():
         Count("pairs matched", 4)
         terminal.LOG.warning("cannot be renamed")
@@ -166,7 +166,7 @@ def test_warnings_stand_above_the_bar(screen, log_shown):
     assert before.endswith("\x1b[2K"), (before, text)
 
 
-def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
+def test_counts_are_not_printed_above_the_bar(now, screen, log_shown):
     with terminal.counts_on_terminal():
         count = Count("pairs matched", 4)
         now[0] += 9
@@ -178,7 +178,7 @@ def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
     assert "pairs matched: 2 of 4, 0:09 left" in screen.getvalue()
 
 
-def test_what_was_placed_is_told_in_words():
+def test_mapping_summary_counts_registered_photographs():
     figures = {"registered": 32, "not_registered": ["IMG_0034.jpg"], "points": 9, "error_px": 1.268}
     step = MapCameras(stage="map_cameras")
     assert step.summary(figures) == "32 of 33 photographs placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
@@ -187,7 +187,7 @@ def test_what_was_placed_is_told_in_words():
     assert many.endswith("6.jpg, 7.jpg, and 12 more")
 
 
-def test_photographs_that_cannot_be_read_are_counted():
+def test_unreadable_photographs_are_counted():
     features = {"photographs": 4, "cameras": 2, "damaged": {"b.jpg": "not an image"}}
     assert FindFeatures(stage="find_features").summary(features) == "features found in 4 photographs from 2 cameras"
     cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
@@ -196,5 +196,5 @@ def test_photographs_that_cannot_be_read_are_counted():
     assert summarize_placement({"find_features": "damaged", "map_cameras": cameras}) == ""
 
 
-def test_times_are_read_as_on_a_clock():
+def test_times_are_formatted_like_a_clock():
     assert [clock(seconds) for seconds in (0, 59.6, 3600, 3725)] == ["0:00", "1:00", "1:00:00", "1:02:05"]

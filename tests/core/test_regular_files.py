@@ -57,7 +57,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize(("reader", "what"), list(zip(READERS, cycle(NOT_FILES), strict=False)))
-def test_what_is_no_regular_file_is_data_that_cannot_be_read(reader, what, tmp_path):
+def test_reading_a_non_regular_file_is_a_data_error(reader, what, tmp_path):
     path = tmp_path / "x"
     NOT_FILES[what](path)
     with pytest.raises(DataError, match=rf"/x: cannot be read \(it is {what}\); expected "):
@@ -84,12 +84,12 @@ def test_records_that_are_a_pipe_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["\0", "\ud800", "n" * 5000])
-def test_a_name_that_no_file_can_have_is_refused(name):
+def test_impossible_file_name_is_refused(name):
     with pytest.raises(DataError, match="cannot be read"):
         read_file(Path(name))
 
 
-def test_a_file_of_more_bytes_than_expected_is_not_read(tmp_path):
+def test_file_larger_than_expected_is_not_read(tmp_path):
     with (tmp_path / "x").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(DataError, match="it has 1099511627776 bytes, more than 1000"):
@@ -113,7 +113,7 @@ def test_only_the_vertices_of_a_model_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "\xff", "9" * 5000])
-def test_what_is_no_json_is_refused_in_one_line(text, tmp_path):
+def test_invalid_json_is_refused_in_one_line(text, tmp_path):
     (tmp_path / "x").write_bytes(text.encode("latin-1"))
     with pytest.raises(DataError, match=r"^.*/x: not a JSON file \(.*\); expected a JSON file: create it again$"):
         read_json(tmp_path / "x")

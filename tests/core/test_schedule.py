@@ -20,17 +20,17 @@ def value_of(schedule: object, step: int) -> float:
     return at_step(L1(weight=schedule).weight, step)
 
 
-def test_a_number_stays():
+def test_number_is_constant():
     assert value_of(0.3, 0) == value_of(0.3, 10**6) == 0.3
 
 
 @pytest.mark.parametrize("schedule", [POINTS, {"points": POINTS}, {"points": POINTS, "between": "linear"}])
-def test_straight_lines_lie_between_points(schedule):
+def test_values_between_points_are_linear(schedule):
     at = {0: 0.8, 100: 0.8, 101: 0.796, 199: 0.404, 200: 0.4, 201: 0.436, 299: 3.964, 300: 4.0, 301: 4.0, 9999: 4.0}
     assert [value_of(schedule, step) for step in at] == pytest.approx([*at.values()], rel=1e-12)
 
 
-def test_a_value_of_steps_stays_until_the_next():
+def test_step_value_holds_until_the_next():
     at = {0: 0.8, 99: 0.8, 100: 0.8, 101: 0.8, 199: 0.8, 200: 0.4, 201: 0.4, 299: 0.4, 300: 4.0, 301: 4.0, 9999: 4.0}
     assert [value_of(STEPS, step) for step in at] == [*at.values()]
 
@@ -47,7 +47,7 @@ def test_a_decay_is_exponential_between_its_start_and_its_end():
     assert [value_of(DECAY, step) for step in shares] == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_value_at_every_so_many_steps_is_0_at_the_others():
+def test_periodic_value_is_0_at_other_steps():
     curve = Every(every=4, value=0.5)
     assert [curve.at(step) for step in (1, 3, 4, 5, 8, 4000)] == [0, 0, 0.5, 0, 0.5, 0.5]
     assert min(curve.values) == 0
@@ -85,7 +85,7 @@ ORDER = "expected points [step, value] with increasing steps"
         ("{initial: 1.0, final: 0.1, over: 10, stop: 3}", NOTATION),
     ],
 )
-def test_what_is_not_a_schedule_is_explained_in_one_sentence(recipe, schedule, message):
+def test_invalid_schedule_is_explained_in_one_sentence(recipe, schedule, message):
     with pytest.raises(ConfigError) as error:
         load(recipe(loss_weight=schedule))
     text = str(error.value)
@@ -146,7 +146,7 @@ def recipe(tmp_path: Path):
     ["2", "[[0, 4.0], [1000, 1.0]]", "{points: [[0, 2.0], [20, 1]], between: steps}",
      "{initial: 4.0, final: 1.0, over: 30, start: 5}"],
 )  # fmt: skip
-def test_every_number_that_may_change_takes_every_notation(recipe, schedule):
+def test_every_schedule_key_takes_every_notation(recipe, schedule):
     pipeline = load(recipe(**dict.fromkeys(PLACES, schedule)))
     optimize = pipeline.settings.training
     densify = optimize.during[0]

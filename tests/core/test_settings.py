@@ -120,7 +120,7 @@ def test_two_variants_of_one_name_are_refused():
     )
 
 
-def test_a_word_means_the_variant_with_its_defaults(loaded):
+def test_bare_name_means_the_variant_with_defaults(loaded):
     words = loaded("{order: shuffle}", "[l1, dssim]", "[clone, prune_faint]")
     mappings = loaded("{order: {type: shuffle}}", "[{type: l1}, {type: dssim}]", "[{type: clone}, {type: prune_faint}]")
     assert words.resolved() == mappings.resolved()
@@ -151,14 +151,14 @@ def test_a_word_means_the_variant_with_its_defaults(loaded):
         ({"rules": "[{type: clone, statistic: screen_grat}]"}, "rules[0].statistic: expected "),
     ],
 )  # fmt: skip
-def test_what_is_not_a_variant_is_explained_in_one_line(loaded, settings, message):
+def test_unknown_variant_is_explained_in_one_line(loaded, settings, message):
     with pytest.raises(ConfigError) as error:
         loaded(**settings)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_every_variant_says_what_it_is():
+def test_every_variant_has_a_description():
     """Its docstring is its manual, and so are those of its fields."""
     for base in (Stage, Loss, Rule, Order, PhotographTransform):
         for name, kind in variants(base).items():
@@ -168,7 +168,7 @@ def test_every_variant_says_what_it_is():
 
 
 @pytest.mark.parametrize("key", ["screen_filter.variance", "near"])
-def test_number_no_model_file_holds_is_refused_before_training(key):
+def test_value_beyond_the_format_is_refused_before_training(key):
     with pytest.raises(ConfigError, match=key.rpartition(".")[2]):
         load("smoke", [f"model.{key}=1e38"])
     load("smoke", [f"model.{key}=1e14"])

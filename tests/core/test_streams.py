@@ -31,7 +31,7 @@ def status(out: Path) -> tuple[str, int]:
 
 @full
 @pytest.mark.slow
-def test_a_run_goes_on_with_its_log_where_the_screen_is_full(tiny_scene, tmp_path):
+def test_run_continues_with_its_log_if_stderr_is_full(tiny_scene, tmp_path):
     with Path("/dev/full").open("w") as nowhere:
         run = command("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, "--set", "optimize.steps=20")
         done = subprocess.run(run, stdout=nowhere, stderr=nowhere, timeout=120)
@@ -66,7 +66,7 @@ def test_run_outlives_its_terminal_with_nohup_or_saves_its_state(nohup, tiny_sce
 
 
 @pytest.mark.slow
-def test_a_reader_that_closes_the_pipe_has_what_it_wanted():
+def test_closed_pipe_is_no_error():
     process = subprocess.Popen(command("devices"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()
     assert (process.wait(60), process.stderr.read()) == (0, "")
@@ -74,7 +74,7 @@ def test_a_reader_that_closes_the_pipe_has_what_it_wanted():
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors of POSIX")
-def test_no_file_takes_a_descriptor_closed_before_the_start(tmp_path):
+def test_files_do_not_reuse_closed_standard_descriptors(tmp_path):
     code = f"""if True:
         import os
         for number in (0, 1, 2):
@@ -94,7 +94,7 @@ def test_no_file_takes_a_descriptor_closed_before_the_start(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
 @pytest.mark.parametrize("arguments", [["devices"], ["devices", "--json"]])
-def test_a_product_that_a_closed_stdout_cannot_take_is_missed(arguments):
+def test_output_to_a_closed_stdout_is_an_error(arguments):
     shell = ["sh", "-c", 'exec "$@" >&-', "sh", *command(*arguments)]
     done = subprocess.run(shell, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 7
@@ -103,7 +103,7 @@ def test_a_product_that_a_closed_stdout_cannot_take_is_missed(arguments):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
-def test_a_run_goes_on_where_stdout_is_closed(tiny_scene, tmp_path):
+def test_run_continues_if_stdout_is_closed(tiny_scene, tmp_path):
     run = command("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, "--set", "optimize.steps=4")
     done = subprocess.run(["sh", "-c", 'exec "$@" >&-', "sh", *run], timeout=120)
     assert (done.returncode, status(tmp_path)) == (0, ("done", 0))
@@ -122,7 +122,7 @@ class Broken:
 
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), BrokenPipeError(32, "x"), ValueError("closed")])
-def test_what_prints_never_fails_and_what_is_wanted_is_missed(error, monkeypatch):
+def test_only_command_output_fails_on_a_broken_stdout(error, monkeypatch):
     monkeypatch.setattr(sys, "stdout", Broken(error))
     monkeypatch.setattr(signals.STDOUT, "fault", None)
     signals.STDOUT.install()
@@ -141,7 +141,7 @@ PRODUCTS = ["pipelines", "pipelines smoke", "check smoke", "check smoke --json",
 
 
 @pytest.mark.parametrize("arguments", PRODUCTS)
-def test_the_product_of_a_command_is_missed(arguments, tmp_path, monkeypatch, capsys):
+def test_command_fails_if_its_output_cannot_be_written(arguments, tmp_path, monkeypatch, capsys):
     write_status(tmp_path, state="done", step=7)
     monkeypatch.setattr(sys, "stdout", Broken(OSError(5, "Input/output error")))
     monkeypatch.setattr(sys, "argv", ["clsplat", *arguments.replace("RUN", str(tmp_path)).split()])
@@ -152,7 +152,7 @@ def test_the_product_of_a_command_is_missed(arguments, tmp_path, monkeypatch, ca
     assert "stdout: cannot be written" in capsys.readouterr().err
 
 
-def test_a_signal_within_a_write_loses_its_line_alone(monkeypatch):
+def test_signal_within_a_write_loses_only_that_line(monkeypatch):
     monkeypatch.setattr(sys, "stdout", Broken(RuntimeError("reentrant call inside <_io.BufferedWriter>")))
     monkeypatch.setattr(signals.STDOUT, "fault", None)
     terminal.print_message("finishing the step")
@@ -167,7 +167,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("name", ENDS)
-def test_what_ends_a_command_without_a_run_is_one_line(name, monkeypatch, capsys):
+def test_end_of_a_command_without_a_run_is_one_line(name, monkeypatch, capsys):
     raised, code, line = ENDS[name]
 
     def fail(*arguments):
@@ -204,7 +204,7 @@ def fill(handler: logging.FileHandler) -> None:
 
 
 @full
-def test_a_log_on_a_full_disk_is_said_once_and_ends_nothing(tmp_path, capsys):
+def test_full_log_disk_is_reported_once_and_stops_nothing(tmp_path, capsys):
     terminal.start_logging(debug=False)
     try:
         with terminal.logging_to(tmp_path / "log.txt"):
@@ -220,7 +220,7 @@ def test_a_log_on_a_full_disk_is_said_once_and_ends_nothing(tmp_path, capsys):
     )
 
 
-def test_a_log_that_is_no_file_is_refused(tmp_path):
+def test_log_that_is_not_a_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "log.txt") if hasattr(os, "mkfifo") else (tmp_path / "log.txt").mkdir()
     with (
         pytest.raises(OutputError, match=r"log.txt: cannot be written \(it is not a file\)"),
@@ -240,7 +240,7 @@ def test_log_on_a_disk_full_from_the_start_is_refused(tmp_path, monkeypatch):
         pass
 
 
-def test_a_run_whose_log_cannot_be_written_has_a_status(tiny_scene, tmp_path, monkeypatch):
+def test_run_with_an_unwritable_log_has_a_status(tiny_scene, tmp_path, monkeypatch):
     def unused(*arguments):
         raise AssertionError
 

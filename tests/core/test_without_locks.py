@@ -33,7 +33,7 @@ def owned_by(folder: Path, **values) -> None:
     (folder / LOCK).write_text(json.dumps({**owner, **values}))
 
 
-def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without_locks, caplog):
+def test_missing_locks_warn_and_a_dead_owner_is_replaced(tmp_path, without_locks, caplog):
     caplog.set_level("INFO", "clsplat")
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
@@ -47,7 +47,7 @@ def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without
     assert "the file system does not support locks" in caplog.text
 
 
-def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_locks, monkeypatch):
+def test_owner_from_before_a_reboot_has_ended(tmp_path, without_locks, monkeypatch):
     """Its number is that of a living process by now."""
     monkeypatch.setattr(machine, "_pid_namespace", lambda: machine.FIRST_PID_NAMESPACE)
     monkeypatch.setattr(machine, "_boot", lambda: "now")
@@ -56,7 +56,7 @@ def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_loc
         assert json.loads((tmp_path / LOCK).read_text())["boot"] == "now"
 
 
-def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
+def test_incomplete_lock_counts_as_held(tmp_path, without_locks):
     """Between making the file and writing into it; or a process was killed there."""
     (tmp_path / LOCK).touch()
     with (
@@ -96,7 +96,7 @@ def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monk
         pytest.param({"process": NONE, "host": "another", "boot": "before"}, id="on another host, since its start"),
     ],
 )
-def test_without_locks_an_owner_that_may_live_keeps_the_folder(values, tmp_path, without_locks):
+def test_possibly_live_owner_keeps_the_folder(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)
     with pytest.raises(OutputError, match=r"if that process has exited, remove .*run.lock"), lock.lock_folder(tmp_path):
         pass

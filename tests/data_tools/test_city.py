@@ -36,7 +36,7 @@ def test_points_lie_in_the_streets_and_on_the_houses(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [40, 300])
-def test_any_number_of_views_lies_evenly_above_the_city(count: int) -> None:
+def test_views_are_evenly_spaced_above_the_city(count: int) -> None:
     poses = np.array(City(train=count).poses()["train"])
     half = City().half
     down = poses[:, :3, 3] - poses[:, :3, 2] * (FLIGHT / poses[:, 2, 2])[:, None]  # where the axes meet the ground
@@ -48,7 +48,7 @@ def test_any_number_of_views_lies_evenly_above_the_city(count: int) -> None:
     assert 9.9 < tilts.min() < tilts.max() < 35.1
 
 
-def test_another_city_in_its_place_is_refused(folder: Path) -> None:
+def test_replacing_a_different_city_is_refused(folder: Path) -> None:
     assert "already complete" in write_dataset(folder, TINY)
     for other in (City(size=16, train=4, test=1, lots=4), SyntheticOptions(size=16, train=4, test=1)):
         with pytest.raises(DataError, match="is another dataset"):

@@ -32,7 +32,7 @@ def video(tmp_path: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-def test_the_sharp_frames_of_a_video(video, tmp_path):
+def test_sharp_frames_of_a_video(video, tmp_path):
     assert write_frames(video, tmp_path / "frames", frames=10) == 10
     files = sorted((tmp_path / "frames").glob("*.png"))
     assert [file.name for file in files] == [f"frame_{i:05d}.png" for i in range(1, 11)]
@@ -40,7 +40,7 @@ def test_the_sharp_frames_of_a_video(video, tmp_path):
     np.testing.assert_allclose(levels, np.arange(1, 30, 3), atol=0.6)
 
 
-def test_a_camera_that_rests_gives_one_frame(tmp_path, rng):
+def test_still_camera_gives_one_frame(tmp_path, rng):
     """It rests, passes a wall in the middle third of the video, and rests again."""
     wall = cv2.GaussianBlur(rng.integers(0, 255, (90, 300, 3)).astype(np.uint8), (0, 0), 2)
     writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (120, 90))
@@ -60,7 +60,7 @@ def test_parts_have_the_same_motion():
     assert sharpest([1.0], [0.0], 4) == [0]
 
 
-def test_frames_are_not_taken_twice(video, tmp_path):
+def test_existing_frames_are_not_extracted_again(video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=4, long_side=48)
     files = sorted((tmp_path / "frames").glob("*.png"))
     assert read_image(files[0]).shape == (32, 48, 3)
@@ -72,7 +72,7 @@ def test_frames_are_not_taken_twice(video, tmp_path):
 
 
 @pytest.mark.parametrize("chosen", [5, [], [[1], 2], [True], [3, 1]])
-def test_a_damaged_list_of_frames_is_made_again(chosen, video, tmp_path):
+def test_damaged_frame_list_is_rebuilt(chosen, video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=4)
     record = tmp_path / "frames" / ".frames.json"
     before = record.read_text()
@@ -83,7 +83,7 @@ def test_a_damaged_list_of_frames_is_made_again(chosen, video, tmp_path):
     assert (tmp_path / "frames" / "frame_00002.png").is_file()
 
 
-def test_frames_that_the_video_does_not_have_are_told(video, tmp_path):
+def test_missing_frames_of_a_video_are_reported(video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=2)
     record = tmp_path / "frames" / ".frames.json"
     record.write_text(json.dumps({**json.loads(record.read_text()), "chosen": [0, 10**6]}))
@@ -92,7 +92,7 @@ def test_frames_that_the_video_does_not_have_are_told(video, tmp_path):
         write_frames(video, tmp_path / "frames", frames=2)
 
 
-def test_a_frame_that_was_damaged_is_made_again(video, tmp_path):
+def test_damaged_frame_is_extracted_again(video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=2)
     frame = tmp_path / "frames" / "frame_00001.png"
     before = frame.read_bytes()
@@ -126,7 +126,7 @@ def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
     assert image.read_bytes() == kept
 
 
-def test_frames_go_on_where_a_call_was_killed(video, tmp_path, monkeypatch):
+def test_extraction_resumes_after_a_kill(video, tmp_path, monkeypatch):
     write_frames(video, tmp_path / "whole", frames=6)
     written: list[str] = []
     write, looked = video_tool.write_image, video_tool._measured
@@ -156,7 +156,7 @@ def test_not_a_video(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_picture_is_no_video(tmp_path):
+def test_image_is_refused_as_a_video(tmp_path):
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((60, 80, 3), np.uint8))
     text = refusal(write_frames, tmp_path / "a.jpg", tmp_path / "out")
     assert text.startswith(f"{tmp_path / 'a.jpg'}: has only one frame")

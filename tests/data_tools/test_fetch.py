@@ -93,7 +93,7 @@ def test_fetched(web, tmp_path):
 
 
 @pytest.mark.parametrize("ranges", [True, False])
-def test_a_broken_download_goes_on(web, tmp_path, ranges):
+def test_broken_download_resumes(web, tmp_path, ranges):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
     server.breaks, server.ranges = 3, ranges
@@ -102,7 +102,7 @@ def test_a_broken_download_goes_on(web, tmp_path, ranges):
     assert server.asked == ["", "bytes=1000-", "bytes=2000-", "bytes=3000-"] if ranges else ["", *["bytes=1000-"] * 3]
 
 
-def test_a_download_that_breaks_for_good_is_kept(web, tmp_path):
+def test_partial_download_is_kept_after_retries(web, tmp_path):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
     server.breaks = 5
@@ -123,7 +123,7 @@ def test_a_wrong_checksum(web, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../evil.txt", "/evil.txt", "C:\\evil.txt", "a/../../evil.txt"])
-def test_archives_that_reach_out_of_their_folder(web, tmp_path, name):
+def test_archive_members_outside_the_folder_are_refused(web, tmp_path, name):
     folder, address, _ = web
     archive(folder / "d.zip", ("scene/a.txt", name))
     assert "outside of its folder" in refusal(quietly, WebArchive(f"{address}/d.zip", ""), tmp_path / "d")
@@ -144,7 +144,7 @@ def test_tar_links_are_left_out(web, tmp_path):
     assert [path.name for path in (tmp_path / "d" / "scene").iterdir()] == ["a.txt"]
 
 
-def test_what_cannot_be_fetched(web, tmp_path):
+def test_unfetchable_data_is_refused(web, tmp_path):
     folder, address, _ = web
     (folder / "page.html").write_text("hello")
     assert "the server sent 404" in refusal(quietly, WebArchive(f"{address}/none.zip", ""), tmp_path / "d")

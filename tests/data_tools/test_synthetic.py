@@ -73,7 +73,7 @@ def test_cylinder_has_a_side_and_caps() -> None:
     np.testing.assert_allclose(can.normal(hits).T, [[1, 0, 0], [0, 0, 1]], atol=1e-12)
 
 
-def test_a_tilted_cylinder_lies_along_minus_y() -> None:
+def test_tilted_cylinder_points_along_minus_y() -> None:
     rod = Cylinder(center=(0, 0, 0), radius=0.1, half=1, paint=plain, tilt=90)
     np.testing.assert_allclose(rod.intersect(column(0, -3, 0), column(0, 1, 0)), 2, rtol=1e-12)
 
@@ -115,7 +115,7 @@ def test_alpha_is_the_silhouette(dataset: Path) -> None:
         assert (image[alpha == 0] == 0).all()
 
 
-def test_test_cameras_stand_between_the_training_cameras() -> None:
+def test_test_cameras_are_between_training_cameras() -> None:
     for options in (TINY, SyntheticOptions()):
         train, test = (np.array(poses)[:, :3, 2] for poses in options.poses().values())
         assert np.degrees(np.arccos((test @ train.T).max())) > 4
@@ -153,7 +153,7 @@ def test_same_arguments_same_bytes(dataset: Path, tmp_path: Path) -> None:
         assert (dataset / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
-def test_a_finished_data_set_is_kept(dataset: Path) -> None:
+def test_finished_data_set_is_not_rebuilt(dataset: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
     assert "already complete" in write_dataset(dataset, TINY)
     assert before == {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
@@ -161,7 +161,7 @@ def test_a_finished_data_set_is_kept(dataset: Path) -> None:
         write_dataset(dataset, SyntheticOptions(size=24, train=4, test=2, seed=1))
 
 
-def test_other_folders_are_refused_and_not_touched(
+def test_foreign_folders_are_refused_and_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine").mkdir()
@@ -174,7 +174,7 @@ def test_other_folders_are_refused_and_not_touched(
     assert [p.name for p in tmp_path.rglob("*")] == ["mine", "note.txt"]
 
 
-def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError("No space left on device")
 

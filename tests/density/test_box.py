@@ -14,7 +14,7 @@ from tests.support.runs import digest, train
 EASY = "densify.rules=[{type: clone, gradient_above: 1.0e-5, size_below: 10}]"
 
 
-def test_a_box_holds_its_lower_faces_and_not_its_upper_ones():
+def test_box_includes_its_lower_faces_only():
     box = Box(low=[0, None, None], high=[1, None, 2])
     points = np.array([[0, 9, 0], [1, 0, 0], [-1e-9, 0, 0], [0.5, -9, 2], [0.5, np.nan, 0], [0.5, np.inf, -np.inf]])
     assert box.holds(points).tolist() == [True, False, False, False, False, True]
@@ -22,7 +22,7 @@ def test_a_box_holds_its_lower_faces_and_not_its_upper_ones():
 
 
 @pytest.mark.parametrize("high", [0.0, -1.0])
-def test_a_box_without_room_is_refused(high):
+def test_empty_box_is_refused(high):
     with pytest.raises(ValidationError, match=r"expected 'low' below 'high' on each axis, got 0 and -?\d for y"):
         Box(low=[None, 0.0, None], high=[None, high, None])
 
@@ -56,7 +56,7 @@ def test_only_gaussians_inside_grow(tiny_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_crop_leaves_what_lies_inside_as_it_is(tiny_scene, tmp_path):
+def test_crop_leaves_gaussians_inside_unchanged(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "whole", "optimize.steps=2")
     half = {"inside": {"low": [0.1, None, None]}}
     stages = [{"init": {"source": "model", "file": str(run.out)}}, {"crop": half}, {"export": {}}]
@@ -70,7 +70,7 @@ def test_a_crop_leaves_what_lies_inside_as_it_is(tiny_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_part_of_a_scene_trains_as_the_whole_with_its_extent(tiny_scene, tmp_path):
+def test_part_trains_with_the_extent_of_the_scene(tiny_scene, tmp_path):
     extent = read_scene(tiny_scene).extent
     plain = train(tiny_scene, tmp_path / "plain", "optimize.steps=3")
     given = train(tiny_scene, tmp_path / "given", "optimize.steps=3", f"scene.extent={extent!r}")

@@ -19,7 +19,7 @@ def weights(rasterizer, model, photographs):
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)])
-def test_weights_are_those_of_the_reference(device, rng, count, width, height):
+def test_weights_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     found = weights(Rasterizer(device, "radix"), case.model(device), [photograph_of(device, case)])
     assert found.shape == (count,)
@@ -67,7 +67,7 @@ def test_schedules_agree(device, rng):
 
 
 @on_devices("name", ["means", "logit_opacity"])
-def test_nan_gaussian_contributes_nothing_and_hides_nothing(device, rng, name):
+def test_nan_gaussian_is_invisible_and_occludes_nothing(device, rng, name):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     without = {key: table.copy() for key, table in case.parameters.items()}
     case.parameters[name][3] = np.nan

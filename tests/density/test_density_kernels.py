@@ -86,7 +86,7 @@ def test_adaptive_density_control(device, rng, count, step):
 
 
 @on_devices("count, children", each_once([0, 1, 63, 64, 65, 300], [2, 3, 8]))
-def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count, children):
+def test_shared_opacity_preserves_transmittance(device, rng, count, children):
     case = random_case(rng, count)
     logits = np.resize([-30.0, -5.0, 0.0, 2.0, 9.0, 40.0, 90.0], (count, 1)) + rng.normal(0, 0.1, (count, 1))
     case.parameters["logit_opacity"][:] = logits
@@ -104,7 +104,7 @@ def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count,
 
 
 @on_one_setting
-def test_growth_that_is_undone_shares_nothing(device, rng):
+def test_undone_growth_keeps_the_opacities(device, rng):
     before, gaussians, change = edited(device, rng, 64, 600, rules=[Clone(opacity="shared")])
     assert change.after > 64
     before, gaussians, change = edited(device, rng, 64, 600, rules=[Clone(opacity="shared")], limit=64)
@@ -146,7 +146,7 @@ def test_random_numbers_depend_on_seed_and_step_alone(device, rng):
 
 
 @on_one_setting
-def test_everything_may_be_pruned(device, rng):
+def test_all_gaussians_may_be_pruned(device, rng):
     _, gaussians, change = edited(device, rng, 30, 600, rules=[PruneFaint(opacity_below=1.0)])
     assert change.after == 0
     assert gaussians.get("means").shape == (0, 3)
@@ -201,7 +201,7 @@ def test_opacity_is_capped_after_the_world_filter(device, rng):
 
 
 @on_devices("value", [np.nan, np.inf, -np.inf])
-def test_values_that_are_not_finite_are_found(device, rng, value):
+def test_nonfinite_values_are_detected(device, rng, value):
     case = random_case(rng, 65)
     assert case.model(device).gaussians.not_finite() == []
     case.parameters["quats"][64, 2] = value

@@ -22,7 +22,7 @@ def edit_of(gaussians, survey=None) -> Edit:
 
 
 @on_devices("unit", [1.0, 1e-3, 1e3])
-def test_far_is_by_the_size_of_the_scene(device, rng, unit):
+def test_far_is_relative_to_the_scene_size(device, rng, unit):
     """Of distances 1 around a middle that is not the origin, with two that are farther."""
     case = random_case(rng, 43)
     directions = rng.normal(size=(20, 3))
@@ -37,14 +37,14 @@ def test_far_is_by_the_size_of_the_scene(device, rng, unit):
 
 
 @on_one_setting
-def test_no_gaussians_have_no_middle(device, rng):
+def test_empty_model_has_no_center(device, rng):
     edit = edit_of(random_case(rng, 0).model(device).gaussians)
     PruneFar().mark(edit)
     assert edit.rows().tolist() == []
 
 
 @on_devices("count, width, height", [(0, 16, 16), (17, 33, 31), (40, 24, 24)])
-def test_sizes_are_those_where_a_photograph_shows_it(device, rng, count, width, height):
+def test_screen_sizes_count_only_views_that_show_the_gaussian(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
     mask = rng.random((height, width)) < 0.2
     held = [photograph_of(device, case, mask), photograph_of(device, case, ~mask & (rng.random(mask.shape) < 0.3))]

@@ -38,7 +38,7 @@ def edit_of(gaussians: Gaussians, step: int = 600, seed: int = 3) -> Edit:
 
 
 @on_devices("count, name", each_once(ROWS, ["means", "logit_opacity", "sh_rest"]))
-def test_rows_are_set_and_the_others_stay(device, rng, count, name):
+def test_setting_rows_leaves_other_rows(device, rng, count, name):
     gaussians = gaussians_of(device, rng)
     rows = rng.permutation(COUNT)[:count]
     values = rng.normal(size=(count, gaussians.tables[name].components))
@@ -104,7 +104,7 @@ WRONG_CHOICES = {
 
 
 @on_devices("case", WRONG_CHOICES)
-def test_a_wrong_choice_is_refused(device, rng, case):
+def test_invalid_selection_is_refused(device, rng, case):
     arguments, message = WRONG_CHOICES[case]
     edit = edit_of(gaussians_of(device, rng))
     with pytest.raises(ValueError, match=message):
@@ -114,7 +114,7 @@ def test_a_wrong_choice_is_refused(device, rng, case):
 
 @on_one_setting
 @pytest.mark.parametrize("numbers", [{"copies": -1, "kept": 0}, {"copies": 2, "kept": -1}])
-def test_a_mark_with_negative_numbers_is_refused(device, rng, numbers):
+def test_negative_row_counts_are_refused(device, rng, numbers):
     edit = edit_of(gaussians_of(device, rng))
     with pytest.raises(ValueError, match="expected a number of rows, 0 or more, got -1"):
         edit.mark(**numbers)
@@ -134,7 +134,7 @@ def test_edit_with_more_rows_than_32_bits_changes_nothing(device, rng):
 
 
 @on_devices("count", ROWS)
-def test_moments_of_rows_become_zero_and_the_others_stay(device, rng, count):
+def test_zeroing_moments_leaves_other_rows(device, rng, count):
     gaussians = gaussians_of(device, rng)
     rows = rng.permutation(COUNT)[:count]
     before = {table: gaussians[table].get() for table in gaussians.tables}
@@ -154,7 +154,7 @@ def test_moments_without_an_optimizer_need_no_zeroing(device, rng):
 
 
 @on_devices("count, kept", each_once([1, 15, 16, 17, 63, 64, 65, 150], [0, 1, 3]))
-def test_each_chosen_gaussian_has_its_own_number_of_rows(device, rng, count, kept):
+def test_each_selected_gaussian_gets_its_row_count(device, rng, count, kept):
     """`kept` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
     edit = edit_of(gaussians_of(device, rng, count))
     expected = {"copies": np.ones(count), "kept": np.ones(count), "shrink": np.ones(count)}
@@ -181,7 +181,7 @@ class Multiply(Rule):
 
 
 @on_devices("kept", [1, 2])
-def test_kept_rows_keep_moments_and_fresh_ones_start_at_zero(device, rng, kept):
+def test_old_rows_keep_moments_and_new_rows_start_at_zero(device, rng, kept):
     gaussians = gaussians_of(device, rng, 65)
     copies = rng.integers(0, 5, 65)
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -251,7 +251,7 @@ def test_random_numbers_of_an_edit_depend_on_seed_step_and_rule(device, rng):
 
 
 @on_one_setting
-def test_a_rule_draws_the_same_whichever_rules_acted_before(device, rng):
+def test_random_numbers_do_not_depend_on_earlier_rules(device, rng):
     """Its place in the list counts, not what came of the others."""
     seen = []
 

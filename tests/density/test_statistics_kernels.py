@@ -106,7 +106,7 @@ def test_columns(device, rng, names):
 
 
 @on_one_setting
-def test_columns_come_and_go_and_keep_their_sums(device, rng):
+def test_added_and_removed_columns_keep_their_sums(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     stats = SplatStats(gaussians, ["screen_grad"])
     gaussians["stats/screen_grad"].fill(3)
@@ -157,7 +157,7 @@ def test_absgs_splits_where_gradients_cancel(device):
 
 
 @on_one_setting
-def test_as_many_as_takes_the_matching_quantile(device):
+def test_as_many_as_selects_the_matching_quantile(device):
     """Two of eight reach the ordinary threshold, so the two or so largest absolute gradients qualify as well."""
     grad = [9e-4, 5e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]
     absolute = [1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3, 7e-3, 8e-3]
@@ -170,7 +170,7 @@ def test_as_many_as_takes_the_matching_quantile(device):
 
 
 @on_one_setting
-def test_as_many_as_never_takes_those_without_any(device):
+def test_as_many_as_never_selects_zero_gradients(device):
     """If so many qualify that the quantile is zero, a Gaussian without gradient still does not."""
     grad, absolute = [9e-4, 9e-4, 9e-4, 0.0], [0.0, 0.0, 0.0, 1e-3]
     matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)

@@ -53,7 +53,7 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
 
 
 @on_devices("count, width, height", SIZES)
-def test_squares_are_those_of_the_reference(device, rng, count, width, height):
+def test_squares_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
     views = RenderedView.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
@@ -63,7 +63,7 @@ def test_squares_are_those_of_the_reference(device, rng, count, width, height):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * expected.max(initial=0))
 
 
-def test_squares_are_those_of_finite_differences(rng):
+def test_squares_match_finite_differences(rng):
     """The image by the opacity, dI/do = G dI/dalpha, from two images of the reference; dI/dG = o dI/dalpha."""
 
     def opaque(parameters: dict) -> None:
@@ -119,7 +119,7 @@ def test_schedules_agree(device, rng):
 
 
 @on_devices("name", ["means", "logit_opacity"])
-def test_a_gaussian_that_is_not_a_number_or_not_seen_has_none(device, rng, name):
+def test_nan_or_invisible_gaussian_has_no_square(device, rng, name):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     case.parameters["means"][5] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
     case.parameters[name][3] = np.nan
@@ -131,7 +131,7 @@ def test_a_gaussian_that_is_not_a_number_or_not_seen_has_none(device, rng, name)
 
 
 @on_devices("masked", [False, True])
-def test_errors_and_losses_are_those_of_the_pixels_that_count(device, rng, masked):
+def test_errors_and_losses_use_counted_pixels_only(device, rng, masked):
     case = random_case(rng, 30, 33, 17)
     mask = rng.random((17, 33)) < 0.7 if masked else None
     look = look_at(device, case, rng, mask)
@@ -162,7 +162,7 @@ def test_views_are_drawn_by_seed_and_step():
     assert counts.max() < 260
 
 
-def test_rules_share_what_they_ask_for():
+def test_rules_share_cached_results():
     survey, asked = Survey(None, None, None, [], 0, 0), []
 
     def found(given: Survey, number: int) -> int:

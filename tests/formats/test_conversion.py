@@ -34,7 +34,7 @@ def source(tmp_path, rng):
 
 
 @pytest.mark.parametrize("name", ["b.spz", "b.sog", "b.glb", "b.splat", "b.usda", "f/meta.json"])
-def test_a_model_is_written_as_its_name_says(name, source, tmp_path):
+def test_file_suffix_selects_the_format(name, source, tmp_path):
     done = clsplat.convert(source, tmp_path / name)
     assert done["gaussians"] == 100
     assert done["bytes"] > 0
@@ -44,7 +44,7 @@ def test_a_model_is_written_as_its_name_says(name, source, tmp_path):
         assert detect(tmp_path / name).name == done["format"]
 
 
-def test_a_file_that_no_run_has_written_is_replaced(few_steps, tmp_path):
+def test_only_files_of_no_run_are_replaced(few_steps, tmp_path):
     run = shutil.copytree(few_steps, tmp_path / "run")
     (tmp_path / "pipeline.yaml").write_text("of a project")
     for place in (run / "web.spz", tmp_path / "out" / "web.spz"):
@@ -56,7 +56,7 @@ def test_a_file_that_no_run_has_written_is_replaced(few_steps, tmp_path):
             check_not_run_file(run / name)
 
 
-def test_no_file_of_a_run_is_replaced(source, tmp_path):
+def test_convert_replaces_no_file_of_a_run(source, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     (run / "status.json").write_text("{}")
@@ -67,7 +67,7 @@ def test_no_file_of_a_run_is_replaced(source, tmp_path):
     assert clsplat.convert(source, run / "new.spz")["gaussians"] == 100
 
 
-def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng):
+def test_merged_model_has_the_highest_sh_degree(source, tmp_path, rng):
     write(tmp_path / "b.glb", splats(rng, 30, 1))
     done = clsplat.convert([source, tmp_path / "b.glb"], tmp_path / "c.ply")
     found = load(tmp_path / "c.ply")
@@ -76,7 +76,7 @@ def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng
     np.testing.assert_array_equal(found.means[:100], load(source).means)
 
 
-def test_every_number_of_a_merged_model_that_is_not_kept_is_said(tmp_path, rng, caplog):
+def test_merging_reports_each_dropped_setting(tmp_path, rng, caplog):
     said = [{"near": 0.2}, {"near": 5.0, "background": "white", "screen_variance": 0.1, "alpha": "mask"}, {"near": 0.2}]
     for name, numbers in zip("abc", said, strict=True):
         write(tmp_path / f"{name}.ply", replace(splats(rng, 10), rendering=numbers))
@@ -104,7 +104,7 @@ EXTREME = {
 
 @pytest.mark.parametrize("name", EXTREME)
 @pytest.mark.filterwarnings("error")
-def test_extreme_values_raise_no_warnings_of_numpy(name, tmp_path, rng):
+def test_extreme_values_raise_no_numpy_warnings(name, tmp_path, rng):
     one = splats(rng, 40, 1)
     for table, value in EXTREME[name].items():
         if table == "filter_variance":
@@ -127,7 +127,7 @@ def test_extreme_values_raise_no_warnings_of_numpy(name, tmp_path, rng):
 
 @pytest.mark.parametrize("text", ["scale=1e39", "scale=1e-200", "translate=0,1e300,0 rotate=0,20,1"])
 @pytest.mark.filterwarnings("error")
-def test_a_transform_too_far_is_named_as_such(text, source, tmp_path):
+def test_too_large_transform_is_named(text, source, tmp_path):
     with pytest.raises(ConfigError, match=rf"--transform '{text}': expected a scale from 1e-15 to 1e\+15"):
         clsplat.convert(source, tmp_path / "b.ply", transform=text)
     far = load(source)
@@ -146,13 +146,13 @@ def test_faint_opacities_keep_their_digits():
     np.testing.assert_allclose(opacities(logit), expected, atol=1e-16)
 
 
-def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
+def test_mip_model_is_not_merged_with_a_plain_one(source, tmp_path, rng):
     write(tmp_path / "b.ply", splats(rng, 30, 1, "mip"))
     with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is a plain model; merge only"):
         clsplat.convert([source, tmp_path / "b.ply"], tmp_path / "c.ply")
 
 
-def test_a_transform_turns_harmonics_as_directions_say(source, tmp_path, rng):
+def test_transform_rotates_harmonics_with_directions(source, tmp_path, rng):
     """The color toward a turned direction is that of the source toward the direction."""
     text = "rotate=20,-50,130 scale=3 translate=1,2,3"
     clsplat.convert(source, tmp_path / "b.ply", transform=text)
@@ -167,7 +167,7 @@ def test_a_transform_turns_harmonics_as_directions_say(source, tmp_path, rng):
     np.testing.assert_allclose(after.log_scales, before.log_scales + np.log(3), atol=1e-5)
 
 
-def test_a_transform_is_words_from_left_to_right_or_a_matrix():
+def test_transform_is_a_matrix_or_steps_from_left_to_right():
     words = parse_transform("translate=1,0,0 rotate=0,0,90 scale=2")
     np.testing.assert_allclose(words @ [0, 0, 0, 1], [0, 2, 0, 1], atol=1e-12)
     rows = ",".join(str(value) for value in words.ravel())
@@ -185,7 +185,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("option", "text"), [(option, text) for option, (texts, _) in WRONG.items() for text in texts])
-def test_a_wrong_option_is_refused_before_anything_is_written(option, text, source, tmp_path):
+def test_invalid_option_is_refused_before_writing(option, text, source, tmp_path):
     with pytest.raises(ConfigError, match=WRONG[option][1] or "--transform .*expected"):
         clsplat.convert(source, tmp_path / "b.spz", **{option: text})
     assert not (tmp_path / "b.spz").exists()
@@ -211,7 +211,7 @@ def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_
     assert not (tmp_path / name).exists()
 
 
-def test_no_input_is_written_over(source, tmp_path, rng):
+def test_inputs_are_not_overwritten(source, tmp_path, rng):
     write(tmp_path / "b.ply", splats(rng, 30))
     (tmp_path / "link.ply").symlink_to(source)
     clsplat.convert(source, tmp_path / "f" / "meta.json", sh_degree=0)
@@ -230,7 +230,7 @@ def test_no_input_is_written_over(source, tmp_path, rng):
     assert (tmp_path / "link.ply").is_symlink()
 
 
-def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
+def test_crop_and_min_opacity_filter_gaussians(source, tmp_path):
     model = load(source)
     box = (-1.0, -1.0, -1.0, 1.0, 2.0, 3.0)
     clsplat.convert(source, tmp_path / "b.ply", crop=box, drop_below=0.3, sh_degree=1)
@@ -243,7 +243,7 @@ def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
         clsplat.convert(source, tmp_path / "c.ply", crop="50,50,50,51,51,51")
 
 
-def test_an_spz_with_the_axes_of_ply_is_turned(source, tmp_path):
+def test_spz_with_ply_axes_is_rotated(source, tmp_path):
     upside_down = {"transform": "rotate=180,0,0", "quality": "high"}
     clsplat.convert(source, tmp_path / "ply_axes.spz", **upside_down)
     expected, found = load(source), load(tmp_path / "ply_axes.spz")
@@ -255,7 +255,7 @@ def test_an_spz_with_the_axes_of_ply_is_turned(source, tmp_path):
             np.testing.assert_allclose(right[name], table, atol=1e-5, err_msg=name)
 
 
-def test_gaussians_that_are_not_finite_are_dropped(tmp_path, rng, caplog):
+def test_nonfinite_gaussians_are_dropped(tmp_path, rng, caplog):
     bad = splats(rng, 20)
     bad.parameters["means"][3, 1], bad.parameters["sh_rest"][7, 0] = np.nan, np.inf
     write_ply(tmp_path / "a.ply", bad.parameters, {})
@@ -268,7 +268,7 @@ def test_gaussians_that_are_not_finite_are_dropped(tmp_path, rng, caplog):
 
 
 @pytest.mark.parametrize(("table", "value"), [("log_scales", 3e38), ("sh_base", -3e38), ("sh_rest", 1e16)])
-def test_gaussians_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_path, rng, caplog):
+def test_values_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_path, rng, caplog):
     large = splats(rng, 20, 1)
     large.parameters[table][3:5, 1] = value
     write_ply(tmp_path / "a.ply", large.parameters, {})
@@ -286,7 +286,7 @@ def test_gaussians_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_
     assert len(load(tmp_path / "b.sog")) == 18
 
 
-def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, caplog):
+def test_nonfinite_tables_are_not_reported_as_too_large(tmp_path, rng, caplog):
     large = splats(rng, 1200)
     large.parameters["sh_base"][:1100, 1] = 1e20
     large.parameters["log_scales"][7] = np.inf
@@ -296,14 +296,14 @@ def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, capl
 
 
 @pytest.mark.parametrize("name", ["b.ply", "b.sog", "b.glb"])
-def test_a_number_that_no_reader_takes_is_not_written(name, source, tmp_path):
+def test_unreadable_setting_is_not_written(name, source, tmp_path):
     with pytest.raises(DataError, match=r"says near = .*; expected a number from 0 to 1e\+15"):
         write(tmp_path / name, replace(read(source), rendering={"near": 2e16}))
     assert not (tmp_path / name).exists()
 
 
 @pytest.mark.parametrize("number", ["NaN", "1e999"])
-def test_a_comment_of_numbers_that_are_not_finite_is_refused(number, source, tmp_path):
+def test_nonfinite_settings_in_a_comment_are_refused(number, source, tmp_path):
     write(tmp_path / "a.ply", replace(read(source), rendering={"note": 5}))
     (tmp_path / "a.ply").write_bytes(
         (tmp_path / "a.ply").read_bytes().replace(b'{"note": 5}', f'{{"note": {number}}}'.encode())
@@ -312,7 +312,7 @@ def test_a_comment_of_numbers_that_are_not_finite_is_refused(number, source, tmp
         clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb")
 
 
-def test_sizes_are_figures_for_people(tmp_path, rng):
+def test_sizes_are_human_readable(tmp_path, rng):
     same = splats(rng, 300).rows(np.zeros(300, int))
     write(tmp_path / "a.spz", same)
     done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])
@@ -320,7 +320,7 @@ def test_sizes_are_figures_for_people(tmp_path, rng):
     assert re.search(r" MB, \d{1,3},\d{3}\.\d % of what was read", done.output), done.output
 
 
-def test_a_run_folder_stands_for_its_model(source, tmp_path):
+def test_run_folder_is_read_as_its_model(source, tmp_path):
     (tmp_path / "point_cloud.ply").write_bytes(source.read_bytes())
     (tmp_path / "log.txt").write_bytes(bytes(5000))
     assert clsplat.convert(tmp_path, tmp_path / "b.spz")["bytes_read"] == source.stat().st_size
@@ -328,7 +328,7 @@ def test_a_run_folder_stands_for_its_model(source, tmp_path):
         clsplat.convert(tmp_path, tmp_path / "point_cloud.ply")
 
 
-def test_check_tells_what_a_model_is(source, tmp_path):
+def test_check_describes_a_model(source, tmp_path):
     clsplat.convert(source, tmp_path / "b.spz")
     found = clsplat.check(tmp_path / "b.spz")
     assert (found["format"], found["gaussians"], found["sh_degree"], found["mode"]) == ("SPZ", 100, 3, "default")
@@ -340,13 +340,13 @@ def test_check_tells_what_a_model_is(source, tmp_path):
     json.dumps(found, allow_nan=False)
 
 
-def test_missing_model_cannot_be_read_and_a_pipeline_is_none(tmp_path):
+def test_missing_model_and_pipeline_file_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"a\.spz: cannot be read \(No such file or directory\)"):
         clsplat.check(tmp_path / "a.spz")
     assert "stages" in clsplat.check("smoke")
 
 
-def test_the_size_of_a_model_is_that_of_its_own_files(few_steps, source, tmp_path):
+def test_model_size_counts_only_its_files(few_steps, source, tmp_path):
     size = (few_steps / "point_cloud.ply").stat().st_size
     folder = tmp_path / "f" / "meta.json"
     assert clsplat.convert(few_steps, tmp_path / "b.ply")["bytes_read"] == size
@@ -358,14 +358,14 @@ def test_the_size_of_a_model_is_that_of_its_own_files(few_steps, source, tmp_pat
         assert clsplat.convert(place, tmp_path / "b.ply")["bytes_read"] == written == model_bytes(place)
 
 
-def test_a_name_stands_as_it_is(source, tmp_path):
+def test_file_name_is_printed_unchanged(source, tmp_path):
     write(tmp_path / "not_finite_no_rotation.ply", read(source))
     found = clsplat.check(tmp_path / "not_finite_no_rotation.ply")
     assert lines(found).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
     assert "0 not finite, 0 without rotation, 0 flat, " in lines(found)
 
 
-def test_check_counts_what_shows_nothing(tmp_path, rng):
+def test_check_counts_invisible_gaussians(tmp_path, rng):
     odd = splats(rng, 40)
     p = odd.parameters
     p["logit_opacity"][:] = np.linspace(-3, 3, 40)[:, None]
@@ -389,7 +389,7 @@ def test_check_counts_what_shows_nothing(tmp_path, rng):
         ("sh_base", (0.1, 0.9), "not SH coefficients"),
     ],
 )
-def test_check_sees_activations_that_were_applied_already(table, values, words, tmp_path, rng):
+def test_check_detects_activated_values(table, values, words, tmp_path, rng):
     model = splats(rng, 60)
     assert not [text for text in checked(tmp_path, model)["findings"] if words in text]
     model.parameters[table][:] = rng.uniform(*values, model.parameters[table].shape)
@@ -397,7 +397,7 @@ def test_check_sees_activations_that_were_applied_already(table, values, words, 
 
 
 @pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.usda"])
-def test_a_format_that_knows_no_empty_model_refuses_one(name, tmp_path, rng):
+def test_formats_without_empty_models_refuse_them(name, tmp_path, rng):
     with pytest.raises(DataError, match="the model has no Gaussians; only a PLY can be empty"):
         write(tmp_path / name, splats(rng, 0))
     write(tmp_path / "a.ply", splats(rng, 0))
@@ -448,7 +448,7 @@ def test_a_folder_of_images_is_a_model(source, tmp_path):
     assert len(load(tmp_path / "f")) == 100
 
 
-def test_the_page_about_formats_lists_all_of_them():
+def test_formats_page_lists_every_format():
     page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
     for codec in CODECS:
         row = f"| {codec.name} | {', '.join(f'`{ending}`' for ending in codec.endings)} |"

@@ -27,7 +27,7 @@ def attribute(tree, binary, name):
 
 
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (200, 0), (200, 1), (200, 2)])
-def test_a_glb_comes_back_within_its_digits(tmp_path, rng, count, degree):
+def test_glb_round_trip_is_within_its_precision(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
     found = there_and_back(tmp_path / "a.glb", source)
     assert detect(tmp_path / "a.glb").name == "GLB"
@@ -35,7 +35,7 @@ def test_a_glb_comes_back_within_its_digits(tmp_path, rng, count, degree):
     assert_close(found, source, 1e-3, means=0, log_scales=1e-6, opacity=1e-6, sh_base=0, sh_rest=0)
 
 
-def test_a_glb_is_what_the_specification_says(tmp_path, rng):
+def test_glb_follows_the_specification(tmp_path, rng):
     source = splats(rng, 100, 2)
     write(tmp_path / "a.glb", source)
     tree, binary = parts((tmp_path / "a.glb").read_bytes())
@@ -66,7 +66,7 @@ def test_a_glb_is_what_the_specification_says(tmp_path, rng):
     assert all(view["byteOffset"] % 4 == 0 for view in tree["bufferViews"])
 
 
-def test_a_glb_of_another_program_is_the_source():
+def test_glb_of_another_program_equals_its_source():
     """splat-transform turns a model by half about z, where the axes of glTF ask for half about x."""
     source, found = load(interop("train1000.ply")), load(interop("train1000.glb"))
     half = source.transformed(rotation=np.diag([-1.0, 1, -1]))
@@ -102,14 +102,14 @@ def test_moved_turned_and_scaled_node_moves_its_gaussians(tmp_path, rng):
     np.testing.assert_allclose(np.abs((unit(found.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
 
 
-def test_a_rotation_in_few_digits_is_one(tmp_path, rng):
+def test_low_precision_rotation_is_accepted(tmp_path, rng):
     plain, other = moved(tmp_path, rng, rotation=[0, 0.70710, 0, 0.70710])
     turned = load(plain).transformed(1.0, np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), (0, -1, 0))
     np.testing.assert_allclose(load(other).means, turned.means, atol=2e-6)
 
 
 @pytest.mark.parametrize("rotation", [[0, 0, 0, 0], [0, float("nan"), 0, 1], [0, 1e400, 0, 1]])
-def test_a_rotation_without_a_direction_is_refused(rotation, tmp_path, rng):
+def test_zero_rotation_is_refused(rotation, tmp_path, rng):
     _, other = moved(tmp_path, rng, rotation=rotation)
     with pytest.raises(
         DataError, match=r"b\.glb: the rotation of node 1 .* of length (0|nan|inf); expected .*; export"
@@ -124,7 +124,7 @@ def test_a_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
         load(other)
 
 
-def test_whole_numbers_and_strides_are_read(tmp_path, rng):
+def test_integers_and_strides_are_read(tmp_path, rng):
     write(tmp_path / "a.glb", splats(rng, 5, 0))
     tree, binary = parts((tmp_path / "a.glb").read_bytes())
     rows = np.zeros((5, 8), "<i2")
@@ -196,7 +196,7 @@ def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
         (b'{"a": "\xff"}', "UnicodeDecodeError: "),
     ],
 )
-def test_json_that_cannot_be_read_is_refused(text, words, tmp_path):
+def test_invalid_json_is_refused(text, words, tmp_path):
     text += b" " * (-len(text) % 4)
     chunk = struct.pack("<2I", len(text), 0x4E4F534A) + text
     (tmp_path / "a.glb").write_bytes(struct.pack("<4s2I", b"glTF", 2, 12 + len(chunk)) + chunk)
@@ -205,14 +205,14 @@ def test_json_that_cannot_be_read_is_refused(text, words, tmp_path):
     assert f"a.glb: its JSON is damaged ({words}" in str(caught.value)
 
 
-def test_json_that_is_too_long_is_told_with_the_limit(tmp_path, rng, monkeypatch):
+def test_too_long_json_is_refused_with_the_limit(tmp_path, rng, monkeypatch):
     monkeypatch.setattr("clsplat.formats.gltf_usd.MAX_JSON", 100)
     write(tmp_path / "a.glb", splats(rng, 4, 0))
     with pytest.raises(DataError, match=r"its JSON has \d+ bytes; expected at most 100"):
         read(tmp_path / "a.glb")
 
 
-def test_nodes_without_a_scene_stand_in_their_parents(tmp_path, rng):
+def test_nodes_without_a_scene_use_their_parents(tmp_path, rng):
     _, path = moved(tmp_path, rng, translation=[1, 0, 0])
     tree, binary = parts(path.read_bytes())
     del tree["scenes"], tree["scene"]
@@ -221,7 +221,7 @@ def test_nodes_without_a_scene_stand_in_their_parents(tmp_path, rng):
     np.testing.assert_array_equal(load(path).means, expected)
 
 
-def test_a_cut_glb_is_refused(tmp_path, rng):
+def test_truncated_glb_is_refused(tmp_path, rng):
     write(tmp_path / "a.glb", splats(rng, 4, 0))
     data = (tmp_path / "a.glb").read_bytes()
     for size in (4, 19, 40, len(data) - 1):
@@ -264,7 +264,7 @@ def test_the_same_model_gives_the_same_bytes(name, tmp_path, rng):
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_a_world_filter_is_baked_but_for_a_ply(tmp_path, rng):
+def test_world_filter_is_baked_except_in_ply(tmp_path, rng):
     source = splats(rng, 50, 0).parameters
     model = Model(**source, filter_variance=np.full((50, 1), 0.01, np.float32))
     for name in ("a.ply", "a.glb"):
@@ -277,12 +277,12 @@ def test_a_world_filter_is_baked_but_for_a_ply(tmp_path, rng):
 
 
 @pytest.mark.parametrize(("name", "said"), [("a.splat", True), ("a.usda", True), ("a.spz", False), ("a.sog", False)])
-def test_a_mark_that_is_lost_is_said(name, said, tmp_path, rng, caplog):
+def test_lost_mip_mark_is_reported(name, said, tmp_path, rng, caplog):
     write(tmp_path / name, splats(rng, 5, 0, "mip"))
     assert ("cannot mark a mip model" in caplog.text) is said
 
 
-def test_numbers_of_the_renderer_that_are_lost_are_said(tmp_path, rng, caplog):
+def test_lost_render_settings_are_reported(tmp_path, rng, caplog):
     source = splats(rng, 5, 0, "mip")
     for name in ("a.ply", "a.sog", "a.glb"):
         assert there_and_back(tmp_path / name, source).rendering == source.rendering

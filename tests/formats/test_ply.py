@@ -36,7 +36,7 @@ def test_round_trip(tmp_path, rng, degree, count):
         np.testing.assert_array_equal(file.parameters[name], written[name])
 
 
-def test_layout_is_the_references(tmp_path, rng):
+def test_layout_matches_the_reference(tmp_path, rng):
     """Property by property, as other programs read it."""
     path, p = tmp_path / "model.ply", parameters(rng, 3)
     write_ply(path, p, {})
@@ -53,7 +53,7 @@ def test_layout_is_the_references(tmp_path, rng):
     np.testing.assert_array_equal(values[:, 58:], p["quats"])
 
 
-def test_a_genuine_file_survives_unchanged(tmp_path):
+def test_reference_file_survives_unchanged(tmp_path):
     path = data_set("splats") / "train-1000.ply"
     file = read_ply(path)
     assert len(file.parameters["means"]) == 1000
@@ -88,7 +88,7 @@ def test_reads_any_order_and_types(tmp_path, rng):
         np.testing.assert_array_equal(file.parameters[name], p[name])
 
 
-def test_other_elements_may_surround_the_vertices(tmp_path, rng):
+def test_other_elements_around_the_vertices_are_skipped(tmp_path, rng):
     p, path = parameters(rng, 4, degree=1), tmp_path / "model.ply"
     write_ply(path, p, {"near": 0.2})
     header, body = path.read_bytes().split(b"end_header\n", 1)
@@ -192,7 +192,7 @@ def a_model(count: int, degree: int = 3) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 33])
-def test_rows_are_written_and_read_some_at_a_time(count, tmp_path, monkeypatch):
+def test_rows_are_written_and_read_in_blocks(count, tmp_path, monkeypatch):
     """The same bytes, and the same tables."""
     model = a_model(count)
     whole = ply.write_ply(tmp_path / "whole.ply", model, {})
@@ -205,7 +205,7 @@ def test_rows_are_written_and_read_some_at_a_time(count, tmp_path, monkeypatch):
         assert in_parts[name].dtype == table.dtype
 
 
-def test_a_model_lies_in_memory_once(tmp_path, monkeypatch):
+def test_model_is_in_memory_once(tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "ROWS", 1000)
     model = a_model(40_000, degree=1)
     size = sum(table.nbytes for table in model.values())

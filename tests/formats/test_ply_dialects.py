@@ -28,14 +28,14 @@ def packed():
 
 
 @pytest.mark.parametrize("mark", MARKS)
-def test_the_mark_of_a_mip_model_is_read_in_every_spelling(mark, tmp_path, rng):
+def test_every_spelling_of_the_mip_mark_is_read(mark, tmp_path, rng):
     path = tmp_path / "a.ply"
     write_ply(path, splats(rng, 3).parameters, {})
     path.write_bytes(path.read_bytes().replace(b"comment SplatRenderMode: default", mark.encode()))
     assert read(path).mode == MARKS[mark]
 
 
-def test_a_disc_has_a_third_axis_of_almost_nothing(tmp_path, rng):
+def test_disc_gets_a_tiny_third_axis(tmp_path, rng):
     path, source = tmp_path / "a.ply", splats(rng, 5).parameters
     write_ply(path, source, {})
     header, body = path.read_bytes().split(b"end_header\n", 1)
@@ -61,7 +61,7 @@ def test_the_published_bytes_of_a_compressed_ply(rng):
 
 
 @pytest.mark.parametrize(("name", "rows"), [("train1000", 1000), ("playbot31k", 31_000)])
-def test_a_compressed_ply_of_another_program_is_the_source(name, rows):
+def test_compressed_ply_of_another_program_equals_its_source(name, rows):
     """Its splats are sorted: each is matched with the nearest of the source."""
     source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.compressed.ply"))
     assert len(found) == rows
@@ -84,7 +84,7 @@ def test_a_compressed_ply_without_ranges_of_colors(tmp_path):
     np.testing.assert_allclose(colors[:, 0], levels / 255, atol=1e-6)
 
 
-def test_no_splats_are_a_model_too(tmp_path, rng):
+def test_empty_model_is_read(tmp_path, rng):
     assert len(there_and_back(tmp_path / "a.ply", splats(rng, 0))) == 0
 
 

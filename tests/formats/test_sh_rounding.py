@@ -75,7 +75,7 @@ def test_weights_ignore_scene_size_and_grow_with_opacity_area(rng):
 
 
 @pytest.mark.parametrize("count", [400, 3000])
-def test_sky_of_gaussians_does_not_decide_the_rounding(count, rng, tmp_path):
+def test_sky_gaussians_do_not_decide_the_rounding(count, rng, tmp_path):
     """Of the scene: its weights, and the errors of its positions in files."""
     source, texels = splats(rng, count), rng.uniform(0, 1, (64, 3)).astype(np.float32)
     source.parameters["log_scales"] = rng.uniform(-3.5, -3, (count, 3)).astype(np.float32)
@@ -92,7 +92,7 @@ def test_sky_of_gaussians_does_not_decide_the_rounding(count, rng, tmp_path):
         assert errors[1] < 1.3 * errors[0], name
 
 
-def test_a_model_without_a_sky_counts_all_whatever_its_shape(rng, tmp_path):
+def test_model_without_sky_counts_all_gaussians(rng, tmp_path):
     """Most Gaussians in a small object, the others far around it: no sky, where the file notes none."""
     source = splats(rng, 2300, 0)
     directions, radii = rng.normal(size=(2300, 3)), np.append(rng.uniform(0, 0.1, 2000), rng.uniform(2, 3, 300))
@@ -106,7 +106,7 @@ def test_a_model_without_a_sky_counts_all_whatever_its_shape(rng, tmp_path):
         assert (found[0] != found[1]).any(), name
 
 
-def test_a_sky_is_known_again_in_a_ply_that_is_converted(rng, tmp_path):
+def test_sky_is_recognized_in_a_converted_ply(rng, tmp_path):
     source, texels = splats(rng, 300, 1), rng.uniform(0, 1, (64, 3)).astype(np.float32)
     baked = with_sky_splats(Model(**source.parameters, sky=Sky(texels)), 5000)
     baked.save(tmp_path / "a.ply")
@@ -136,13 +136,13 @@ def test_weights_are_finite_of_any_model(count, rng):
     assert np.isfinite(log_weights(p)).all()
 
 
-def test_steps_are_as_the_roots_of_the_weights(rng):
+def test_steps_are_proportional_to_root_weights(rng):
     found = quantization_steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
     np.testing.assert_array_equal(found, [64, 16, 8, 4, 2, 1, 1])
 
 
 @pytest.mark.parametrize("count", [1, 50])
-def test_rounding_is_that_of_the_reference(count, rng):
+def test_rounding_matches_the_reference(count, rng):
     """The reference solves for what the rest of the coefficients should take up, one coefficient after another."""
     rest = seen_from_one_side(rng, count).parameters["sh_rest"]
     form, step = visible_form(rest), np.exp2(rng.integers(-7, -2, count)).astype(np.float32)
@@ -160,7 +160,7 @@ def test_rounding_is_that_of_the_reference(count, rng):
     assert (np.abs(found - expected) > 1e-6).any(axis=1).mean() < 0.05  # a tie of float32 is none of float64
 
 
-def test_less_shows_of_rounding_than_of_rounding_each_alone(rng):
+def test_joint_rounding_is_less_visible_than_independent(rng):
     rest = seen_from_one_side(rng, 400).parameters["sh_rest"]
     step = np.full(400, 1 / 32, np.float32)
     form = visible_form(rest)
@@ -187,7 +187,7 @@ def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
 
 
 @pytest.mark.parametrize("count", [3, 8, 15])
-def test_the_mean_of_harmonics_follows_from_their_second_moments(count, rng):
+def test_harmonics_mean_follows_from_second_moments(count, rng):
     """Products of one band with itself are even, so that those of band 1 alone tell nothing of its mean."""
     directions = rng.normal((0, 1, 2), size=(50, 3))
     values = basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))[:, :count]
@@ -201,7 +201,7 @@ def test_the_mean_of_harmonics_follows_from_their_second_moments(count, rng):
     assert mean @ np.linalg.solve(moments, mean) < 1.001
 
 
-def test_band_0_takes_up_what_is_the_same_from_all_cameras(rng):
+def test_band_0_absorbs_the_view_independent_part(rng):
     """The least squares of colors over the directions themselves."""
     directions = rng.normal((0, 0, 2), size=(40, 3))
     values = basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
@@ -229,7 +229,7 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     assert np.abs(given - exact)[within].max() <= 1 / 256
 
 
-def test_each_gaussian_of_an_spz_has_the_steps_of_its_own_weight(tmp_path, rng):
+def test_spz_steps_depend_on_each_gaussians_weight(tmp_path, rng):
     source = seen_from_one_side(rng, 500)
     source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
     found = there_and_back(tmp_path / "a.spz", source).parameters
@@ -259,14 +259,14 @@ def test_spz_positions_and_rotations_are_within_their_steps(tmp_path, rng):
     assert np.degrees(2 * np.arccos(np.minimum(cosine, 1))).max() < 0.7
 
 
-def test_the_gzip_of_an_spz_is_one_that_other_programs_read(tmp_path, rng):
+def test_spz_gzip_is_readable_by_other_programs(tmp_path, rng):
     for degree in (0, 3):
         write(tmp_path / "a.spz", splats(rng, 200, degree))
         assert len(gzip.decompress((tmp_path / "a.spz").read_bytes())) == 16 + 200 * (20 + 3 * ((degree + 1) ** 2 - 1))
 
 
 @pytest.mark.parametrize(("count", "entries"), [(1, 1), (40, 40), (700, 30), (1500, 300)])
-def test_a_palette_for_neighbors_has_the_means_of_its_parts(count, entries, rng):
+def test_neighbor_palette_holds_the_means_of_its_clusters(count, entries, rng):
     rest = seen_from_one_side(rng, count).parameters["sh_rest"]
     weights = rng.normal(size=count)
     vectors, labels = tree_palette(rest, weights, entries, 1.0)
@@ -281,7 +281,7 @@ def test_a_palette_for_neighbors_has_the_means_of_its_parts(count, entries, rng)
         np.testing.assert_array_equal(tree_palette(rest, weights, entries, 1.0)[1], labels)
 
 
-def test_palette_for_neighbors_favors_heavier_gaussians(rng):
+def test_neighbor_palette_favors_heavier_gaussians(rng):
     rest = seen_from_one_side(rng, 2000).parameters["sh_rest"]
     weights = np.where(np.arange(2000) % 4 == 0, 3.0, -3.0)
     vectors, labels = tree_palette(rest, weights, 400, 2.0)
@@ -293,7 +293,7 @@ def test_palette_for_neighbors_favors_heavier_gaussians(rng):
     assert not labels.any()
 
 
-def test_a_palette_that_the_model_had_before_is_shared_by_all(rng):
+def test_existing_palette_is_recovered(rng):
     few = seen_from_one_side(rng, 300).parameters["sh_rest"]
     rest = few[rng.integers(0, 300, 2000)]
     vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
@@ -308,7 +308,7 @@ def test_small_harmonics_have_smaller_steps(rng):
     np.testing.assert_allclose(usual_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sog_quantize.USUAL, rtol=0.05)
 
 
-def test_sog_has_the_models_shape_and_converts_again_losslessly(tmp_path, rng):
+def test_sog_keeps_the_shape_and_converts_again_losslessly(tmp_path, rng):
     source = seen_from_one_side(rng, 1500)
     found = there_and_back(tmp_path / "a.sog", source)
     order = morton_order(source.parameters["means"])

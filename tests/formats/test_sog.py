@@ -36,7 +36,7 @@ def test_the_published_bytes_of_a_sog():
     np.testing.assert_allclose(found["sh_rest"][::3][:4], (0.014241, 0.016862, -0.073519, -0.052921), atol=1e-6)
 
 
-def test_a_sog_of_another_program_is_the_source():
+def test_sog_of_another_program_equals_its_source():
     source, found = read(interop("playbot31k.ply")), read(interop("playbot31k.sog"))
     kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
     np.testing.assert_allclose(kept[0], kept[1], atol=1e-4)
@@ -50,7 +50,7 @@ def test_version_1_is_read():
 
 
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 0), (300, 1), (1100, 2)])
-def test_a_sog_comes_back_within_its_steps(tmp_path, rng, count, degree):
+def test_sog_round_trip_is_within_its_steps(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
     found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
@@ -58,7 +58,7 @@ def test_a_sog_comes_back_within_its_steps(tmp_path, rng, count, degree):
     assert_close(found, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
 
 
-def test_a_palette_of_as_many_entries_as_differ_is_exact(tmp_path, rng):
+def test_palette_with_an_entry_per_distinct_vector_is_exact(tmp_path, rng):
     """Eight different colors in a thousand Gaussians."""
     source = splats(rng, 1024)
     source.parameters["sh_rest"][:] = source.parameters["sh_rest"][rng.integers(0, 8, 1024)].round(1)
@@ -67,7 +67,7 @@ def test_a_palette_of_as_many_entries_as_differ_is_exact(tmp_path, rng):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_a_folder_holds_what_the_bundle_holds(tmp_path, rng):
+def test_folder_and_bundle_have_the_same_content(tmp_path, rng):
     source = splats(rng, 200, 1)
     bundled = there_and_back(tmp_path / "a.sog", source)
     write(tmp_path / "folder" / "meta.json", source)
@@ -80,7 +80,7 @@ def test_a_folder_holds_what_the_bundle_holds(tmp_path, rng):
 
 
 @pytest.mark.parametrize("at", [1, 2, 9, 16, 17, 18])
-def test_a_folder_holds_its_old_model_until_the_new_one_is_whole(at, tmp_path, rng, monkeypatch):
+def test_folder_keeps_its_old_model_until_the_new_is_complete(at, tmp_path, rng, monkeypatch):
     """The n-th sync or rename of a write fails: images of one model never stand under the meta.json of another."""
     place, calls = tmp_path / "meta.json", []
     old, new = (splats(rng, 30, 0) for _ in range(2))
@@ -113,7 +113,7 @@ def test_a_folder_holds_its_old_model_until_the_new_one_is_whole(at, tmp_path, r
     assert not np.array_equal(read(place).parameters["means"], before)
 
 
-def test_images_of_another_program_go_with_their_meta(tmp_path, rng):
+def test_replacing_meta_removes_only_its_own_images(tmp_path, rng):
     """But no other file that a meta.json names, and none outside of the folder."""
     folder, other = folder_of(tmp_path, rng, means__files=["letter.txt", "../other.webp"]), tmp_path / "other.webp"
     for file in (folder / "letter.txt", other):
@@ -124,7 +124,7 @@ def test_images_of_another_program_go_with_their_meta(tmp_path, rng):
     assert (folder / "letter.txt").read_bytes() == other.read_bytes() == b"mine"
 
 
-def test_a_larger_palette_is_nearer(tmp_path, rng):
+def test_larger_palette_is_more_accurate(tmp_path, rng):
     source = splats(rng, 2050, 1)
     errors = []
     for quality in ("small", "balanced"):
@@ -134,7 +134,7 @@ def test_a_larger_palette_is_nearer(tmp_path, rng):
     assert errors[1] < errors[0] < 0.1**2
 
 
-def test_a_codebook_is_better_than_equal_steps(rng):
+def test_codebook_is_more_accurate_than_equal_steps(rng):
     values = rng.normal(size=20_000) ** 3
     entries = codebook(values)
     assert len(entries) == ENTRIES
@@ -147,7 +147,7 @@ def test_a_codebook_is_better_than_equal_steps(rng):
 
 
 @pytest.mark.parametrize("far", [[-1e5] * 50, [1e8], [1e15, -1e15, 3e8]])
-def test_a_few_far_values_cost_the_others_little(far, rng):
+def test_outliers_barely_affect_other_values(far, rng):
     values = rng.normal(-5, 1.2, 60_000)
 
     def error(entries):
@@ -156,7 +156,7 @@ def test_a_few_far_values_cost_the_others_little(far, rng):
     assert error(codebook(np.append(values, far))) < 2 * error(codebook(values))
 
 
-def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
+def test_every_point_gets_its_nearest_integer_vector(rng):
     points = rng.integers(-511, 512, (400, 45)).astype(np.float32)
     points[0, 0] = 511
     vectors, labels = palette(points, 32, np.ones(400))
@@ -165,7 +165,7 @@ def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
     assert len(np.unique(labels)) > 28
 
 
-def test_a_palette_is_nearer_to_points_that_count_more(rng):
+def test_palette_is_more_accurate_for_heavier_points(rng):
     points = rng.normal(size=(4000, 9)).astype(np.float32)
     weights = np.where(np.arange(4000) % 10 == 0, 50.0, 0.1)
 
@@ -176,7 +176,7 @@ def test_a_palette_is_nearer_to_points_that_count_more(rng):
     assert error(weighted) < 0.8 * error(evenly)
 
 
-def test_a_palette_does_not_depend_on_the_number_of_threads(rng):
+def test_palette_does_not_depend_on_the_thread_count(rng):
     """Sums of whole numbers below 2^24: any order of a product gives the same."""
     from clsplat.formats import palette as module
 
@@ -286,7 +286,7 @@ def repacked(path, kind, **files):
     return held
 
 
-def test_a_bundle_that_is_compressed_in_another_way_is_refused(tmp_path, rng):
+def test_bundle_with_unknown_compression_is_refused(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 1))
     repacked(path, zipfile.ZIP_LZMA)
@@ -296,7 +296,7 @@ def test_a_bundle_that_is_compressed_in_another_way_is_refused(tmp_path, rng):
     assert len(read(path)) == 100
 
 
-def test_bundle_files_together_fit_their_packed_size(tmp_path, rng):
+def test_unpacked_bundle_size_is_limited(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 0))
     with zipfile.ZipFile(path) as archive:
@@ -313,7 +313,7 @@ def test_bundle_files_together_fit_their_packed_size(tmp_path, rng):
         tracemalloc.stop()
 
 
-def test_a_file_that_is_named_twice_is_read_once(tmp_path, rng):
+def test_file_listed_twice_is_read_once(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 0))
     held = repacked(path, zipfile.ZIP_STORED)
@@ -324,7 +324,7 @@ def test_a_file_that_is_named_twice_is_read_once(tmp_path, rng):
     assert len(read(path)) == 100
 
 
-def test_files_of_a_bundle_may_lie_in_a_folder_of_it(tmp_path, rng):
+def test_bundle_files_may_be_in_a_subfolder(tmp_path, rng):
     write(tmp_path / "s" / "meta.json", splats(rng, 50, 0))
     shutil.make_archive(str(tmp_path / "a"), "zip", tmp_path, "s")
     shutil.move(tmp_path / "a.zip", tmp_path / "a.sog")
@@ -341,7 +341,7 @@ def sums(folder: Path, count: int = 24) -> list[str]:
     return found
 
 
-def test_processors_with_and_without_avx_512_write_equal_bytes(tmp_path):
+def test_cpus_with_and_without_avx_512_write_equal_bytes(tmp_path):
     """NumPy computes logarithms in other ways with it, whose last bit differs."""
     core = pytest.importorskip("numpy._core._multiarray_umath")
     wide = [
@@ -359,7 +359,7 @@ def test_processors_with_and_without_avx_512_write_equal_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("place", [-7.3, 5e5])
-def test_positions_are_as_fine_as_their_range_wherever_it_lies(place, tmp_path, rng):
+def test_position_precision_depends_only_on_the_range(place, tmp_path, rng):
     source = splats(rng, 400, 0)
     source.parameters["means"][:] += place
     found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]

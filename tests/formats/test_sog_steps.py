@@ -18,7 +18,7 @@ def covariances(quats, log_scales):
     return np.einsum("nij,nj,nkj->nik", turns, np.exp(2.0 * log_scales), turns)
 
 
-def test_renamed_axes_give_the_same_gaussian_turned_less(rng):
+def test_permuted_axes_give_an_equal_gaussian_with_less_rotation(rng):
     quats, sizes = rng.normal(size=(2000, 4)), rng.normal(size=(2000, 3))
     found, renamed = round_quats(quats, sizes, 1)
     assert (np.argmax(np.abs(found), axis=1) == 0).all()
@@ -40,12 +40,12 @@ def test_light_gaussians_have_larger_position_steps(rng):
     assert moved[weights < -2].mean() > 3 * moved[weights > 2].mean()
 
 
-def test_positions_of_a_scene_without_extent_stay(rng):
+def test_positions_without_extent_do_not_change(rng):
     means = np.full((5, 3), 2.5, np.float32)
     np.testing.assert_allclose(round_means(means, np.zeros((5, 3)), np.zeros(5), 0.25), means, rtol=1e-6)
 
 
-def test_a_codebook_of_steps_where_they_suffice(rng):
+def test_codebook_has_equal_steps_where_they_suffice(rng):
     values = rng.normal(size=5000)
     entries = codebook(values, 0.1)
     np.testing.assert_allclose(np.rint(entries / 0.1) * 0.1, entries)
@@ -55,7 +55,7 @@ def test_a_codebook_of_steps_where_they_suffice(rng):
     assert len(fine) == ENTRIES
 
 
-def test_rounded_tables_are_written_as_they_are_in_fewer_bytes(tmp_path: Path, rng):
+def test_rounded_tables_are_written_exactly_in_fewer_bytes(tmp_path: Path, rng):
     source = splats(rng, 1500, 0)
     p = source.parameters
     p["log_scales"] -= 2
@@ -70,7 +70,7 @@ def test_rounded_tables_are_written_as_they_are_in_fewer_bytes(tmp_path: Path, r
     assert (tmp_path / "after.sog").stat().st_size < 0.85 * (tmp_path / "before.sog").stat().st_size
 
 
-def test_quality_counts_without_harmonics_too(tmp_path: Path, rng):
+def test_quality_matters_without_harmonics(tmp_path: Path, rng):
     for degree in (0, 1):
         source = splats(rng, 600, degree)
         source.parameters["sh_rest"][:] = 0

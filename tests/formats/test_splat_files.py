@@ -30,7 +30,7 @@ def test_the_published_bytes_of_a_splat(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["train1000"])
-def test_a_splat_of_another_program_is_the_source(name):
+def test_splat_of_another_program_equals_its_source(name):
     source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.splat"))
     expected = by_size(source)
     same = np.flatnonzero((found.parameters["means"] == expected.parameters["means"]).all(axis=1))
@@ -40,7 +40,7 @@ def test_a_splat_of_another_program_is_the_source(name):
     np.testing.assert_allclose(found.parameters["log_scales"], expected.parameters["log_scales"], atol=1e-5)
 
 
-def test_a_splat_comes_back_within_its_steps(tmp_path, rng):
+def test_splat_round_trip_is_within_its_steps(tmp_path, rng):
     source = splats(rng, 300)
     source.parameters["sh_base"][:] = np.clip(source.parameters["sh_base"], -1.7, 1.7)
     found = there_and_back(tmp_path / "a.splat", source)
@@ -50,7 +50,7 @@ def test_a_splat_comes_back_within_its_steps(tmp_path, rng):
     assert_close(found, expected, 0.8, **bounds)
 
 
-def test_what_a_splat_does_not_hold_is_said(tmp_path, rng, caplog):
+def test_data_lost_in_splat_is_reported(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_base"][:] = 0
     source.parameters["sh_base"][4:7] = -3
@@ -59,7 +59,7 @@ def test_what_a_splat_does_not_hold_is_said(tmp_path, rng, caplog):
     assert "splat stores no spherical harmonics" in caplog.text
 
 
-def test_numbers_as_text_are_no_splat(tmp_path):
+def test_text_of_numbers_is_not_a_splat(tmp_path):
     (tmp_path / "a.txt").write_bytes(b"0.001 0.0020.001 0.0020.001 0.02" * 5)
     assert detect(tmp_path / "a.txt") is None
     with pytest.raises(DataError, match=r"unknown model format; expected one of .ply, "):
@@ -76,7 +76,7 @@ def test_a_damaged_splat_is_refused(data, words, tmp_path):
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_a_ksplat_of_another_program_is_the_source(level):
+def test_ksplat_of_another_program_equals_its_source(level):
     """Its writer keeps degree 2 and the order of the source."""
     source, found = read(interop("train1000.ply")), read(interop(f"train1000.{level}.ksplat"))
     assert detect(interop(f"train1000.{level}.ksplat")).name == "ksplat"

@@ -43,7 +43,7 @@ def test_the_published_bytes_of_an_spz(version):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_an_spz_of_another_program_is_the_source(version):
+def test_spz_of_another_program_equals_its_source(version):
     source, found = read(interop("playbot31k.ply")), read(interop(f"playbot31k.v{version}.spz"))
     kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
     np.testing.assert_allclose(kept[0], kept[1], atol=2e-4)
@@ -51,7 +51,7 @@ def test_an_spz_of_another_program_is_the_source(version):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_an_spz_comes_back_within_its_steps(tmp_path, rng, degree):
+def test_spz_round_trip_is_within_its_steps(tmp_path, rng, degree):
     source = splats(rng, 200, degree, "mip")
     found = there_and_back(tmp_path / "a.spz", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
@@ -67,7 +67,7 @@ def test_both_versions_give_the_same_values(tmp_path, rng):
         np.testing.assert_array_equal(table, b.parameters[name])
 
 
-def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
+def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
     for largest, fraction in ((1.0, 12), (2047.0, 12), (2049.0, 11), (4095.0, 11), (5000.0, 10), (8388607.0, 0)):
         source = splats(rng, 50, 0)
         source.parameters["log_scales"][:] = -9.9  # no larger steps for larger Gaussians
@@ -92,7 +92,7 @@ def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
     assert np.abs(fine - source.rows(morton_order(source.parameters["means"])).parameters["means"]).max() < 2e-6
 
 
-def test_harmonics_beyond_one_are_cut_and_said(tmp_path, rng, caplog):
+def test_harmonics_beyond_one_are_clipped_with_a_warning(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_rest"][3, 5] = 2.9
     found = there_and_back(tmp_path / "a.spz", source)
@@ -100,7 +100,7 @@ def test_harmonics_beyond_one_are_cut_and_said(tmp_path, rng, caplog):
     assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
 
 
-def test_colors_and_scales_that_no_byte_holds_are_cut_and_said(tmp_path, rng, caplog):
+def test_out_of_range_values_are_clipped_with_a_warning(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_base"][2:4, 1] = 9
     source.parameters["log_scales"][5, 0] = -12
@@ -145,7 +145,7 @@ def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, cap
     assert not caplog.messages
 
 
-def test_extension_that_turns_axes_is_refused_others_skipped(tmp_path):
+def test_only_the_extension_that_rotates_axes_is_refused(tmp_path):
     path = tmp_path / "a.spz"
     other = struct.pack("<2I4s", 7, 4, b"abcd")
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
@@ -196,7 +196,7 @@ def test_a_damaged_spz_is_refused(fault, tmp_path):
         read(tmp_path / "a.spz")
 
 
-def test_streams_of_other_sizes_are_refused(tmp_path, rng):
+def test_streams_of_wrong_sizes_are_refused(tmp_path, rng):
     path = tmp_path / "a.spz"
     data = version_4(path, splats(rng, 40))
     table = struct.unpack_from("<12Q", data, 32)
@@ -214,7 +214,7 @@ def test_streams_of_other_sizes_are_refused(tmp_path, rng):
             read(path)
 
 
-def test_a_bomb_is_refused_before_it_grows(tmp_path):
+def test_decompression_bomb_is_refused_early(tmp_path):
     """A stream that would become 1 GiB, in a file that declares two splats."""
     zstandard = pytest.importorskip("zstandard")
     frame = zstandard.ZstdCompressor(1).compress(bytes(1 << 26)) * 16
@@ -230,7 +230,7 @@ def test_a_bomb_is_refused_before_it_grows(tmp_path):
         read(tmp_path / "a.spz")
 
 
-def test_version_4_without_zstandard_says_what_to_install(tmp_path, rng, monkeypatch):
+def test_version_4_without_zstandard_names_the_package(tmp_path, rng, monkeypatch):
     version_4(tmp_path / "a.spz", splats(rng, 3))
     monkeypatch.setitem(sys.modules, "zstandard", None)
     monkeypatch.setitem(sys.modules, "compression", None)
@@ -239,7 +239,7 @@ def test_version_4_without_zstandard_says_what_to_install(tmp_path, rng, monkeyp
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_a_model_takes_little_more_memory_than_it_has(version, tmp_path, rng):
+def test_reading_needs_little_more_memory_than_the_model(version, tmp_path, rng):
     """All planes but the positions of a file of version 4 are of equal bytes, so that the file is small."""
     zstandard = pytest.importorskip("zstandard") if version == 4 else None
     count = 200_000

@@ -42,7 +42,7 @@ def leaves(node: dict) -> list[dict]:
     return [node] if "lods" in node else [leaf for child in node["children"] for leaf in leaves(child)]
 
 
-def test_a_file_has_the_keys_of_the_specification(written):
+def test_meta_has_the_keys_of_the_specification(written):
     folder, _ = written
     meta = json.loads((folder / "lod-meta.json").read_text())
     assert meta["version"] == 1
@@ -81,7 +81,7 @@ def test_each_leaf_is_a_morton_run_inside_its_box(written):
         np.testing.assert_allclose(np.sort(means, axis=0), np.sort(expected, axis=0), atol=0.002)
 
 
-def test_the_finest_level_comes_back(written):
+def test_finest_level_is_read_back(written):
     folder, made = written
     for place in (folder, folder / "lod-meta.json"):
         found = read(place)
@@ -93,7 +93,7 @@ def test_the_finest_level_comes_back(written):
     assert_close(found, made[0].rows(order), 0.8, **close)
 
 
-def test_a_leaf_is_divided_while_it_has_too_many_or_is_too_wide(rng):
+def test_too_large_leaves_are_divided(rng):
     parameters = splats(rng, 700).parameters
     for limits in (SMALL, LeafLimits(100, 1e9, 1), LeafLimits(1000, 1.0, 20)):
         found = list(tree([parameters], limits).leaves())
@@ -105,7 +105,7 @@ def test_a_leaf_is_divided_while_it_has_too_many_or_is_too_wide(rng):
         np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in found])), np.arange(700))
 
 
-def test_a_box_reaches_as_far_as_a_standard_deviation_turned(rng):
+def test_box_covers_one_rotated_standard_deviation(rng):
     parameters = splats(rng, 50).parameters
     expected = np.empty((50, 3))
     for row, (quat, logs) in enumerate(zip(parameters["quats"], parameters["log_scales"], strict=True)):
@@ -117,7 +117,7 @@ def test_a_box_reaches_as_far_as_a_standard_deviation_turned(rng):
     np.testing.assert_allclose(half_boxes(parameters), expected, rtol=1e-5)
 
 
-def test_boxes_are_those_of_splat_transform(tmp_path):
+def test_boxes_match_splat_transform(tmp_path):
     """The root's box of what its version 2.7.1 writes for this file as one level."""
     source = read(interop("train1000.ply"))
     write_lod(tmp_path / "a", [source])
@@ -135,7 +135,7 @@ def test_the_same_levels_give_the_same_bytes(written, tmp_path, rng):
     assert model_bytes(folder) == sum(map(len, files.values()))
 
 
-def test_one_gaussian_and_many_in_one_place_are_levels(tmp_path, rng):
+def test_one_or_coincident_gaussians_make_levels(tmp_path, rng):
     one = splats(rng, 1)
     write_lod(tmp_path / "one", [one, one])
     assert len(read(tmp_path / "one")) == 1
@@ -143,7 +143,7 @@ def test_one_gaussian_and_many_in_one_place_are_levels(tmp_path, rng):
     assert len(read(tmp_path / "same")) == 900
 
 
-def test_a_folder_is_there_once_it_is_whole(tmp_path, rng, monkeypatch):
+def test_folder_appears_only_when_complete(tmp_path, rng, monkeypatch):
     made, calls, real = levels(rng), [], os.fsync
 
     def fsync(number):
@@ -170,7 +170,7 @@ def test_a_folder_in_use_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["file/x", "n" * 245])
-def test_a_folder_that_cannot_be_is_refused_before_the_work(name, tmp_path):
+def test_impossible_folder_is_refused_before_the_work(name, tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="cannot be written"), new_folder(tmp_path / name):
         pytest.fail("the work begins")
@@ -192,7 +192,7 @@ def test_empty_folder_is_replaced_where_rename_cannot_replace(tmp_path, monkeypa
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["empty", "empty/a"]
 
 
-def test_folders_of_killed_processes_go_before_a_new_one_is_made(tmp_path):
+def test_folders_of_killed_processes_are_removed_first(tmp_path):
     left = f".site.{NO_PROCESS}-0.partial"
     others = [f".other.{NO_PROCESS}-0.partial", f".site.{os.getppid()}-0.partial", ".site.partial"]
     for name in (left, *others):
@@ -276,7 +276,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_damaged_one_is_refused_in_a_line(written, name):
+def test_damaged_model_is_refused_in_one_line(written, name):
     folder, _ = written
     change, message = WRONG[name]
     meta = json.loads((folder / "lod-meta.json").read_text())
@@ -288,7 +288,7 @@ def test_a_damaged_one_is_refused_in_a_line(written, name):
     assert len(str(error.value)) < len(str(folder)) + 300
 
 
-def test_the_tree_is_walked_once_whatever_the_number_of_levels(written, monkeypatch):
+def test_tree_is_traversed_once_for_all_levels(written, monkeypatch):
     folder, _ = written
     walks, real = [], streamed_sog._leaves
     monkeypatch.setattr(streamed_sog, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
@@ -305,7 +305,7 @@ def renamed(folder: Path, file: int, name: str) -> Path:
     return folder / old
 
 
-def test_a_coarser_level_that_is_missing_is_damage_of_the_model(written, tmp_path):
+def test_missing_coarser_level_is_damage(written, tmp_path):
     folder, _ = written
     renamed(folder, 1, "9_9/meta.json")
     assert len(read(folder)) == 700

@@ -28,7 +28,7 @@ FAULTS = (cl.MemoryError, MemoryLimitError, 5), (cl.RuntimeError, DeviceError, 4
 @pytest.mark.parametrize(
     ("name", "error", "expected", "code"), [(name, *FAULTS[i % 2]) for i, name in enumerate(CALLS)]
 )
-def test_a_refused_call_has_the_code_of_its_fault(name, error, expected, code, info, monkeypatch):
+def test_refused_call_has_the_exit_code_of_its_cause(name, error, expected, code, info, monkeypatch):
     def refuse(*arguments, **values):
         raise error("the runtime refuses")
 
@@ -44,7 +44,7 @@ def test_a_refused_call_has_the_code_of_its_fault(name, error, expected, code, i
 
 
 @pytest.mark.parametrize(("error", "expected"), [(cl.MemoryError, MemoryLimitError), (cl.RuntimeError, DeviceError)])
-def test_a_refusal_while_one_waits_is_one_of_the_device(error, expected, info):
+def test_failure_while_waiting_is_a_device_error(error, expected, info):
     class Refusing:
         """A queue, or the event of a launch, whose work fails after it was taken."""
 

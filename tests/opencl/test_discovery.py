@@ -51,12 +51,12 @@ def found(monkeypatch):
         ([OTHER, replace(OTHER, units=64)], OTHER),
     ],
 )
-def test_the_strongest_gpu_is_chosen_and_of_cpus_the_first(found, devices, first):
+def test_strongest_gpu_or_first_cpu_is_chosen(found, devices, first):
     found(*devices)
     assert choose() is first
 
 
-def test_the_other_gpus_are_named_in_one_line(found, caplog):
+def test_other_gpus_are_named_in_one_line(found, caplog):
     found(CPU, INTEGRATED, LARGE, LARGER)
     with caplog.at_level(logging.INFO, "clsplat"):
         choose()
@@ -80,7 +80,7 @@ def test_a_device_with_small_groups_does_not_work(found, info, least):
         choose()
 
 
-def test_device_failing_only_with_a_damaged_cache_is_reported_so(monkeypatch, tmp_path):
+def test_damaged_cache_is_reported_as_the_cause(monkeypatch, tmp_path):
     """Its second try has an empty folder for kernels; of a device that fails there, too, the first fault is told."""
     broken, folders = False, []
 
@@ -101,7 +101,7 @@ def test_device_failing_only_with_a_damaged_cache_is_reported_so(monkeypatch, tm
     assert CPU.fault() == "error: fault 3"
 
 
-def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_path):
+def test_runtime_that_does_not_know_the_cpu_is_reported(monkeypatch, tmp_path):
     """PoCL 3.0 builds kernels for a newer processor without an error, and then has none that takes whole roots."""
     said = "error: a test kernel fails (clCreateKernel failed: INVALID_KERNEL_NAME)"
     monkeypatch.setattr(
@@ -114,7 +114,7 @@ def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_
 
 
 @pytest.mark.parametrize(("width", "lanes"), [(16, 16), (8, 8), (4, 4), (1, 4)])
-def test_kernels_compiled_without_vector_units_are_not_made(monkeypatch, width, lanes):
+def test_kernels_without_vector_units_are_not_built(monkeypatch, width, lanes):
     """PoCL 3.0 on a newer processor may take minutes to make one; the warning is in the log of the build."""
     warning = f"'float{lanes}' (vector of {lanes} 'float' values) without 'avx512f' enabled changes the ABI"
     built = []
@@ -139,7 +139,7 @@ def test_kernels_compiled_without_vector_units_are_not_made(monkeypatch, width, 
     assert f"vload{lanes}(" in built[0]
 
 
-def test_a_device_works_where_a_success_cannot_be_noted(monkeypatch, tmp_path):
+def test_device_works_if_the_probe_result_cannot_be_saved(monkeypatch, tmp_path):
     """As in a cache with a folder of another user."""
     monkeypatch.setattr(runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, "", ""))
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
@@ -175,7 +175,7 @@ class Platform:
         return list(self.found)
 
 
-def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, caplog):
+def test_broken_runtime_is_reported_and_isolated(monkeypatch, info, caplog):
     platform, number = info.index
     good = discovery.platforms()[platform]
     devices = [BrokenDevice(), good.get_devices()[number]]
@@ -194,7 +194,7 @@ def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, cap
 
 
 @pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
-def test_failing_loader_is_reported_but_not_one_without_runtimes(monkeypatch, caplog, code, lines):
+def test_only_a_failing_loader_is_reported(monkeypatch, caplog, code, lines):
     def refuse():
         raise refusal(getattr(cl.status_code, code))
 
@@ -203,7 +203,7 @@ def test_failing_loader_is_reported_but_not_one_without_runtimes(monkeypatch, ca
     assert len(caplog.records) == lines
 
 
-def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):
+def test_probe_result_is_valid_for_its_kernels_only(monkeypatch, tmp_path):
     results = []
     monkeypatch.setattr(
         runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], len(results), "", "error: none")
@@ -257,7 +257,7 @@ def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
         Device(info, "simt").program("scan.cl")
 
 
-def test_a_limit_that_rusticl_understates_refuses_no_kernel(info, monkeypatch):
+def test_limit_understated_by_rusticl_refuses_no_kernel(info, monkeypatch):
     capped(monkeypatch, 32)
     monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
     assert Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").tuning["TILE"] == 16

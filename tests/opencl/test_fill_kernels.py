@@ -22,7 +22,7 @@ def test_fill(device, count, dtype, value):
 
 
 @on_devices("count, lines", [(2**32, 2**28), (2**32 + 1, 2**28 + 1), (2**33 - 16, 2**29 - 1)])
-def test_the_number_of_words_may_pass_32_bits(device, monkeypatch, count, lines):
+def test_word_count_may_exceed_32_bits(device, monkeypatch, count, lines):
     """A stand-in for the queue takes the launch: the buffer is small."""
     launched = []
     device.program("fill.cl")  # built before the stand-in takes its place

@@ -47,7 +47,7 @@ def test_program_without_its_kernels_may_be_a_damaged_cache(device, tmp_path, mo
         device.program(file)
 
 
-def test_a_warning_stops_tests_and_no_user(device, tmp_path, monkeypatch):
+def test_build_warning_fails_only_tests(device, tmp_path, monkeypatch):
     file = tmp_path / "own.cl"
     file.write_text(
         "int nothing(void) { }\n"  # `#warning` is an error to NVIDIA's compiler

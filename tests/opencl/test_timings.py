@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def test_kernels_are_timed_while_sampling_alone_and_in_order(device):
+def test_kernels_are_timed_only_while_sampling_and_in_order(device):
     array, profiling = device.zeros(1 << 16, np.uint32), []
     device.timings.take()
     for number in range(1, 41):

@@ -29,7 +29,7 @@ from tests.support.refusals import refusal
 
 
 @pytest.mark.parametrize("damage", ["a text for a place", "no focal length", "cut"])
-def test_exif_that_is_damaged_tells_no_lens(tmp_path, damage):
+def test_damaged_exif_gives_no_lens(tmp_path, damage):
     segment = bytearray(exif())
     if damage == "a text for a place":
         segment[segment.index(struct.pack("<HH", 0x8769, 4)) + 2] = 2
@@ -84,7 +84,7 @@ def test_turned_photographs_keep_exif_except_for_the_rotation(tmp_path):
     assert np.abs(read_image(turned).astype(int) - read_image(source, upright=True)).max() < 12
 
 
-def test_exif_of_the_other_byte_order_and_none_at_all(tmp_path):
+def test_big_endian_and_missing_exif_are_handled(tmp_path):
     _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
     block = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)
     head = jpeg.tobytes()[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
@@ -95,7 +95,7 @@ def test_exif_of_the_other_byte_order_and_none_at_all(tmp_path):
 
 
 @pytest.mark.parametrize(("cameras", "groups"), [("auto", 4), ("one", 2), ("per_folder", 3), ("per_image", 8)])
-def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
+def test_photographs_share_cameras_by_size_and_lens(tmp_path, cameras, groups, caplog):
     """Of one lens: across, and turned; of another; and without EXIF data."""
     pycolmap = pytest.importorskip("pycolmap")
     caplog.set_level("INFO")
@@ -122,7 +122,7 @@ def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
 # ---- features
 
 
-def test_reduced_photographs_tell_where_their_pixels_were(tmp_path):
+def test_downscaled_photographs_report_their_scale(tmp_path):
     """A JPEG of an odd size, made smaller by its decoder first; a spot stays where it is."""
     pixels = np.full((901, 1203, 3), 60, np.uint8)
     cv2.circle(pixels, (1000, 700), 24, (200, 200, 200), -1)
@@ -135,7 +135,7 @@ def test_reduced_photographs_tell_where_their_pixels_were(tmp_path):
         np.testing.assert_allclose([(x + 0.5) * across, (y + 0.5) * down], [1000.5, 700.5], atol=0.3)
 
 
-def test_features_lie_where_spots_are():
+def test_features_are_at_the_spots():
     pixels = np.full((120, 160), 90, np.float32)
     y, x = np.indices(pixels.shape) + 0.5
     spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
@@ -153,7 +153,7 @@ def test_features_lie_where_spots_are():
 # ---- photographs that cannot be placed
 
 
-def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplog):
+def test_unreadable_files_come_with_a_conversion_command(tmp_path, caplog):
     for name in ("a.jpg", "b.jpg", "c.jpg", "d.HEIC", "e.dng"):
         (tmp_path / name).touch()
     assert len(list_photographs(tmp_path)) == 3
@@ -165,7 +165,7 @@ def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplo
     assert "heif-convert" in text
 
 
-def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
+def test_misnamed_files_come_with_a_conversion_command(tmp_path):
     for i in range(3):
         take(tmp_path / "p" / f"{i}.jpg", (64, 48), seed=i)
     for name, brand in (("h.jpg", b"heic"), ("m.JPG", b"mif1"), ("v.png", b"avif"), ("o.jpg", b"isom")):
@@ -190,7 +190,7 @@ def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
 
 
 @pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
-def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
+def test_video_instead_of_a_folder_names_the_command(tmp_path, read):
     (tmp_path / "my walk.AVI").write_bytes(b"RIFF")
     (tmp_path / "notes").touch()
     command = f"`clsplat data video {shell_quote(tmp_path / 'my walk.AVI')} FOLDER`"
@@ -212,7 +212,7 @@ def matched(tmp_path: Path) -> MatchGraph:
     return MatchGraph(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
 
 
-def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
+def test_each_unregistered_photograph_has_a_reason(tmp_path):
     found = explain_unplaced(matched(tmp_path), [{"a", "b", "c"}])
     assert found == {
         "blurred": "blurred",
@@ -242,7 +242,7 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photograph: add")
 
 
-def test_set_without_a_model_is_described_by_its_groups(tmp_path):
+def test_failed_mapping_is_described_by_groups(tmp_path):
     found = matched(tmp_path)
     assert diagnose(found) == (
         "they do not connect: 2 groups with good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
@@ -256,7 +256,7 @@ def test_set_without_a_model_is_described_by_its_groups(tmp_path):
     assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
 
 
-def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
+def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     wide = blocks(1, 900, 600)
     pictures = {f"{i}.png": wide[:, 60 * i : 60 * i + 700] for i in range(3)}
@@ -320,13 +320,13 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=["turned", "turned, with a stranger", "other places", "copies", "a wall", "a wall, with one of texture"],
 )
-def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, sentence):
+def test_unusable_sets_end_with_one_sentence(tmp_path, dense, pixels, sentence):
     matches, cameras = prepared(tmp_path, [pixels(number) for number in range(6)])
     with pytest.raises(DataError, match=sentence):
         map_cameras(matches, cameras)
 
 
-def test_plain_photographs_not_fully_matched_end_in_a_sentence(tmp_path, dense):
+def test_featureless_photographs_end_with_one_sentence(tmp_path, dense):
     """More pairs are looked for among photographs without features."""
     plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
     matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbors=2)
@@ -334,7 +334,7 @@ def test_plain_photographs_not_fully_matched_end_in_a_sentence(tmp_path, dense):
         map_cameras(matches, cameras)
 
 
-def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
+def test_only_performed_attempts_count(tmp_path, dense, caplog):
     """All pairs were matched, so that there are no more of them to try."""
     caplog.set_level("INFO")
     matches, cameras = prepared(tmp_path, [stranger(number) for number in range(4)])
@@ -344,7 +344,7 @@ def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
     assert tried == ["smaller angles and fewer matches", "denser features"]
 
 
-def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
+def test_copies_do_not_count_as_camera_motion(tmp_path, dense):
     """Three neighbors that shift before a wall, each with two copies, which match it best: it has not turned."""
     wide = blocks(1, 400, 180)
     matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
@@ -353,7 +353,7 @@ def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
     assert "all the same" in why_no_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
 
 
-def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
+def test_model_counts_only_photographs_outside_larger_models(tmp_path):
     class Model:
         def __init__(self, *numbers: int) -> None:
             self.numbers = numbers
@@ -376,7 +376,7 @@ def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
     assert figures["not_registered"] == ["5.jpg", "6.jpg"]
 
 
-def test_model_of_a_turning_camera_is_refused_among_strangers(tmp_path, dense):
+def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
     """Before there is one, too few photographs match to know."""
     matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
     with pytest.raises(DataError, match=r"the \d of 14 photographs that were placed look as if"):
@@ -384,7 +384,7 @@ def test_model_of_a_turning_camera_is_refused_among_strangers(tmp_path, dense):
     assert not (cameras / "sparse").exists()
 
 
-def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense, monkeypatch, caplog):
+def test_unrelated_photographs_are_not_searched_again(tmp_path, dense, monkeypatch, caplog):
     monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
     caplog.set_level("INFO")
     matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
@@ -403,13 +403,13 @@ def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense
     ],
     ids=["no pair", "chance pairs", "half of them", "plain surfaces"],
 )
-def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expected):
+def test_unrelated_photographs_are_detected(tmp_path, features, pairs, expected):
     """Ten photographs; however few matches a pair has."""
     found = MatchGraph(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
     assert found.have_nothing_in_common() == expected
 
 
 @pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
-def test_few_photographs_are_related_where_two_match(tmp_path, names, pairs):
+def test_photographs_are_related_if_two_of_few_match(tmp_path, names, pairs):
     found = MatchGraph(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
     assert not found.have_nothing_in_common()

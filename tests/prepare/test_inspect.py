@@ -72,7 +72,7 @@ def test_real_sets_are_ready(name):
     assert inspection.facts.on_disk == inspection.facts.registered
 
 
-def test_observations_and_errors_of_a_real_model():
+def test_real_model_has_observations_and_errors():
     pycolmap = pytest.importorskip("pycolmap")
     facts = Inspection.from_folder(data_set("kitchen")).facts
     theirs = pycolmap.Reconstruction(data_set("kitchen") / "sparse" / "0")
@@ -161,7 +161,7 @@ def test_an_unreadable_image(scene):
     assert "1 image file cannot be decoded (05.png)" in said(Inspection.from_folder(scene), "error")
 
 
-def test_a_test_view_whose_pixels_are_damaged(scene):
+def test_test_view_with_damaged_pixels(scene):
     file = scene / "images" / "08.png"
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 255  # headers and end stay as they are
@@ -175,7 +175,7 @@ def test_a_test_view_whose_pixels_are_damaged(scene):
     assert "is wrong); copy or export them again" in said
 
 
-def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):
+def test_nonfinite_pose_in_a_text_model(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 2, translation=(0.0, float("nan"), 4.0)))
     inspection = Inspection.from_folder(write(tmp_path, model, "txt"))
@@ -184,7 +184,7 @@ def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_a_truncated_file_is_one_error_and_the_rest_is_inspected(scene, stem):
+def test_truncated_file_is_one_error_among_others(scene, stem):
     file = scene / "sparse" / "0" / f"{stem}.bin"
     file.write_bytes(file.read_bytes()[:-5])
     inspection = Inspection.from_folder(scene)
@@ -224,7 +224,7 @@ def test_damaged_frames_are_named_one_by_one(tiny_scene, tmp_path):
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 @given(data=st.data())
 @settings(max_examples=100, deadline=None)
-def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, data: st.DataObject) -> None:
+def test_trainable_means_readable_by_a_reader(tmp_path_factory, kind: str, data: st.DataObject) -> None:
     path = write(tmp_path_factory.mktemp("scene"), tiny_model(), kind)
     files = [file for file in sorted(path.rglob("*")) if file.is_file()]
     file = data.draw(st.sampled_from(files))
@@ -261,7 +261,7 @@ def test_an_unregistered_image(scene):
     assert Inspection.from_folder(scene).verdict.startswith("trains, but 6 of 30 images on disk have no pose")
 
 
-def test_a_stray_camera(tmp_path):
+def test_outlier_camera(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 4, translation=(0.0, 0.0, 4000.0)))
     inspection = Inspection.from_folder(write(tmp_path, model))
@@ -297,7 +297,7 @@ def test_equal_poses(tmp_path):
     assert "00.png, 01.png have exactly the same pose" in said(inspection, "note")
 
 
-def test_all_cameras_in_one_place(tmp_path):
+def test_coincident_cameras(tmp_path):
     model = orbit()
     images = [replace(model.images[0], name=image.name) for image in model.images]
     assert "all cameras are at the same position" in said(
@@ -317,14 +317,14 @@ def test_points_behind_all_cameras(tmp_path):
     assert "% of the points are behind all cameras" in said(inspection, "warning")
 
 
-def test_points_beside_all_images(tmp_path):
+def test_points_outside_all_images(tmp_path):
     model = orbit()
     above = [replace(point, position=(0, 0, 4 + i % 7)) for i, point in enumerate(model.points)]
     inspection = Inspection.from_folder(write(tmp_path, replace(model, points=above)))
     assert "only 0 % of the points project into two or more views" in said(inspection, "warning")
 
 
-def test_points_that_are_not_finite_or_very_far(tmp_path):
+def test_nonfinite_or_very_far_points(tmp_path):
     model = orbit()
     points = [*model.points, PointEntry((float("nan"), 0, 0)), PointEntry((1e5, 0, 0)), PointEntry((0, 1e300, 0))]
     inspection = Inspection.from_folder(write(tmp_path, replace(model, points=points)))
@@ -333,7 +333,7 @@ def test_points_that_are_not_finite_or_very_far(tmp_path):
     assert "1 point is more than 100 times" in said(inspection, "note")
 
 
-def test_views_that_see_few_points(scene):
+def test_views_with_few_points(scene):
     """The writer leaves 2D points unconnected; here those of all images but one are connected, at no known place."""
     lines = ["# images"]
     for i, image in enumerate(orbit().images):
@@ -354,7 +354,7 @@ def test_imprecise_poses(scene):
     assert "the mean reprojection error of the points is 3.00 px" in said(Inspection.from_folder(scene), "warning")
 
 
-def test_a_cut_image_and_one_on_its_side(tmp_path):
+def test_truncated_and_rotated_images(tmp_path):
     model = orbit()
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     whole = (path / "images" / "05.jpg").read_bytes()
@@ -365,7 +365,7 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     assert "1 photograph is rotated by EXIF" in said(inspection, "note")
 
 
-def test_images_on_their_side_that_the_reader_turns(tmp_path):
+def test_rotated_images_that_the_reader_turns(tmp_path):
     model = orbit()
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     photograph(path / "images" / "06.jpg", SIZE[::-1])
@@ -445,7 +445,7 @@ def test_long_lists_of_names_are_cut(tmp_path):
     assert "… and 5 more" in text
 
 
-def test_a_model_is_no_dataset(tmp_path, rng):
+def test_model_is_refused_as_a_dataset(tmp_path, rng):
     write_splats(tmp_path / "a.ply", splats(rng, 3))
     done = clsplat("inspect", tmp_path / "a.ply", expect=3)
     assert "a.ply: is a model (PLY), which `clsplat check` reads; expected the folder of a dataset" in done.stderr
@@ -454,7 +454,7 @@ def test_a_model_is_no_dataset(tmp_path, rng):
     assert "b.txt: is a file; expected the folder of a dataset" in done.stderr
 
 
-def test_a_run_warns_of_few_views_as_inspect_does(tiny_scene, tmp_path, caplog):
+def test_run_and_inspect_warn_of_few_views(tiny_scene, tmp_path, caplog):
     warned = [
         finding.text for finding in Inspection.from_folder(tiny_scene).findings if "training views" in finding.fault
     ]

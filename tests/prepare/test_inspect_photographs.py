@@ -19,7 +19,7 @@ def texts(inspection: Inspection, level: str) -> list[str]:
     return [finding.text for finding in inspection.findings if finding.level == level]
 
 
-def test_inspected_folder_is_named_as_a_shell_reads_it(tmp_path):
+def test_inspected_folder_is_shell_quoted(tmp_path):
     scene = tmp_path / "my ü"
     for name in ("one/a.png", "one/b.png", "two/c.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +29,7 @@ def test_inspected_folder_is_named_as_a_shell_reads_it(tmp_path):
     )
 
 
-def test_files_left_out_by_preparation_are_reported_alike(tmp_path, caplog):
+def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):
     for name in ("a.png", "b.png", "c.png"):
         photograph(tmp_path / name)
     for name in ("d.heic", "e.dng", "f.cr2"):
@@ -45,7 +45,7 @@ def test_files_left_out_by_preparation_are_reported_alike(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("names", [("a.heic",), ("a.png", "b.png"), ("a.png", "b.png", "c.heic")])
-def test_too_few_are_refused_as_a_preparation_refuses_them(tmp_path, names):
+def test_too_few_photographs_are_refused_as_in_preparation(tmp_path, names):
     for name in names:
         photograph(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_bytes(b"raw")
     inspection = Inspection.from_folder(tmp_path)
@@ -55,7 +55,7 @@ def test_too_few_are_refused_as_a_preparation_refuses_them(tmp_path, names):
     assert not texts(inspection, "warning"), "the error says what to convert"
 
 
-def test_three_of_which_one_is_damaged_are_too_few(tmp_path):
+def test_two_valid_photographs_are_too_few(tmp_path):
     for name in ("a.png", "b.png"):
         photograph(tmp_path / name)
     (tmp_path / "c.jpg").write_text("text")
@@ -73,7 +73,7 @@ def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
     return files
 
 
-def test_dark_photograph_is_not_blurred_but_a_dark_blurred_is(tmp_path):
+def test_dark_photograph_is_reported_only_if_blurred(tmp_path):
     files = shown(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
     assert compare_photos(files).blurred == []
     pixels = cv2.imread(str(files["3.png"]))
@@ -81,7 +81,7 @@ def test_dark_photograph_is_not_blurred_but_a_dark_blurred_is(tmp_path):
     assert compare_photos(files).blurred == ["3.png"]
 
 
-def test_close_photograph_of_a_thing_on_black_is_not_blurred(tmp_path):
+def test_close_up_on_black_is_not_blurred(tmp_path):
     files = shown(tmp_path, [1] * 9)
     for name in [*files][:6]:
         pixels = cv2.imread(str(files[name]))
@@ -90,7 +90,7 @@ def test_close_photograph_of_a_thing_on_black_is_not_blurred(tmp_path):
     assert compare_photos(files).blurred == []
 
 
-def test_step_in_brightness_is_a_hint_without_exif_exposure(tmp_path):
+def test_brightness_step_is_a_hint_without_exif_exposure(tmp_path):
     files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
     ((a, b, ratio),) = compare_photos(files).steps
     assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
@@ -105,7 +105,7 @@ def test_step_in_brightness_is_a_hint_without_exif_exposure(tmp_path):
     )
 
 
-def test_larger_thing_on_black_is_no_step_in_brightness(tmp_path):
+def test_larger_object_on_black_is_no_brightness_step(tmp_path):
     files = shown(tmp_path, [1, 1, 1])
     for name, wide in zip(files, (10, 30, 10), strict=True):
         pixels = cv2.imread(str(files[name]))

@@ -42,7 +42,7 @@ def matches(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "matches"
 
 
-def test_pairs_that_were_not_looked_at(matches):
+def test_unmatched_pairs_are_proposed(matches):
     every = [(f"{number}.jpg", LAST) for number in range(7)]
     assert more_pairs(matches / "database.db", {LAST}) == every, "no more than the 17 that were looked at"
     strangers = more_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST})
@@ -52,7 +52,7 @@ def test_pairs_that_were_not_looked_at(matches):
     assert more_pairs(matches / "database.db", set()) == []
 
 
-def test_where_all_pairs_were_matched_there_are_no_more(matches, tmp_path):
+def test_exhaustive_matching_leaves_no_pairs(matches, tmp_path):
     shutil.copy(matches / "database.db", tmp_path)
     names = [f"{number}.jpg" for number in range(10)]
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
@@ -60,7 +60,7 @@ def test_where_all_pairs_were_matched_there_are_no_more(matches, tmp_path):
     assert more_pairs(tmp_path / "database.db", set(names)) == []
 
 
-def test_a_name_with_spaces_has_no_more_pairs(matches, tmp_path, caplog):
+def test_names_with_spaces_get_no_pairs(matches, tmp_path, caplog):
     pycolmap = pytest.importorskip("pycolmap")
     shutil.copy(matches / "database.db", tmp_path)
     rows = pycolmap.Database.open(str(tmp_path / "database.db"))
@@ -93,7 +93,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
     assert [text for text in caplog.messages if text.endswith("trying again with denser features")]
 
 
-def test_left_out_photograph_is_placed_also_after_a_kill(matches, tmp_path, caplog):
+def test_expansion_registers_a_photograph_after_a_kill(matches, tmp_path, caplog):
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
     figures = map_cameras(matches, tmp_path / "whole", attempts=3)

@@ -57,13 +57,13 @@ def do(steps: list[Step], photos: Path, root: Path) -> tuple[str, list[str]]:
     return (folder / "x.txt").read_text(), list(Copy.calls)
 
 
-def test_the_second_time_nothing_is_done(photos, tmp_path):
+def test_second_preparation_does_nothing(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     assert do(steps, photos, root) == ("pab", ["a", "b"])
     assert do(steps, photos, root) == ("pab", [])
 
 
-def test_what_was_left_out_is_told_again(photos, tmp_path, monkeypatch, caplog):
+def test_left_out_photographs_are_reported_again(photos, tmp_path, monkeypatch, caplog):
     figures = {"photographs": 4, "damaged": {"b.jpg": "not an image"}, "registered": 3, "not_registered": ["c.jpg"]}
     for step in (prepare_steps.FindFeatures, prepare_steps.MapCameras):
         monkeypatch.setattr(step, "make", lambda *_: figures)
@@ -76,7 +76,7 @@ def test_what_was_left_out_is_told_again(photos, tmp_path, monkeypatch, caplog):
     assert "1 of 4 photographs could not be placed and are not used: c.jpg" in caplog.text
 
 
-def test_what_depends_on_a_change_is_redone(photos, tmp_path):
+def test_steps_after_a_change_are_redone(photos, tmp_path):
     root, a, b, c = tmp_path / "runs" / "prepared", Copy(letter="a"), Copy(letter="b"), Copy(letter="c")
     do([a, b, c], photos, root)
     assert do([a, Copy(letter="x"), c], photos, root) == ("paxc", ["x", "c"])
@@ -85,7 +85,7 @@ def test_what_depends_on_a_change_is_redone(photos, tmp_path):
     assert do([a, b, c], photos, root) == ("pqabc", ["a", "b", "c"])
 
 
-def test_why(photos, tmp_path):
+def test_plan_gives_reasons(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     assert [one.why for one in plan(steps, photos, root)] == ["no result yet"] * 2
     do(steps, photos, root)
@@ -97,7 +97,7 @@ def test_why(photos, tmp_path):
     assert [one.why for one in plan(steps[1:], photos, root)] == ["its input has changed"]
 
 
-def test_results_on_the_way_are_not_missed(photos, tmp_path):
+def test_missing_intermediate_results_are_not_redone(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     do(steps, photos, root)
     first = plan(steps, photos, root)[0].folder
@@ -105,14 +105,14 @@ def test_results_on_the_way_are_not_missed(photos, tmp_path):
     assert do(steps, photos, root) == ("pab", [])
 
 
-def test_a_step_that_fails_leaves_nothing(photos, tmp_path):
+def test_failed_step_leaves_no_files(photos, tmp_path):
     root = tmp_path / "runs" / "prepared"
     assert refusal(do, [Copy(letter="a"), Copy(letter="b", fail=True)], photos, root) == "broken"
     assert [path.name.split("-")[0] for path in root.iterdir()] == ["copy"]
     assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
 
 
-def test_an_error_names_the_photographs_where_the_user_has_them(photos, tmp_path, monkeypatch):
+def test_error_names_the_users_photographs(photos, tmp_path, monkeypatch):
     """A step after the first one has links to them."""
 
     def refuse(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def test_an_error_names_the_photographs_where_the_user_has_them(photos, tmp_path
 
 
 @pytest.mark.parametrize("fault", ["no record", "no JSON", "a list", "a file less", "an empty file", "a folder"])
-def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
+def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     caplog.set_level("INFO")
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     do(steps, photos, root)
@@ -166,7 +166,7 @@ class Linked(Copy):
 Settings.defined.remove(Linked)
 
 
-def test_a_result_whose_images_are_gone_is_made_again(photos, tmp_path):
+def test_result_without_its_images_is_redone(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Linked(letter="a"), Linked(letter="b")]
     prepare(plan(steps, photos, root), photos, root)
     assert [one.why for one in plan(steps, photos, root)] == ["", ""]
@@ -189,7 +189,7 @@ def test_results_moved_with_their_photographs_are_complete(tmp_path):
     assert (planned[-1].folder / "images" / "p.txt").read_text() == "p"
 
 
-def test_what_a_killed_run_left_is_removed(photos, tmp_path):
+def test_leftovers_of_a_killed_run_are_removed(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
     folder = plan(steps, photos, root)[0].folder
     left = folder.with_name(f".{folder.name}")
@@ -222,7 +222,7 @@ Settings.defined.remove(Slow)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device"), RuntimeError("defect")])
-def test_a_step_that_resumes_keeps_what_an_interrupted_call_made(photos, tmp_path, monkeypatch, error):
+def test_resumable_step_keeps_partial_results(photos, tmp_path, monkeypatch, error):
     root, steps = tmp_path / "runs" / "prepared", [Slow()]
     monkeypatch.setattr(Slow, "stop_at", 3)
     monkeypatch.setattr(Slow, "error", error)
@@ -248,7 +248,7 @@ def test_record_left_by_a_killed_call_is_not_part_of_the_result(photos, tmp_path
     assert [one.why for one in plan(steps, photos, root)] == [""]
 
 
-def test_what_was_made_of_other_photographs_is_not_gone_on_with(photos, tmp_path, monkeypatch):
+def test_partial_results_of_other_photographs_are_discarded(photos, tmp_path, monkeypatch):
     root = tmp_path / "runs" / "prepared"
     for letter, text in (("a", "p"), ("b", "p"), ("a", "q")):
         (photos / "p.txt").write_text(text)
@@ -258,7 +258,7 @@ def test_what_was_made_of_other_photographs_is_not_gone_on_with(photos, tmp_path
     assert Slow.calls == ["0", "1"] * 3
 
 
-def test_a_step_that_refuses_its_photographs_leaves_nothing(photos, tmp_path, monkeypatch):
+def test_step_that_refuses_its_photographs_leaves_no_files(photos, tmp_path, monkeypatch):
     root = tmp_path / "runs" / "prepared"
     monkeypatch.setattr(Slow, "stop_at", 2)
     monkeypatch.setattr(Slow, "error", DataError("broken"))
@@ -305,7 +305,7 @@ def run(pipeline: Path, photos: Path, *words: str) -> str:
     return clsplat("run", str(pipeline), "--scene", str(photos), "--set", "optimize.steps=3", *words)[1]
 
 
-def test_a_pipeline_that_was_run_is_up_to_date(pipeline, photos, tmp_path):
+def test_finished_pipeline_is_up_to_date(pipeline, photos, tmp_path):
     assert "find_features  no result yet" in run(pipeline, photos, "--dry-run")
     assert not (tmp_path / "runs").exists()
     run(pipeline, photos)
@@ -320,7 +320,7 @@ def test_a_pipeline_that_was_run_is_up_to_date(pipeline, photos, tmp_path):
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["prepared", "smoke"]
 
 
-def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
+def test_changed_setting_is_another_run(pipeline, photos, tmp_path):
     run(pipeline, photos)
     assert "find_features  done" in run(pipeline, photos, "--dry-run", "--set", "optimize.log_every=2")
     run(pipeline, photos, "--set", "optimize.log_every=2")
@@ -330,7 +330,7 @@ def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
     assert "its input has changed" in run(pipeline, photos, "--dry-run")
 
 
-def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
+def test_run_does_not_resume_with_other_photographs(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
     out = tmp_path / "runs" / "a"
     runner.execute(checked, opening.open_run(checked, out, None), "new", lambda progress: None)
@@ -339,7 +339,7 @@ def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path)
         opening.open_run(checked, out, None)
 
 
-def test_one_process_makes_a_result_at_a_time(pipeline, photos, tmp_path):
+def test_concurrent_processes_prepare_a_result_once(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
     (one,) = checked.preparation(tmp_path / "runs" / "a")
     other = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3", "find_features.long_side=50"])
@@ -356,7 +356,7 @@ def test_one_process_makes_a_result_at_a_time(pipeline, photos, tmp_path):
     assert not list(one.folder.parent.glob(".*")), "no lock is left"
 
 
-def test_runs_of_different_photographs_prepare_at_once(pipeline, photos, tmp_path, monkeypatch):
+def test_runs_of_different_photographs_prepare_concurrently(pipeline, photos, tmp_path, monkeypatch):
     """One begins while the other is in the middle of its step."""
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / "p.txt").write_text("others")
@@ -391,7 +391,7 @@ def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_pa
     assert not list((tmp_path / "r" / "p").iterdir())
 
 
-def test_a_scene_that_holds_cameras_is_taken_as_it_is(pipeline, tiny_scene, tmp_path):
+def test_scene_with_cameras_is_used_unprepared(pipeline, tiny_scene, tmp_path):
     """Its run folder is that of a pipeline without `prepare`, and goes on as such a one."""
     words = ["run", str(pipeline), "--scene", str(tiny_scene), "--set", "optimize.steps=3", "--out", "runs/a"]
     code, told = clsplat(*words, "--dry-run")
@@ -406,7 +406,7 @@ def test_a_scene_that_holds_cameras_is_taken_as_it_is(pipeline, tiny_scene, tmp_
     assert json.loads((folder / "metrics.json").read_text())["steps"] == 5
 
 
-def test_the_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
+def test_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
     run(pipeline, photos)
     note = json.loads((tmp_path / "runs" / "smoke" / "prepared.json").read_text())
     assert (Path(note["folder"]) / "transforms_train.json").is_file()
@@ -435,7 +435,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ran
 
 
-def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done):
+def test_placing_resumes_from_a_stopped_run(photos, tmp_path, done):
     out = tmp_path / "out"
     assert refusal(place_photographs, photos, out, 1600, "SIMPLE_RADIAL", "auto", "global") == "broken"
     assert not (out / "sparse").exists()
@@ -445,7 +445,7 @@ def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done)
     assert (out / "images").is_dir()
 
 
-def test_photographs_are_not_placed_from_other_settings(photos, tmp_path, done):
+def test_placing_does_not_resume_with_other_settings(photos, tmp_path, done):
     out = tmp_path / "out"
     place_photographs(photos, out)
     assert "already contains a model" in refusal(place_photographs, photos, out)
@@ -455,7 +455,7 @@ def test_photographs_are_not_placed_from_other_settings(photos, tmp_path, done):
     assert done == ["match_features", "map_cameras"]
 
 
-def test_one_process_places_photographs_in_a_folder_at_a_time(photos, tmp_path, done, monkeypatch):
+def test_concurrent_placing_in_a_folder_is_refused(photos, tmp_path, done, monkeypatch):
     make, refused = prepare_steps.MatchFeatures.make, []
 
     def begins_another(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -471,7 +471,7 @@ def test_one_process_places_photographs_in_a_folder_at_a_time(photos, tmp_path, 
     assert not (tmp_path / "out" / ".steps" / "run.lock").exists()
 
 
-def test_images_of_the_user_are_not_overwritten(photos, tmp_path, done):
+def test_user_images_are_not_overwritten(photos, tmp_path, done):
     (tmp_path / "out" / "images").mkdir(parents=True)
     assert "already contains `images`" in refusal(place_photographs, photos, tmp_path / "out")
     assert done == []

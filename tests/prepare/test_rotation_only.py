@@ -45,18 +45,18 @@ def told(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
     return why_no_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
 
 
-def test_a_camera_that_turns_on_one_spot_tells_no_depth(tmp_path):
+def test_rotating_camera_gives_no_depth(tmp_path):
     assert "only rotated in place" in told(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
 
 
-def test_camera_turning_on_each_of_several_spots_gives_depths(tmp_path):
+def test_camera_rotating_at_several_positions_gives_depth(tmp_path):
     """Each photograph matches those of its own spot best."""
     assert told(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
 
 
-def test_copies_of_one_photograph_are_the_same(tmp_path):
+def test_copies_of_one_photograph_are_duplicates(tmp_path):
     assert "are all the same" in told(tmp_path, [(0, 0)] * 4)
 
 
-def test_copies_of_two_photographs_are_not_the_same(tmp_path):
+def test_copies_of_two_photographs_are_not_all_duplicates(tmp_path):
     assert told(tmp_path, [(0, -60), (0, -60), (0, 60), (0, 60)]) == "", "different places, twice each"

@@ -79,20 +79,20 @@ def pose_errors(placed: Path) -> np.ndarray:
     return errors / np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
 
 
-def test_cameras_are_where_they_were(placed):
+def test_cameras_match_the_ground_truth(placed):
     errors = pose_errors(placed)
     assert len(errors) == 14
     assert np.median(errors) < 0.01
     assert errors.max() < 0.03
 
 
-def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
+def test_cameras_are_reproducible(photos, placed, tmp_path):
     again = place(photos, tmp_path)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (again / "sparse" / "0" / name).read_bytes() == (placed / "sparse" / "0" / name).read_bytes(), name
 
 
-def test_points_that_two_photographs_show(placed, tmp_path):
+def test_points_with_two_observations(placed, tmp_path):
     """The cameras stay, and the points of three photographs; those of pairs come with them."""
     map_cameras(placed.with_name("matches"), tmp_path, min_track_length=2)
     model, before = read_model(tmp_path / "sparse" / "0"), read_model(placed / "sparse" / "0")
@@ -119,12 +119,12 @@ def read_model(folder: Path):
 
 
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
-def test_other_ways_to_match(photos, tmp_path, matching):
+def test_other_matching_modes(photos, tmp_path, matching):
     placed = place(photos, tmp_path, matching=matching, neighbors=3)
     assert len(read_scene(placed).views) >= 12
 
 
-def test_photographs_that_show_nothing(tmp_path):
+def test_photographs_without_features(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
@@ -133,7 +133,7 @@ def test_photographs_that_show_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
-def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkeypatch, few, attempt):
+def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, few, attempt):
     """With so few features of each photograph."""
     monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(480, 1500))
     for name in ("features", "matches", "cameras"):
@@ -147,7 +147,7 @@ def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkey
     assert not list((tmp_path / "cameras").glob(".*")), "what attempts have made is removed"
 
 
-def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, monkeypatch, caplog):
+def test_further_attempts_use_the_matching_mode_or_are_off(photos, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(320, 300))
     for name in ("features", "matches", "cameras", "once"):
         (tmp_path / name).mkdir()
@@ -188,7 +188,7 @@ def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_features_are_found_once_each_also_after_a_kill(few, tmp_path, monkeypatch):
+def test_features_are_extracted_once_despite_a_kill(few, tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
@@ -266,7 +266,7 @@ def test_pairs_are_matched_once(photos, placed, tmp_path):
         ).read_bytes()
 
 
-def test_pairs_are_matched_once_also_after_a_kill(placed, tmp_path):
+def test_pairs_are_matched_once_despite_a_kill(placed, tmp_path):
     source, database = placed.parent / "features", tmp_path / "database.db"
     killed = f"""
 import os, signal, threading, time
@@ -303,7 +303,7 @@ def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
 
 
-def test_features_are_counted_while_they_are_found(few, tmp_path):
+def test_extraction_reports_its_progress(few, tmp_path):
     heard: list[int] = []
 
     def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -316,7 +316,7 @@ def test_features_are_counted_while_they_are_found(few, tmp_path):
 
 
 @pytest.mark.parametrize("undefined", ["crop", "mask"])
-def test_undistortion_goes_on(tmp_path, monkeypatch, undefined):
+def test_undistortion_resumes(tmp_path, monkeypatch, undefined):
     source, written = shutil.copytree(data_set("fox_opencv"), tmp_path / "source"), []
     write = undistort_tool.write_image
 
@@ -360,7 +360,7 @@ def test_undistorted_images_do_not_mix_with_others(tmp_path):
 # ---- which photographs
 
 
-def test_photographs_are_found_below_the_folder(tmp_path):
+def test_photographs_in_subfolders_are_found(tmp_path):
     (tmp_path / "a" / ".hidden").mkdir(parents=True)
     (tmp_path / "runs").mkdir()
     for name in ("b.JPG", "a/ü 1.png", "a/.hidden/x.jpg", ".y.png", "runs/r.png", "K.txt", "c.tif"):
@@ -370,7 +370,7 @@ def test_photographs_are_found_below_the_folder(tmp_path):
     assert "has 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
 
 
-def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):
+def test_damaged_photographs_are_skipped_and_rotated_ones_turned(tmp_path, caplog):
     pytest.importorskip("pycolmap")
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -390,7 +390,7 @@ def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplo
     assert cv2.imread(str(images / "turned.jpg"), cv2.IMREAD_UNCHANGED).shape == (48, 32, 3)
 
 
-def test_alike_photographs(rng):
+def test_similar_photographs_are_paired(rng):
     """Each shares half of its features with the next one, in a ring."""
     halves = rng.random((6, 300, 128), dtype=np.float32)
     tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
@@ -460,7 +460,7 @@ def pattern(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return 127 + 100 * np.sin(2 * u) * np.cos(1.5 * v)
 
 
-def test_undistorted_photographs_are_smaller_and_kept(tmp_path):
+def test_undistorted_photographs_are_smaller_and_reused(tmp_path):
     source = data_set("brighton")
     count = undistort_scene(source, tmp_path / "out", long_side=120)
     views = read_scene(tmp_path / "out").views

@@ -84,7 +84,7 @@ def same(old, new, prefix=""):
 
 
 @pytest.mark.parametrize(("model", "lenses"), list(zip(LENSES, cycle((1, 3)), strict=False)))
-def test_colmap_gives_back_what_it_got(model, lenses, scene_of, tmp_path):
+def test_colmap_round_trip(model, lenses, scene_of, tmp_path):
     scene = scene_of(model, lenses)
     files = clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
     assert [file.name for file in files] == ["cameras.bin", "images.bin", "points3D.bin"]
@@ -95,7 +95,7 @@ def test_colmap_gives_back_what_it_got(model, lenses, scene_of, tmp_path):
 
 
 @pytest.mark.parametrize(("model", "lenses"), list(zip(DISTORTION, cycle((3, 1)), strict=False)))
-def test_nerfstudio_gives_back_what_it_got(model, lenses, scene_of, tmp_path, rng):
+def test_nerfstudio_round_trip(model, lenses, scene_of, tmp_path, rng):
     scene = scene_of(model, lenses)
     clsplat.write_cameras(scene, tmp_path / "out", "nerfstudio", images="copy")
     found = clsplat.read_scene(tmp_path / "out")
@@ -108,7 +108,7 @@ def test_nerfstudio_gives_back_what_it_got(model, lenses, scene_of, tmp_path, rn
 
 
 @pytest.mark.parametrize("model", sorted(LENSES.keys() - DISTORTION.keys()))
-def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_path):
+def test_lens_unknown_to_nerfstudio_is_refused(model, scene_of, tmp_path):
     with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or `clsplat data undistort` first"):
         clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
     assert not (tmp_path / "out").exists()
@@ -118,7 +118,7 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_pa
     Cameras(formats=["inria", "colmap"]).check_run(stage)
 
 
-def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path):
+def test_nerfstudio_has_validation_views_and_one_lens_model(scene_of, tmp_path):
     """It reads `camera_model` from the top alone, and asks for the views of `val_filenames` as it trains."""
     clsplat.write_cameras(scene_of("OPENCV_FISHEYE", 3), tmp_path / "a", "nerfstudio")
     table = json.loads((tmp_path / "a/transforms.json").read_text())
@@ -131,14 +131,14 @@ def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path)
     assert not [key for key in json.loads((tmp_path / "b/transforms.json").read_text()) if "filenames" in key]
 
 
-def test_two_kinds_of_lenses_are_refused_for_nerfstudio(scene_of, tmp_path):
+def test_nerfstudio_refuses_mixed_lens_models(scene_of, tmp_path):
     views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
     with pytest.raises(DataError, match=r"right/4\.png: is OPENCV_FISHEYE, other views are OPENCV"):
         clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
-def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, caplog):
+def test_cameras_json_has_undistorted_cameras(model, scene_of, tmp_path, caplog):
     scene = scene_of(model, 3)
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
@@ -152,7 +152,7 @@ def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, c
     np.testing.assert_allclose(np.array(first["rotation"])[:, 2], scene.views[0].world_to_camera[2, :3])
 
 
-def test_distorted_photographs_do_not_join_pinhole_cameras(scene_of, tmp_path):
+def test_distorted_images_are_refused_with_pinhole_cameras(scene_of, tmp_path):
     with pytest.raises(DataError, match=r"inria holds cameras of undistorted photographs, .*`clsplat data undistort`"):
         clsplat.write_cameras(scene_of("OPENCV"), tmp_path / "a", "inria", images="copy")
     assert not (tmp_path / "a").exists()
@@ -182,14 +182,14 @@ def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
 
 
 @pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
-def test_a_lost_split_is_said_in_a_line(form, lines, scene_of, tmp_path, caplog):
+def test_lost_split_is_logged_in_one_line(form, lines, scene_of, tmp_path, caplog):
     clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, form)
     words = f"{tmp_path}: {form} does not keep which views are for testing, 2 of 5; nerfstudio does"
     assert [record.levelname for record in caplog.records if record.getMessage() == words] == ["WARNING"] * lines
 
 
 @pytest.mark.parametrize("form", ["colmap", "nerfstudio", "inria"])
-def test_files_that_are_there_stay(form, scene_of, tmp_path):
+def test_existing_files_are_not_replaced(form, scene_of, tmp_path):
     scene = scene_of("PINHOLE")
     first = clsplat.write_cameras(scene, tmp_path / "a", form)
     again = clsplat.write_cameras(scene, tmp_path / "b", form)
@@ -198,7 +198,7 @@ def test_files_that_are_there_stay(form, scene_of, tmp_path):
         clsplat.write_cameras(scene, tmp_path / "a", form)
 
 
-def test_what_cannot_be_written_is_refused(scene_of, tmp_path):
+def test_unwritable_output_is_refused(scene_of, tmp_path):
     scene = scene_of("PINHOLE")
     with pytest.raises(ConfigError, match="no format 'meshroom'; there are colmap, nerfstudio, inria"):
         clsplat.write_cameras(scene, tmp_path / "out", "meshroom")
@@ -227,7 +227,7 @@ def with_tracks(scene, rng):
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-def test_colmap_keeps_which_points_photographs_show_and_where(model, scene_of, tmp_path, rng):
+def test_colmap_keeps_observations(model, scene_of, tmp_path, rng):
     scene = with_tracks(scene_of(model), rng)
     clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
     found = clsplat.read_scene(tmp_path / "out").tracks
@@ -244,7 +244,7 @@ def test_colmap_keeps_which_points_photographs_show_and_where(model, scene_of, t
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
-def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_path, rng):
+def test_optimized_cameras_keep_observations(model, scene_of, tmp_path, rng):
     scene = with_tracks(scene_of(model), rng)
     learned = [
         replace(
@@ -263,7 +263,7 @@ def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_
 
 
 @pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
-def test_exposures_lie_beside_copied_photographs(form, scene_of, tmp_path, rng, caplog):
+def test_exposures_are_written_next_to_copied_images(form, scene_of, tmp_path, rng, caplog):
     scene = with_tracks(scene_of("PINHOLE"), rng)
     noted = {view.name: CameraExposure(0.01 * (i + 1), 2.0, 100.0) for i, view in enumerate(scene.views[1:])}
     write_exposures(tmp_path / "photographs", noted)
@@ -279,7 +279,7 @@ def test_exposures_lie_beside_copied_photographs(form, scene_of, tmp_path, rng, 
     assert not (tmp_path / "alone/images").exists()
 
 
-def test_a_blender_scene_becomes_one_of_colmap(tiny_scene, tmp_path):
+def test_blender_scene_converts_to_colmap(tiny_scene, tmp_path):
     clsplat.write_cameras(tiny_scene, tmp_path / "out", images="copy")
     old, new = clsplat.read_scene(tiny_scene), clsplat.read_scene(tmp_path / "out")
     found = {view.name: view for view in new.views}
@@ -290,7 +290,7 @@ def test_a_blender_scene_becomes_one_of_colmap(tiny_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_takes_a_dataset_and_a_run(few_steps, tiny_scene, tmp_path):
+def test_command_accepts_a_dataset_or_a_run(few_steps, tiny_scene, tmp_path):
     command("data", "cameras", few_steps, tmp_path / "run", "--format", "nerfstudio", "--images", "copy")
     command("data", "cameras", tiny_scene, tmp_path / "set", "--format", "nerfstudio", "--images", "copy")
     files = [
@@ -303,14 +303,14 @@ def test_the_command_takes_a_dataset_and_a_run(few_steps, tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(("format_", "images"), [("nerfstudio", "none"), ("colmap", "none"), ("colmap", "copy")])
-def test_a_folder_without_photographs_is_told(format_, images, tiny_scene, tmp_path):
+def test_folder_without_images_is_reported(format_, images, tiny_scene, tmp_path):
     words = ["data", "cameras", str(tiny_scene), str(tmp_path / "out"), "--format", format_, "--images", images]
     told = CliRunner().invoke(cli.app, words).output
     assert ("with --images copy" in told) == (images == "none")
 
 
 @pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "brighton"])
-def test_data_sets_come_back_from_both(name, tmp_path):
+def test_datasets_survive_both_round_trips(name, tmp_path):
     scene = clsplat.read_scene(data_set(name))
     for form in ("colmap", "nerfstudio"):
         clsplat.write_cameras(scene, tmp_path / form, form, images="copy")

@@ -60,7 +60,7 @@ def assert_same_points(folder: Path, reconstruction) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_real_scene_equals_pycolmap(name: str) -> None:
+def test_real_scene_matches_pycolmap(name: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     path = data_set(name)
     scene = read_scene(path)
@@ -80,7 +80,7 @@ def test_real_scene_equals_pycolmap(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "kind"), [(name, ("bin", "txt")[i % 2]) for i, name in enumerate(STATUES)])
-def test_every_camera_model_equals_pycolmap(name: str, kind: str) -> None:
+def test_every_camera_model_matches_pycolmap(name: str, kind: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     folder = data_set(name) / ("text" if kind == "txt" else ".")
     reconstruction = pycolmap.Reconstruction(folder)
@@ -170,7 +170,7 @@ def test_written_model_is_read_back(tmp_path_factory: pytest.TempPathFactory, ki
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_the_writer_writes_what_pycolmap_reads(tmp_path: Path, kind: str) -> None:
+def test_pycolmap_reads_written_models(tmp_path: Path, kind: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = replace(tiny_model(), points=[replace(point, track=0) for point in tiny_model().points])
     write_model(tmp_path, replace(model, images=[replace(image, points2d=0) for image in model.images]), kind)
@@ -182,7 +182,7 @@ def test_the_writer_writes_what_pycolmap_reads(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
-def test_model_may_lie_in_three_places(tmp_path: Path, place: str) -> None:
+def test_model_is_found_in_three_folders(tmp_path: Path, place: str) -> None:
     write_scene(tmp_path, tiny_model())
     model = tmp_path / "sparse" / "0"
     for file in sorted(model.iterdir()):
@@ -198,7 +198,7 @@ def test_the_model_folder_itself_may_be_named(tmp_path: Path, place: str) -> Non
     assert read_scene(path).views[0].image_path == tmp_path / "images" / "a.jpg"
 
 
-def test_largest_model_is_taken_and_the_others_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_largest_model_is_used_and_others_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_scene(tmp_path, replace(tiny_model(), images=tiny_model().images[:2]))
     write_scene(tmp_path / "one", tiny_model())
     (tmp_path / "one" / "sparse" / "0").rename(tmp_path / "sparse" / "1")
@@ -236,7 +236,7 @@ def test_points_may_be_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_points_that_are_not_finite_are_dropped(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_nonfinite_points_are_dropped(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     positions = [(1.0, math.nan, 3.0), (1.0, 2.0, 3.0), (math.inf, 0.0, 0.0), (1e300, 0.0, 0.0)]
     model = replace(tiny_model(), points=[PointEntry(position) for position in positions])
     points = read_scene(write_scene(tmp_path, model, kind)).points

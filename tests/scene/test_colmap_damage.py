@@ -62,7 +62,7 @@ def test_huge_count_allocates_nothing(tmp_path: Path, stem: str, offset: int, co
     assert f"{stem}.bin: byte {offset + 8}" in message
 
 
-def test_name_without_end(tmp_path: Path) -> None:
+def test_unterminated_name(tmp_path: Path) -> None:
     file = write_scene(tmp_path, ColmapModel([PINHOLE], [ImageEntry("abcdefgh")])) / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"\0" * 9, b"\1" * 9))  # the end of the name and the count after it
     assert "image name" in refusal(read_scene, tmp_path)
@@ -91,7 +91,7 @@ def test_random_damage_raises_nothing_else(tmp_path_factory, kind: str, data: st
 @pytest.mark.parametrize(
     "name", ["../a.jpg", "/etc/a.jpg", "x/../../a.jpg", "..\\a.jpg", "C:\\a.jpg", "", ".", "a\n.jpg"]
 )
-def test_name_that_leaves_the_image_folder(tmp_path: Path, name: str) -> None:
+def test_name_outside_the_image_folder(tmp_path: Path, name: str) -> None:
     write_model(tmp_path / "sparse" / "0", replace(tiny_model(), images=[ImageEntry(name), ImageEntry("a.jpg")]))
     assert "not a path below" in refusal(read_scene, tmp_path)
 
@@ -108,20 +108,20 @@ def test_name_that_leaves_the_image_folder(tmp_path: Path, name: str) -> None:
         ((1, 0, 0, 0), (0, 1e300, 0)),  # the extent of the scene would be infinite
     ],
 )
-def test_pose_that_is_none(tmp_path: Path, quaternion: tuple[float, ...], translation: tuple[float, ...]) -> None:
+def test_invalid_pose(tmp_path: Path, quaternion: tuple[float, ...], translation: tuple[float, ...]) -> None:
     images = [*tiny_model().images, ImageEntry("bad.jpg", 1, quaternion, translation)]
     assert "the pose of 'bad.jpg'" in refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
 
 
 @pytest.mark.parametrize(("kind", "width"), [("bin", 2**15 + 1), ("bin", 2**63), ("txt", 99999999999999999999)])
-def test_a_camera_wider_than_any_photograph(tmp_path: Path, kind: str, width: int) -> None:
+def test_camera_wider_than_any_image(tmp_path: Path, kind: str, width: int) -> None:
     camera = replace(PINHOLE, width=width)
     message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]), kind))
     assert f"camera 1 is {width}x48" in message
     assert "at most 32768" in message
 
 
-def test_a_focal_length_of_almost_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_tiny_focal_length(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     camera = replace(PINHOLE, model="OPENCV_FISHEYE", params=(5e-324, 50.0, 32.0, 24.0, 0.1, 0.0, 0.0, 0.0))
     assert "focal lengths from 0.001 on" in refusal(
         read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
@@ -136,7 +136,7 @@ def test_unknown_camera(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("model", "params"), [("SIMPLE_DIVISION", (50, 32, 24, 0)), ("FISHEYE", (50, 50, 32, 24))])
-def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
+def test_unsupported_lenses_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
     camera = CameraEntry(3, model, 64, 48, params)
     message = refusal(
         read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
@@ -146,13 +146,13 @@ def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, p
     assert "colmap image_undistorter" in message
 
 
-def test_distortion_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
+def test_nan_distortion_is_refused(tmp_path: Path) -> None:
     camera = CameraEntry(3, "OPENCV", 64, 48, (50, 50, 32, 24, math.nan, 0, 0, 0))
     message = refusal(read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3)])))
     assert "finite numbers" in message
 
 
-def test_distorted_camera_without_images_does_no_harm(tmp_path: Path) -> None:
+def test_distorted_camera_without_images_is_ignored(tmp_path: Path) -> None:
     fisheye = CameraEntry(9, "OPENCV_FISHEYE", 64, 48, (50, 50, 32, 24, 0.1, 0, 0, 0))
     scene = read_scene(write_scene(tmp_path, replace(tiny_model(), cameras=[PINHOLE, fisheye])))
     assert len(scene.views) == 3
@@ -169,7 +169,7 @@ def test_distorted_camera_without_images_does_no_harm(tmp_path: Path) -> None:
         replace(PINHOLE, params=(50.0, 51.0, math.nan, 25.25)),
     ],
 )
-def test_camera_that_is_none(tmp_path: Path, camera: CameraEntry) -> None:
+def test_invalid_camera(tmp_path: Path, camera: CameraEntry) -> None:
     assert "expected a positive size" in refusal(
         read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
     )
@@ -200,7 +200,7 @@ def test_model_without_images_or_folder(tmp_path: Path) -> None:
     assert "no images" in refusal(read_scene, write_scene(tmp_path / "empty", replace(tiny_model(), images=[])))
 
 
-def test_detect_says_what_it_looked_for(tmp_path: Path) -> None:
+def test_detect_lists_the_expected_files(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"looked for multi-camera video .* COLMAP .* Blender .* nerfstudio"):
         read_scene(tmp_path)
     with pytest.raises(DataError, match="no such folder"):

@@ -47,7 +47,7 @@ def test_the_example_is_short():
 
 
 @pytest.mark.usefixtures("_plugin")
-def test_a_scene_reads_as_it_does_from_colmap(scene):
+def test_scene_equals_its_colmap_version(scene):
     original, read = read_scene(scene), read_scene(scene / "images")
     assert is_scene(scene / "images")
     assert (read.train, read.test, read.points) == (original.train, original.test, None)
@@ -58,7 +58,7 @@ def test_a_scene_reads_as_it_does_from_colmap(scene):
 
 
 @pytest.mark.usefixtures("_plugin")
-def test_an_inspection_agrees_with_that_of_colmap(scene):
+def test_inspection_matches_that_of_colmap(scene):
     expected, found = Inspection.from_folder(scene), Inspection.from_folder(scene / "images")
     assert (found.facts.kind, found.verdict) == ("CSV", "ready to train")
     for name in ("registered", "train", "test", "on_disk", "missing", "unregistered", "cameras", "photos"):
@@ -90,7 +90,7 @@ def test_a_missing_photograph_is_named(scene):
         (3, "01.png,", "01.png,0,0,0,0,0,0,0,60,60,32,24,64,48\n"),
     ],
 )
-def test_damage_is_named_by_file_and_line(scene, line, old, new):
+def test_damage_is_reported_with_file_and_line(scene, line, old, new):
     file = scene / "images" / "cameras.csv"
     lines = file.read_text().splitlines()
     assert old in lines[line - 1]

@@ -259,7 +259,7 @@ def fault_of(name: str, result: dict[str, object]) -> str:
 
 
 @pytest.mark.large
-def test_a_damaged_dataset_is_a_sentence_and_a_code(said):
+def test_damaged_dataset_gives_one_sentence_and_a_code(said):
     faults = [fault for name in CASES if (fault := fault_of(name, said[name]))]
     assert not faults, "\n".join(faults)
 

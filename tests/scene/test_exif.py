@@ -42,19 +42,19 @@ def with_exposure(order: str = "<", seconds=(1, 100), aperture=(2, 1), iso: int 
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_a_jpeg_tells_its_exposure(tmp_path, order):
+def test_exposure_is_read_from_jpeg(tmp_path, order):
     (tmp_path / "a.jpg").write_bytes(with_exposure(order))
     assert read_exif_exposure(tmp_path / "a.jpg") == EXPOSURE
     assert EXPOSURE.value == pytest.approx(np.log2(0.01 * 100 / 4))
 
 
 @pytest.mark.parametrize("change", [{"seconds": (1, 0)}, {"aperture": (0, 1)}, {"iso": 0}])
-def test_values_that_are_no_positive_numbers_are_none(tmp_path, change):
+def test_nonpositive_values_are_none(tmp_path, change):
     (tmp_path / "a.jpg").write_bytes(with_exposure(**change))
     assert read_exif_exposure(tmp_path / "a.jpg") is None
 
 
-def test_every_cut_or_changed_exif_block_is_an_exposure_or_none(tmp_path):
+def test_damaged_exif_gives_an_exposure_or_none(tmp_path):
     data = with_exposure()
     for at in range(2, 130):
         for damaged in (data[:at], data[:at] + b"\xff" + data[at + 1 :], data[:at] + b"\0" + data[at + 1 :]):
@@ -63,7 +63,7 @@ def test_every_cut_or_changed_exif_block_is_an_exposure_or_none(tmp_path):
             assert found is None or np.isfinite(found.value)
 
 
-def test_a_file_beside_the_images_holds_what_they_lost(tmp_path):
+def test_exposures_file_round_trip(tmp_path):
     write_exposures(tmp_path, {"a.png": EXPOSURE, "b.png": None})
     assert read_exposures(tmp_path) == {"a.png": EXPOSURE}
     write_exposures(tmp_path / "none", {"a.png": None})
@@ -80,12 +80,12 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
 
 
 @pytest.mark.parametrize("numbers", [(1e9, 2, 100), (0.01, 1e200, 100), (0.01, 2, 1e-300), (0.01, 0, 100), (0.01, 2)])
-def test_what_no_camera_can_have_is_no_exposure(numbers):
+def test_impossible_exposures_are_ignored(numbers):
     assert make_exposure(*numbers, *[None] * (3 - len(numbers))) is None
     assert make_exposure(0.01, 2, 100) is not None
 
 
-def test_a_photograph_that_is_turned_keeps_its_exposure(tmp_path):
+def test_rotated_image_keeps_its_exposure(tmp_path):
     """So does its upright copy."""
     for number, orientation in enumerate((1, 6, 1)):
         (tmp_path / f"{number}.jpg").write_bytes(with_exposure(iso=100 * (number + 1), orientation=orientation))
@@ -102,7 +102,7 @@ def view(path: Path, name: str) -> View:
     return View(name, CAMERA, np.eye(3, 4), path / name)
 
 
-def test_what_lies_beside_comes_before_the_images_own(tmp_path):
+def test_exposures_file_takes_precedence_over_exif(tmp_path):
     (tmp_path / "in").mkdir()
     for name in ("in/a.jpg", "b.jpg"):
         (tmp_path / name).write_bytes(with_exposure())

@@ -39,7 +39,7 @@ def test_a_far_camera_does_not_change_the_extent(distance):
     ],
     ids=["orbit", "walk", "one place", "one step", "close-ups and overviews", "two", "one"],
 )
-def test_healthy_cameras_all_count(centers):
+def test_all_valid_cameras_count(centers):
     views = views_at(centers)
     assert not outlier_cameras(views).any()
     points = np.asarray(centers, float)

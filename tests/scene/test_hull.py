@@ -14,7 +14,7 @@ from clsplat.scene.visual_hull import Silhouette, hull_points
 from tests.support.silhouettes import RADIUS, SIZE, ball, ring
 
 
-def test_a_ball_is_found_with_its_colors():
+def test_ball_is_reconstructed_with_its_colors():
     points = hull_points(ring(), np.zeros(3), 1.0, ball, 4000, 0)
     assert len(points) == 4000
     radius = np.linalg.norm(points.positions, axis=1)
@@ -25,21 +25,21 @@ def test_a_ball_is_found_with_its_colors():
 
 
 @pytest.mark.parametrize("count", [100, 1000, 20_000])
-def test_the_cells_are_as_small_as_the_number_of_points_asks(count):
+def test_cell_size_follows_the_number_of_points(count):
     points = hull_points(ring(), np.zeros(3), 1.0, ball, count, 0)
     assert len(points) == count
     error = np.abs(np.linalg.norm(points.positions, axis=1) - RADIUS)
     assert np.median(error) < 0.5 * np.sqrt(4 * np.pi * RADIUS**2 / count) + 0.5 * 4 / 150, "half a cell, half a pixel"
 
 
-def test_the_same_points_every_time_and_others_of_another_seed():
+def test_points_depend_only_on_the_seed():
     first, second, other = (hull_points(ring(), np.zeros(3), 1.0, ball, 500, seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.positions, second.positions)
     np.testing.assert_array_equal(first.colors, second.colors)
     assert not np.array_equal(first.positions, other.positions)
 
 
-def test_one_view_showing_the_body_elsewhere_leaves_nothing():
+def test_one_inconsistent_silhouette_empties_the_hull():
     """A cell that lies outside the silhouette of a single view is empty."""
     views = ring()
     points = hull_points(
@@ -67,14 +67,14 @@ def narrow_ball(view: View, center=(0.0, 0.0, 0.0), radius=0.3) -> np.ndarray:
     return large[middle : middle + SIZE, middle : middle + SIZE]
 
 
-def test_views_that_do_not_see_a_cell_have_no_say():
+def test_views_that_miss_a_cell_do_not_carve_it():
     """Of a ball beside the axis, which a third of the views do not show."""
     points = hull_points(narrow_views(), np.zeros(3), 1.0, lambda view: narrow_ball(view, (0.3, 0, 0), 0.2), 500, 0)
     near = np.linalg.norm(points.positions - [0.3, 0, 0], axis=1)
     assert (np.abs(near - 0.2) < 0.06).mean() > 0.9
 
 
-def test_nothing_is_made_of_what_few_views_see():
+def test_cells_seen_by_few_views_are_dropped():
     """The corners of the box lie in the images of a few views, which see the ball before them or behind."""
     points = hull_points(narrow_views(), np.zeros(3), 1.3, narrow_ball, 2000, 0)
     assert len(points) > 1000
@@ -101,7 +101,7 @@ def test_an_alpha_that_ends_below_255_is_opaque():
     assert len(hull_points(ring(), np.zeros(3), 1.0, matte, 500, 0)) == 500
 
 
-def test_photographs_are_read_small_and_not_all(monkeypatch):
+def test_hull_reads_a_few_downscaled_images(monkeypatch):
     monkeypatch.setattr(visual_hull, "LONG_SIDE", 60)
     monkeypatch.setattr(visual_hull, "MAX_VIEWS", 20)
     sizes = []
@@ -116,7 +116,7 @@ def test_photographs_are_read_small_and_not_all(monkeypatch):
 
 
 @pytest.mark.parametrize("alpha", [0, 255])
-def test_fully_transparent_or_opaque_photographs_have_no_hull(alpha):
+def test_fully_transparent_or_opaque_images_have_no_hull(alpha):
     image = np.full((SIZE, SIZE, 4), alpha, np.uint8)
     assert not len(hull_points(ring(), np.zeros(3), 0.3, lambda view: image, 500, 0))
 
@@ -125,7 +125,7 @@ def test_photographs_without_transparency_have_no_hull():
     assert not len(hull_points(ring(), np.zeros(3), 1.0, lambda view: None, 500, 0))
 
 
-def test_a_camera_inside_the_box_and_one_that_looks_away():
+def test_cameras_inside_the_box_or_facing_away():
     views = ring()
     inside = View.looking_at([0.7, 0, 0], [0, 0, 0], [0, 0, 1], views[0].camera, name="inside")
     away = View.looking_at([4, 0, 0], [8, 0, 0], [0, 0, 1], views[0].camera, name="away")
@@ -134,7 +134,7 @@ def test_a_camera_inside_the_box_and_one_that_looks_away():
     assert np.abs(np.linalg.norm(points.positions, axis=1) - RADIUS).max() < 0.06
 
 
-def test_a_photograph_with_its_alpha(tmp_path: Path):
+def test_image_with_alpha(tmp_path: Path):
     """At half the size; not of one that has none, or whose alpha is a mask."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (8, 12, 4), np.uint8)

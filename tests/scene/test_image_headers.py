@@ -52,7 +52,7 @@ def test_orientation(tmp_path, order, orientation, expected):
 @pytest.mark.parametrize(
     ("suffix", "behind"), [(".png", b""), (".jpg", bytes(100)), (".png", bytes(200_000)), (".jpg", bytes(200_000))]
 )
-def test_the_end_is_found_before_what_is_appended(tmp_path, suffix, behind):
+def test_image_end_is_before_appended_data(tmp_path, suffix, behind):
     whole = encoded(suffix)
     (tmp_path / f"a{suffix}").write_bytes(whole + behind)
     assert read_header(tmp_path / f"a{suffix}").complete
@@ -60,7 +60,7 @@ def test_the_end_is_found_before_what_is_appended(tmp_path, suffix, behind):
     assert not read_header(tmp_path / f"a{suffix}").complete
 
 
-def test_what_is_no_image(tmp_path):
+def test_files_that_are_not_images(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"")
     for file in (tmp_path / "a.jpg", tmp_path / "none.jpg", tmp_path):
         with pytest.raises(DataError):

@@ -127,7 +127,7 @@ def test_downscaling_is_a_box_mean(tmp_path: Path, factor: int) -> None:
     assert abs((image - mean).mean()) < 0.02
 
 
-def test_alpha_is_averaged_apart_from_the_colors(tmp_path: Path) -> None:
+def test_alpha_is_averaged_separately_from_colors(tmp_path: Path) -> None:
     pixels = random(48, 64, 4)
     image = load_image(view_of(stored(tmp_path / "a.png", pixels), 32, 24), WHITE)
     mean = pixels.reshape(24, 2, 32, 2, 4).mean(axis=(1, 3)) / 255
@@ -143,7 +143,7 @@ def test_alpha_is_averaged_apart_from_the_colors(tmp_path: Path) -> None:
         ((100, 100), (7, 7), 37),
     ],
 )
-def test_flat_region_keeps_its_level(tmp_path: Path, size, camera, level: int) -> None:
+def test_flat_region_keeps_its_value(tmp_path: Path, size, camera, level: int) -> None:
     """Truncation must not turn 199.99999 into 199."""
     flat = np.full((size[1], size[0], 4), level, np.uint8)
     flat[:, :, 3] = 255
@@ -160,7 +160,7 @@ def test_every_downscaled_camera_finds_its_image(tmp_path_factory, width: int, h
 
 
 @pytest.mark.parametrize("size", [(64, 50), (65, 48), (32, 26), (128, 96)])
-def test_wrong_size_names_both(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_wrong_size_names_both_sizes(tmp_path: Path, size: tuple[int, int]) -> None:
     path = stored(tmp_path / "a.png", random(48, 64, 3))
     message = refusal(load_image, view_of(path, *size))
     assert "64x48" in message
@@ -206,7 +206,7 @@ def test_write_below_a_file(tmp_path: Path) -> None:
         write_image(tmp_path / "file" / "a.png", random(2, 2, 3))
 
 
-def test_missing_files_are_named_at_a_readable_length(tmp_path):
+def test_long_lists_of_missing_files_are_shortened(tmp_path):
     names = [tmp_path / f"{'a' * 5000}{number}.png" for number in range(5)]
     message = refusal(require_files, tmp_path, names)
     assert "5 of 5 image files are missing" in message

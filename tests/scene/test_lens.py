@@ -14,7 +14,7 @@ from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.data_sets import data_set
 
 
-def test_every_model_projects_as_colmap_does():
+def test_every_model_projects_like_colmap():
     """Worst error 0.01 px, for a field-of-view lens so weak that COLMAP takes a series; the others 1e-12."""
     cases = json.loads((data_set("colmap_models") / "projection_oracle.json").read_text())
     assert {case["model"] for case in cases.values()} == set(MODELS)
@@ -28,7 +28,7 @@ def test_every_model_projects_as_colmap_does():
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])
-def test_pixels_that_settled_have_the_bits_of_all_rounds(lens):
+def test_converged_pixels_match_the_full_iteration(lens):
     """Beyond the photograph some never settle, and some become infinite."""
     x, y = np.meshgrid(np.linspace(-40, lens.width + 40, 97), np.linspace(-40, lens.height + 40, 71))
     fx, fy, cx, cy, rest = lens._split
@@ -74,7 +74,7 @@ def test_undistorted_photographs_agree_with_the_lens(lens):
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])
-def test_the_whole_photograph(lens):
+def test_wide_pinhole_covers_the_whole_image(lens):
     """Every ray within 60 degrees and twice the size is in the wide pinhole; it shows what its mask says, to 0.1 px."""
     lens = replace(lens, whole=True)
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
@@ -110,13 +110,13 @@ def test_no_pixel_of_the_pinhole_is_blank(lens):
     assert y.max() < lens.height + 0.5
 
 
-def test_a_lens_without_distortion_changes_nothing(rng):
+def test_undistorted_lens_changes_nothing(rng):
     lens = Lens(40, 30, "OPENCV", (50.0, 51.0, 19.0, 16.0, 0.0, 0.0, 0.0, 0.0))
     assert not lens.has_distortion
     assert (lens.pinhole.width, lens.pinhole.height) in [(40, 30), (39, 29), (40, 29), (39, 30)]
     assert FISHEYE.has_distortion
 
 
-def test_a_lens_that_cannot_be_inverted_is_refused():
+def test_non_invertible_lens_is_refused():
     with pytest.raises(DataError, match="calibrate the camera again"):
         _ = Lens(100, 100, "SIMPLE_RADIAL", (1.0, 50.0, 50.0, -9.0)).pinhole

@@ -58,7 +58,7 @@ def test_masks_of_every_kind_of_dataset(tiny_scene, tmp_path, suffix):
         assert load_mask(views[0])[:5].all()
 
 
-def test_masks_of_frames_lie_in_folders_of_cameras(tmp_path):
+def test_masks_of_frames_are_in_camera_folders(tmp_path):
     scene = several_cameras(tmp_path / "scene", {"a": 3, "b": 3})
     masks = masks_of(scene, tmp_path / "masks")
     views = applied(scene, masks).views
@@ -66,7 +66,7 @@ def test_masks_of_frames_lie_in_folders_of_cameras(tmp_path):
     assert len({view.mask_path for view in views}) == 6
 
 
-def test_they_do_not_replace_those_of_the_dataset(tmp_path):
+def test_masks_do_not_replace_those_of_the_dataset(tmp_path):
     """Which may say what no photograph shows, as those of undistortion do."""
     scene = write(tmp_path / "scene", tiny_model())
     masks_of(scene, scene / "masks")
@@ -75,7 +75,7 @@ def test_they_do_not_replace_those_of_the_dataset(tmp_path):
     assert "remove scene.masks" in told
 
 
-def test_the_folder_is_found_from_elsewhere(tiny_scene, tmp_path, monkeypatch):
+def test_mask_folder_does_not_depend_on_the_working_folder(tiny_scene, tmp_path, monkeypatch):
     masks_of(tiny_scene, tmp_path / "masks")
     monkeypatch.chdir(tmp_path)
     settings = SceneSettings(path=str(tiny_scene), masks="masks")
@@ -83,13 +83,13 @@ def test_the_folder_is_found_from_elsewhere(tiny_scene, tmp_path, monkeypatch):
     assert settings.read(tiny_scene)[0].views[0].mask_path.is_relative_to(tmp_path / "masks")
 
 
-def test_photographs_that_are_prepared_have_other_shapes(tmp_path):
+def test_masks_are_refused_for_photos_to_be_undistorted(tmp_path):
     pipeline = load("photos", [f"scene.path='{tmp_path}'", f"scene.masks='{tmp_path}'"])
     with pytest.raises(ConfigError, match=r"scene\.masks: masks do not fit photos that are still to be undistorted"):
         pipeline.preparation(tmp_path / "run")
 
 
-def test_a_photograph_without_a_mask_counts_whole_and_is_named(tiny_scene, tmp_path, caplog):
+def test_image_without_a_mask_counts_fully_and_is_named(tiny_scene, tmp_path, caplog):
     masks = masks_of(tiny_scene, tmp_path / "masks")
     first = read_scene(tiny_scene).views[0].name
     (masks / first).with_suffix(".png").unlink()
@@ -100,7 +100,7 @@ def test_a_photograph_without_a_mask_counts_whole_and_is_named(tiny_scene, tmp_p
     )
 
 
-def test_a_folder_without_masks_of_these_photographs_is_refused(tiny_scene, tmp_path):
+def test_folder_without_matching_masks_is_refused(tiny_scene, tmp_path):
     first = read_scene(tiny_scene).views[0].name
     told = refusal(applied, tiny_scene, tmp_path / "nowhere")
     assert told.startswith(f"{tmp_path / 'nowhere'}: no such folder; expected ")
@@ -123,7 +123,7 @@ def test_a_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp
 # ---- they alone train, and are measured
 
 
-def test_what_they_leave_out_changes_not_a_bit(tiny_scene, tmp_path):
+def test_excluded_pixels_do_not_change_the_model(tiny_scene, tmp_path):
     masks = masks_of(tiny_scene, tmp_path / "masks")
     digests, figures = [], []
     for filling in (0, 77):
@@ -140,7 +140,7 @@ def test_what_they_leave_out_changes_not_a_bit(tiny_scene, tmp_path):
     assert figures[0] == figures[1]
 
 
-def test_a_run_does_not_go_on_with_other_masks(tiny_scene, tmp_path):
+def test_run_does_not_resume_with_other_masks(tiny_scene, tmp_path):
     masks = masks_of(tiny_scene, tmp_path / "masks")
     out, place = tmp_path / "run", f"scene.masks='{masks}'"
     train(tiny_scene, out, "optimize.steps=12", place)
@@ -153,7 +153,7 @@ def test_a_run_does_not_go_on_with_other_masks(tiny_scene, tmp_path):
     command(*again, f"scene.masks='{moved}'")  # the same content elsewhere
 
 
-def test_masks_are_part_of_what_a_cell_is(tiny_scene, tmp_path):
+def test_cell_identity_includes_masks(tiny_scene, tmp_path):
     masks = masks_of(tiny_scene, tmp_path / "masks")
 
     def known(*settings: str) -> str:

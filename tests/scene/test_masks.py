@@ -32,7 +32,7 @@ def view_of(path: Path, width: int, height: int, **more: object) -> View:
 # ---- which pixels count
 
 
-def test_white_counts(tmp_path, rng):
+def test_white_pixels_count(tmp_path, rng):
     photo = store(tmp_path / "a.png", np.full((4, 6, 3), 90, np.uint8))
     white = rng.random((4, 6)) < 0.5
     mask = store(tmp_path / "m.png", np.where(white, 255, 0).astype(np.uint8))
@@ -40,7 +40,7 @@ def test_white_counts(tmp_path, rng):
     assert load_mask(view_of(photo, 6, 4)) is None
 
 
-def test_a_pixel_counts_when_the_whole_of_it_does(tmp_path):
+def test_only_fully_unmasked_pixels_count(tmp_path):
     photo = store(tmp_path / "a.png", np.full((4, 8, 3), 90, np.uint8))
     white = np.full((4, 8), 255, np.uint8)
     white[0, 0] = 0
@@ -65,7 +65,7 @@ def test_mask_of_another_size_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["IMG_01.png", "IMG_01.jpg.png"])
-def test_masks_beside_a_colmap_scene(tmp_path, name):
+def test_colmap_scene_with_a_mask_folder(tmp_path, name):
     source = data_set("brighton")
     shutil.copytree(source / "sparse", tmp_path / "sparse")
     (tmp_path / "images").symlink_to(source / "images")
@@ -82,7 +82,7 @@ def test_masks_beside_a_colmap_scene(tmp_path, name):
 # ---- they alone train, and are measured
 
 
-def test_what_is_masked_changes_not_a_bit(tiny_scene, tmp_path):
+def test_masked_pixels_do_not_change_the_model(tiny_scene, tmp_path):
     """Neither of the model nor of the figures, whatever the photographs hold there."""
     figures, digests = [], []
     for filling in (0, 77):
@@ -97,7 +97,7 @@ def test_what_is_masked_changes_not_a_bit(tiny_scene, tmp_path):
     assert digest(tmp_path / "unmasked") != digests[0]
 
 
-def test_figures_are_means_over_what_counts(rng):
+def test_metrics_average_over_counted_pixels(rng):
     image, photograph = (rng.integers(0, 256, (30, 40, 3)).astype(np.uint8) for _ in range(2))
     mask = rng.random((30, 40)) < 0.7
     error = ((image.astype(float) - photograph)[mask] ** 2).mean() / 255**2
@@ -109,7 +109,7 @@ def test_figures_are_means_over_what_counts(rng):
 # ---- turned photographs
 
 
-def test_turned_photographs(tmp_path):
+def test_masks_of_rotated_images(tmp_path):
     """A camera of the turned photograph gets it turned, one of the stored photograph as stored."""
     pixels = np.zeros((8, 16, 3), np.uint8)
     pixels[:, :8] = 255

@@ -50,7 +50,7 @@ def tiny_colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_no_training_view_shares_a_held_out_camera_or_moment(scene):
+def test_training_views_share_no_held_out_camera_or_time(scene):
     train, test = (scene.split(name) for name in ("train", "test"))
     assert (len(train), len(test)) == (2 * 5, 6)
     assert distinct_times(train) == pytest.approx([0, 0.2, 0.6, 0.8, 1])
@@ -79,7 +79,7 @@ def test_static_parts_never_change_and_three_things_do():
     assert not np.allclose(lamp.paint(p), last[-1].paint(p))
 
 
-def test_points_have_the_moment_at_which_they_were_seen(scene):
+def test_points_have_their_observation_time(scene):
     points = scene.points
     assert points is not None
     assert points.times is not None
@@ -91,7 +91,7 @@ def test_points_have_the_moment_at_which_they_were_seen(scene):
     assert np.median(np.linalg.norm(points.positions[ball] - way, axis=1)) == pytest.approx(0.13, abs=0.02)
 
 
-def test_the_folder_is_the_same_each_time(folder, tmp_path):
+def test_folder_is_reproducible(folder, tmp_path):
     write_dataset(tmp_path / "again", SMALL, workers=1)
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert len(files) == 10 + 6 + 1 + 4
@@ -111,7 +111,7 @@ def timed(*times: float, **values: object) -> list[dict]:
     return [frame | {"time": time} for frame, time in zip(frames(*names, **values), times, strict=True)]
 
 
-def test_times_of_any_unit_become_those_of_the_scene(tmp_path):
+def test_times_of_any_unit_are_normalized(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=timed(30, 10, 20))
     assert [view.time for view in read_scene(path, 0).views] == [1, 0, 0.5]
 
@@ -122,7 +122,7 @@ def test_a_blender_scene_has_one_clock_for_both_files(tmp_path):
     assert [view.time for view in read_scene(train).views] == [0, 0.5, 1]
 
 
-def test_a_scene_without_times_does_not_move(tmp_path):
+def test_scene_without_times_is_static(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=frames("0.png", "1.png"))
     assert [view.time for view in read_scene(path).views] == [None, None]
     assert "times" not in summarize(Inspection.from_folder(path).facts)
@@ -139,7 +139,7 @@ def test_a_scene_without_times_does_not_move(tmp_path):
         ([0, 10**17, 1e17], "frames[1]: time is 100000000000000000; expected a number between -1e+15 and 1e+15"),
     ],
 )
-def test_wrong_times_are_refused_with_their_place(tmp_path, times, message):
+def test_invalid_times_are_refused_with_their_location(tmp_path, times, message):
     table = timed(*times)
     for frame in table:
         if frame["time"] is None:
@@ -152,7 +152,7 @@ def test_wrong_times_are_refused_with_their_place(tmp_path, times, message):
     assert any(message.split(".*")[-1] in finding.text for finding in found.findings)
 
 
-def test_a_mask_of_what_is_static_must_be_there(tmp_path):
+def test_missing_static_mask_is_refused(tmp_path):
     table = timed(0, 1)
     table[1]["static_path"] = "still.png"
     assert "still.png" in refusal(read_scene, write(tmp_path / "a", **LENS, frames=table))
@@ -181,7 +181,7 @@ def test_times_of_points_in_another_unit_are_refused(tmp_path):
     assert fault in [finding.text for finding in Inspection.from_folder(path).findings]
 
 
-def test_damaged_static_mask_is_found_before_training(tmp_path):
+def test_damaged_static_mask_is_refused_before_training(tmp_path):
     table = timed(0, 1, 2)
     for frame in table:
         frame["static_path"] = "still.png"
@@ -207,14 +207,14 @@ def test_folder_of_frames_per_camera_is_a_moving_scene(tmp_path):
     assert len(group_by_camera(scene.views)) == 2
 
 
-def test_frames_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+def test_frames_are_sorted_by_number(tmp_path):
     folder = several_cameras(tmp_path, {"a": 3})
     for old, new in (("0000", "9"), ("0001", "10"), ("0002", "100")):
         (folder / "videos" / "a" / f"{old}.png").rename(folder / "videos" / "a" / f"{new}.png")
     assert [view.name for view in read_scene(folder, 0).views] == ["a/9.png", "a/10.png", "a/100.png"]
 
 
-def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
+def test_videos_can_use_colmap_cameras(tiny_colmap, tmp_path):
     scene = read_scene(tiny_colmap, 0)
     for view in scene.views[:2]:
         folder = tmp_path / "videos" / Path(view.name).stem
@@ -239,12 +239,12 @@ def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
         ({"a": 2, "b": 0}, (), "1 of 2 cameras have no frames: b"),
     ],
 )
-def test_videos_that_do_not_fit_their_cameras_are_refused(tmp_path, counts, posed, message):
+def test_videos_of_the_wrong_size_are_refused(tmp_path, counts, posed, message):
     (tmp_path / "videos").mkdir()
     assert message in refusal(read_scene, several_cameras(tmp_path, counts, *posed))
 
 
-def test_clip_named_after_no_camera_leaves_scene_to_its_reader(tmp_path):
+def test_video_without_a_matching_camera_is_ignored(tmp_path):
     several_cameras(tmp_path, {}, "0001", "0002")
     (tmp_path / "images").mkdir()
     for name in ("0001", "0002"):
@@ -258,7 +258,7 @@ def test_clip_named_after_no_camera_leaves_scene_to_its_reader(tmp_path):
     assert "a video without a folder" in refusal(read_scene, tmp_path)
 
 
-def test_frames_of_videos_are_taken_at_the_same_moments(tmp_path, caplog):
+def test_video_frames_are_extracted_at_equal_times(tmp_path, caplog):
     folder = several_cameras(tmp_path, {"a": 8, "b": 9})
     for name, count in {"a": 8, "b": 9}.items():
         video = cv2.VideoWriter(str(folder / "videos" / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
@@ -279,7 +279,7 @@ def test_frames_of_videos_are_taken_at_the_same_moments(tmp_path, caplog):
     assert "expected 2 to 8" in refusal(write_sync_frames, folder, 9)
 
 
-def test_a_colmap_folder_with_times_moves(tiny_colmap, tmp_path):
+def test_colmap_folder_with_times_is_dynamic(tiny_colmap, tmp_path):
     shutil.copytree(tiny_colmap, tmp_path / "scene")
     names = [view.name for view in read_scene(tiny_colmap, 0).views]
     write_times(tmp_path / "scene" / "images", {name: 5 + i for i, name in enumerate(names)})

@@ -58,7 +58,7 @@ def test_metadata(folders):
         assert cv2.imread(str(out / "images_train" / f"003_d{j}.png"), cv2.IMREAD_UNCHANGED).shape[:2] == (40 >> j,) * 2
 
 
-def test_the_dataset_reads_back(folders):
+def test_dataset_is_read_back(folders):
     """The full scale is the single-scale dataset, bit for bit; the others are what scaling on the way gives."""
     single, multi = (read_scene(folder) for folder in folders)
     assert multi.downscales == (1, 2, 4, 8)
@@ -107,7 +107,7 @@ def test_images_that_cannot_be_halved_are_refused(tiny_scene, tmp_path):
         write_multiscale(tmp_path / "images_train", tmp_path, levels=2)
 
 
-def test_scales_are_those_of_the_photographs(tiny_scene):
+def test_scales_match_the_images(tiny_scene):
     """However a scene was scaled before, a factor divides the size of the photograph."""
     scene = read_scene(tiny_scene)
     assert scene.downscaled(1) is scene
@@ -139,7 +139,7 @@ def shares(views: list[View], order: str, steps: int) -> dict[float, float]:
     return {scale: count / steps for scale, count in found.items()}
 
 
-def test_the_shares_of_the_scales():
+def test_order_decides_how_often_scales_are_drawn():
     views = views_of(10, 1, 2, 4, 8)
     assert shares(views, "uniform", 400) == {1: 0.25, 2: 0.25, 4: 0.25, 8: 0.25}
     assert shares(views, "shuffle", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
@@ -157,7 +157,7 @@ def test_the_order_depends_on_seed_and_step_alone(order):
     assert drawn(views, order, 60, seed=4) != straight
 
 
-def test_every_view_comes_once_before_any_twice():
+def test_every_view_is_drawn_before_any_repeats():
     views = views_of(7, 1, 2)
     found = drawn(views, "uniform", 28)
     for epoch in (found[:14], found[14:]):

@@ -14,12 +14,12 @@ from clsplat.scene.scene import Tracks
 from tests.support.outdoor_scene import Yard
 
 
-def test_each_training_photograph_counts_once(tiny_scene):
+def test_each_training_view_counts_once(tiny_scene):
     scene = read_scene(tiny_scene)
     assert measure_scene(scene.downscaled(1, 2)).photographs == len(scene.split("train"))
 
 
-def test_nearest_points_are_before_any_training_photograph(tiny_scene):
+def test_nearest_points_are_in_front_of_training_views(tiny_scene):
     """The depth that a hundredth of what they show is nearer than; what lies behind a camera does not count."""
     scene = read_scene(tiny_scene)
     trained, tested = scene.split("train")[:2], scene.split("test")[0]
@@ -45,7 +45,7 @@ def test_nearest_points_are_before_any_training_photograph(tiny_scene):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("near", "warned"), [(0.001, False), (3, True)])
-def test_a_run_warns_where_points_lie_before_the_near_plane(tmp_path, rng, caplog, near, warned):
+def test_run_warns_of_points_in_front_of_the_near_plane(tmp_path, rng, caplog, near, warned):
     Yard(rng).write(tmp_path / "yard")
     asked = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", f"model.near={near}"])
     describe(asked, RunState.read(tmp_path / "run"), None, "new")

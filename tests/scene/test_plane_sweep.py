@@ -48,7 +48,7 @@ def wall_views(rng, count=6):
     return views, photographs
 
 
-def test_a_wall_is_found_where_it_is(rng):
+def test_wall_is_found_at_its_depth(rng):
     views, photographs = wall_views(rng)
     points = swept_points(views, np.array([0, 0, DEPTH]), lambda view: photographs[view.name], 5000, 0)
     assert len(points) == 5000
@@ -61,14 +61,14 @@ def test_a_wall_is_found_where_it_is(rng):
     assert np.median(difference) < 12
 
 
-def test_the_same_points_every_time(rng):
+def test_swept_points_are_reproducible(rng):
     views, photographs = wall_views(rng, 3)
     first, second = (swept_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
     np.testing.assert_array_equal(first.positions, second.positions)
     np.testing.assert_array_equal(first.colors, second.colors)
 
 
-def test_photographs_that_have_nothing_in_common(rng):
+def test_unrelated_images_give_few_points(rng):
     views, photographs = wall_views(rng)
     noise = {name: rng.integers(0, 256, image.shape).astype(np.uint8) for name, image in photographs.items()}
     assert len(swept_points(views, np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) < 2500
@@ -102,7 +102,7 @@ def swept(table, shown):
     return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, allowed=shown)
 
 
-def test_pixels_lie_at_exact_depths(table):
+def test_pixels_are_placed_at_exact_depths(table):
     """The median error is below half of the distance between planes, in inverse depth."""
     views, depths = table
     points = swept(table, lambda view: np.isfinite(depths[view.name]) & (view.name == "2"))
@@ -126,7 +126,7 @@ def test_transparent_pixels_give_no_points(table, everywhere):
     assert 500 < len(swept(table, opaque_pixels)) < len(everywhere)
 
 
-def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
+def test_masked_pixels_give_no_points(table, tmp_path):
     left = np.zeros((SIDE, SIDE, 4), np.uint8)
     left[:, : SIDE // 2] = 255
     write_image(tmp_path / "mask.png", left)
@@ -136,7 +136,7 @@ def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
     )
 
 
-def test_what_the_scene_has_is_not_new():
+def test_points_near_existing_ones_are_not_new():
     """Of four pixels at depth 2: a point in it, one behind it, one before it, none; a plane is 0.1 of inverse depth."""
     view = View("a", Camera(4, 1, 1, 1, 2, 0.5), np.eye(4)[:3])
     surface = Surface(view, np.zeros((1, 4, 3)), np.full((1, 4), 0.5), 0.1)
@@ -147,7 +147,7 @@ def test_what_the_scene_has_is_not_new():
         assert surface.is_new(order).tolist() == [[False, True, False, True]]
 
 
-def test_what_the_scene_lacks_is_added(rng):
+def test_missing_surfaces_are_added(rng):
     views, photographs = wall_views(rng, 4)
     center, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
     alone = swept_points(views, center, load, 10**6, 0).positions
@@ -157,7 +157,7 @@ def test_what_the_scene_lacks_is_added(rng):
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
 
-def test_points_are_the_same_every_time(table, everywhere):
+def test_added_points_are_reproducible(table, everywhere):
     first, second = everywhere, swept(table, lambda view: None)
     for name in ("positions", "colors"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
@@ -165,7 +165,7 @@ def test_points_are_the_same_every_time(table, everywhere):
 
 
 @pytest.mark.large
-def test_real_surfaces():
+def test_real_surfaces_are_covered():
     """Nine tenths of what structure from motion found has a swept point within three hundredths of its distance."""
     scene = read_scene(data_set("fox"))
     views = scene.split("train")
@@ -195,7 +195,7 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     assert run.model.gaussians.count == own + joined
 
 
-def test_points_and_sweep(tiny_scene, tmp_path, caplog):
+def test_points_and_sweep_are_combined(tiny_scene, tmp_path, caplog):
     scene = read_scene(tiny_scene)
     caplog.set_level("INFO", "clsplat")
     sets = ("init.source=points+sweep", "init.sweep_points=60", "optimize.steps=1")
@@ -206,7 +206,7 @@ def test_points_and_sweep(tiny_scene, tmp_path, caplog):
     assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
 
 
-def test_a_sweep_that_adds_nothing_is_told(tiny_scene, tmp_path, monkeypatch, caplog):
+def test_empty_sweep_is_reported(tiny_scene, tmp_path, monkeypatch, caplog):
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: nothing)
     run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")

@@ -47,7 +47,7 @@ def with_chunk(data: bytes, more: bytes) -> bytes:
     ("what", "kind", "wrong"),
     [(what, [*KINDS][i % 4], i // 4 ^ i & 1) for i, what in enumerate(METADATA)],
 )
-def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path, capfd):
+def test_metadata_changes_no_pixel_and_prints_nothing(kind, what, wrong, tmp_path, capfd):
     data = encoded(KINDS[kind])
     (tmp_path / "a.png").write_bytes(data)
     plain = read_image(tmp_path / "a.png")
@@ -56,21 +56,21 @@ def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path,
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
+def test_pixels_do_not_depend_on_truncated_metadata():
     data = with_chunk(encoded(KINDS["color"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
     whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, strip_png_metadata(data)))
     np.testing.assert_array_equal(whole, cut)
     assert len(strip_png_metadata(data)) < len(data)
 
 
-def test_transparency_of_a_palette_and_orientation_stay():
+def test_palette_transparency_and_orientation_are_kept():
     for kind in (b"tRNS", b"eXIf"):
         data = with_chunk(encoded(KINDS["color"]), chunk(kind, b"\0\1\0\1\0\1"))
         assert strip_png_metadata(data) == data
 
 
 @pytest.mark.parametrize("name", ["IHDR", "IDAT"])
-def test_a_damaged_chunk_is_named_with_its_place(name, tmp_path, capfd):
+def test_damaged_chunk_is_named_with_its_offset(name, tmp_path, capfd):
     data = bytearray(encoded(KINDS["color"]))
     at = data.index(name.encode())
     length = struct.unpack_from(">I", data, at - 4)[0]
@@ -82,7 +82,7 @@ def test_a_damaged_chunk_is_named_with_its_place(name, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp"])
-def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
+def test_truncated_image_prints_nothing(suffix, tmp_path: Path, capfd):
     data = cv2.imencode(suffix, KINDS["color"])[1].tobytes()
     for length in range(0, len(data), 7):
         (tmp_path / "a").write_bytes(data[:length])
@@ -91,6 +91,6 @@ def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_chunk_whose_name_is_no_text_is_named_in_one_line():
+def test_chunk_with_a_binary_name_is_one_line():
     with pytest.raises(ValueError, match=r"the checksum of the chunk 'A\\r\\n ' is wrong"):
         strip_png_metadata(with_chunk(encoded(KINDS["gray"]), chunk(b"A\r\n ", b"", wrong=1)))

@@ -183,7 +183,7 @@ def test_points(tmp_path: Path, name: str, file: str, keys: dict) -> None:
 
 
 @pytest.mark.parametrize("value", ["../p.ply", "none.ply", 3])
-def test_points_that_are_told_must_be_there(tmp_path: Path, value) -> None:
+def test_missing_points_file_is_refused(tmp_path: Path, value) -> None:
     refusal(read_scene, write(tmp_path, **LENS, ply_file_path=value, frames=frames("a.png", "b.png")))
 
 

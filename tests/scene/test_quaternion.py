@@ -8,7 +8,7 @@ from clsplat.core.quaternions import multiply, rotation_matrix, unit_quaternions
 from clsplat.scene.colmap import pose_matrix
 
 
-def test_rotations_are_those_of_scipy(rng):
+def test_rotations_match_scipy(rng):
     quaternions = rng.normal(size=(50, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     expected = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
@@ -31,7 +31,7 @@ def test_quaternions_of_rotations_are_the_same_up_to_sign(rng):
     np.testing.assert_array_equal(unit_quaternions(np.eye(3)), [1, 0, 0, 0])
 
 
-def test_a_pose_takes_a_quaternion_of_any_length():
+def test_pose_accepts_a_quaternion_of_any_length():
     pose = pose_matrix((0, 3, 0, 0), (1, 2, 3))
     np.testing.assert_array_equal(pose, [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]])
 
@@ -48,12 +48,12 @@ def test_a_pose_takes_a_quaternion_of_any_length():
         ((1, 0, 0, 0), (0, 0)),
     ],
 )
-def test_a_pose_that_is_none_is_refused(quaternion, translation):
+def test_invalid_pose_is_refused(quaternion, translation):
     with pytest.raises(ValueError, match="expected finite numbers and a rotation"):
         pose_matrix(quaternion, translation)
 
 
-def test_products_turn_one_after_the_other(rng):
+def test_product_applies_rotations_in_order(rng):
     left, right = rng.normal(size=(2, 50, 4))
     matrices = [Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix() for quats in (left, right)]
     left, right = (quats / np.linalg.norm(quats, axis=1, keepdims=True) for quats in (left, right))

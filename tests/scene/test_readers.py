@@ -56,14 +56,14 @@ def test_readers_of_plugins_follow_in_order_of_definition():
     assert [reader.name for reader in readers()] == [*SHIPPED, "third", "other"]
 
 
-def test_a_reader_that_extends_a_shipped_one_takes_its_place():
+def test_derived_reader_replaces_its_shipped_base():
     class Wider(ColmapReader):
         name = "wider"
 
     assert [reader.name for reader in readers()] == [SHIPPED[0], "wider", *SHIPPED[2:]]
 
 
-def test_a_reader_that_is_defined_again_replaces_the_one_before():
+def test_redefined_reader_replaces_the_previous():
     def define() -> type[Reader]:
         class Own(OneFile):
             name, expects = "own", "o"
@@ -76,7 +76,7 @@ def test_a_reader_that_is_defined_again_replaces_the_one_before():
     assert [type(reader) for reader in readers()][len(SHIPPED) :] == [second]
 
 
-def test_a_reader_without_a_name_is_refused_in_a_sentence(tmp_path):
+def test_reader_without_a_name_is_refused(tmp_path):
     class Nameless(OneFile):
         def read(self, path: Path, holdout: int) -> Scene:
             raise AssertionError
@@ -94,7 +94,7 @@ def grid(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_matching_and_reading_are_enough_for_inspection(grid):
+def test_reader_needs_only_matches_and_read_for_inspection(grid):
     assert not is_scene(grid)
 
     class Grid(OneFile):
@@ -125,12 +125,12 @@ def test_matching_and_reading_are_enough_for_inspection(grid):
     assert "grid.txt: is empty" in inspection.verdict
 
 
-def test_a_folder_that_no_reader_knows_names_them_all(tmp_path):
+def test_unknown_folder_error_lists_every_reader(tmp_path):
     message = refusal(read_scene, tmp_path)
     assert all(f"{reader.name} ({reader.expects})" in message for reader in readers())
 
 
-def test_the_first_reader_that_matches_is_taken(tmp_path):
+def test_first_matching_reader_is_used(tmp_path):
     path = write(tmp_path / "scene", orbit())
     (path / "transforms.json").write_text("damaged")
     assert len(read_scene(path).views) == 24
@@ -138,12 +138,12 @@ def test_the_first_reader_that_matches_is_taken(tmp_path):
 
 
 @pytest.mark.parametrize("changes", [{"width": 0}, {"fx": -1.0}, {"fy": float("nan")}, {"cx": float("inf")}])
-def test_a_camera_that_is_impossible_is_refused_whoever_read_it(tmp_path, changes):
+def test_impossible_camera_is_refused_from_any_reader(tmp_path, changes):
     camera = Camera(**{"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, **changes})
     view = View("a.png", camera, np.eye(3, 4), tmp_path / "a.png")
     assert "'a.png': the camera is" in refusal(make_scene, tmp_path, [view], set(), None)
 
 
 @pytest.mark.parametrize("pose", [np.zeros((3, 4)), np.full((3, 4), np.nan), np.eye(4)])
-def test_invalid_pose_is_a_data_error_whoever_read_it(pose):
+def test_invalid_pose_is_a_data_error_from_any_reader(pose):
     assert "the pose of 'a.png'" in refusal(View, "a.png", Camera(64, 48, 60.0, 60.0, 32.0, 24.0), pose)

@@ -31,7 +31,7 @@ STATE = ("status.json", "log.txt")  # which tell of the refusal
 
 
 @pytest.mark.parametrize("lens", [None, STRONG])
-def test_distances_are_from_where_the_camera_shows_a_point(rng, lens):
+def test_error_is_the_distance_to_the_projected_point(rng, lens):
     view = View("a.png", STRONG.pinhole, np.column_stack([np.eye(3), OFFSET]), lens=lens)
     points = np.column_stack([*rng.uniform(-0.4, 0.4, (2, 7)), np.full(7, 2.0)])
     seen, camera = points + OFFSET, view.camera
@@ -45,7 +45,7 @@ def test_distances_are_from_where_the_camera_shows_a_point(rng, lens):
     assert np.isnan(reprojection_residuals(view, points, straight)[:4]).all(), "outside the photograph"
 
 
-def test_the_mean_is_over_points_and_then_over_their_photographs():
+def test_mean_is_over_points_then_over_views():
     view = View("a", STRONG.pinhole, np.eye(3, 4))
     seen = {"a": np.array([0, 2]), "b": np.array([2])}
     tracks = Tracks(np.zeros((3, 3)), seen, {"a": np.array([[3.0, 4], [1, 0]]), "b": np.array([[0, 3.0]])})
@@ -56,7 +56,7 @@ def test_the_mean_is_over_points_and_then_over_their_photographs():
     assert reprojection_errors(None, [view]) is None
 
 
-def test_points_a_pixel_away_or_more_tell_no_depth():
+def test_points_with_large_errors_give_no_depth():
     """At the size of training; what is not known stays, and so do other photographs."""
     view, rows = View("a", STRONG.pinhole, np.eye(3, 4)), np.array([1, 3, 5, 6])
     missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
@@ -70,7 +70,7 @@ def test_points_a_pixel_away_or_more_tell_no_depth():
     )
 
 
-def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
+def test_error_is_at_training_size_without_test_views(tmp_path, rng):
     plain = read_scene(Yard(rng).write(tmp_path / "plain"), 6)
     tested = tuple(view.name for view in plain.split("test"))
     again = read_scene(missing(tmp_path / "again", VECTOR, rng, exact=tested), 6)
@@ -79,12 +79,12 @@ def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
     assert measure_scene(plain).reprojection_error is None, "places that were computed from cameras tell nothing"
 
 
-def test_undistorted_scenes_keep_it(tmp_path, rng):
+def test_undistorted_scenes_keep_the_error(tmp_path, rng):
     undistort_scene(missing(tmp_path / "scene", VECTOR, rng), tmp_path / "small", 32)
     assert measure_scene(read_scene(tmp_path / "small", 0)).reprojection_error == pytest.approx(0.75, rel=1e-5)
 
 
-def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
+def test_nonnumeric_positions_in_text_are_ignored(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n35 24 7 ? 3 5\n")
     (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 1\n")
@@ -96,7 +96,7 @@ def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
 
 
 @pytest.mark.parametrize(("error", "learned"), [(0.4, False), (0.99, False), (1.0, True), (3.0, True)])
-def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned):
+def test_photos_recipe_optimizes_poses_from_one_pixel(error, learned):
     chosen = adapted(load("photos"), Measures(60, error))
     training = chosen.settings.optimize
     exposure = Exposure(when="auto", **({} if learned else {"min_spread": 0.2}))
@@ -109,7 +109,7 @@ def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned)
 
 
 @pytest.mark.parametrize(("length", "level"), [(0.5, None), (1.5, "note"), (2.5, "warning")])
-def test_inspect_says_what_to_set(tmp_path, rng, length, level):
+def test_inspect_recommends_a_setting(tmp_path, rng, length, level):
     inspection = Inspection.from_folder(missing(tmp_path / "scene", length * VECTOR / 1.5, rng))
     assert inspection.facts.points is not None
     assert inspection.facts.points.error_mean == pytest.approx(length, rel=1e-5)
@@ -118,7 +118,7 @@ def test_inspect_says_what_to_set(tmp_path, rng, length, level):
     assert all('--set "optimize.modules.camera_optimizer={start: 500}"' in one.remedy for one in found)
 
 
-def test_inspect_says_what_the_recipe_for_photographs_does():
+def test_inspect_and_the_photos_recipe_agree():
     for error, learned in ((POSES_ERROR - 0.01, None), (POSES_ERROR, {"start": 500})):
         (found,) = [one for one in adapted(load("photos"), Measures(9, error)).decisions if one.key in POSES]
         assert found.value == learned
@@ -132,7 +132,7 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
         ("optimize.modules.camera_optimizer={start: 1}", "'camera_optimizer' cannot be combined with sky: "),
     ],
 )
-def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
+def test_optional_sky_is_off_with_conflicting_settings(of_step, reason, tmp_path, rng, caplog):
     folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
     caplog.set_level("DEBUG", "clsplat")
     asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
@@ -140,7 +140,7 @@ def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rn
     assert f"model.background: off, since {reason}" in caplog.text
 
 
-def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
+def test_pipeline_with_poses_and_sky_is_refused():
     for recipe in ("smoke", "photos"):  # which may decide either
         with pytest.raises(ConfigError, match="cannot be learned together with poses"):
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=envmap"])
@@ -152,7 +152,7 @@ def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
 
 
 @pytest.mark.slow
-def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
+def test_enabling_poses_disables_the_sky(tmp_path, rng):
     """With photographs that choose the steps, and a training on all of them after that."""
     folder = missing(tmp_path / "scene", VECTOR, rng)
     asked = [f"scene.path='{folder}'", *FEW, "scene.validation=auto", "optimize.keep=best", "optimize.refit=true"]
@@ -179,7 +179,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
         ),
     ],
 )
-def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):
+def test_refused_restart_changes_no_file(changes, fault, tmp_path, rng):
     folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
     asked = [f"scene.path='{folder}'", *FEW]
     run_pipeline(load("smoke", asked), RunState.read(out), None, "new")

@@ -34,7 +34,7 @@ def letters(scene: Scene, split: str) -> str:
     return "".join(Path(view.name).stem for view in scene.split(split))
 
 
-def test_every_nth_from_an_offset_on_is_for_testing(folder):
+def test_every_nth_view_from_an_offset_is_for_testing(folder):
     scene = read_scene(folder, Split(ViewSelection(every=8, offset=4)))
     assert letters(scene, "test") == "emu"
     assert len(scene.train) == 21
@@ -44,7 +44,7 @@ def test_every_nth_from_an_offset_on_is_for_testing(folder):
 @pytest.mark.parametrize(
     "split", [{"holdout": ViewSelection(every=3, offset=1)}, {"train": ViewSelection(every=2)}, {"validation": 2}]
 )
-def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
+def test_split_changes_only_the_views(folder, split):
     scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
     found = Split(**split).applied(scene)
     assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
@@ -56,14 +56,14 @@ def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
     assert letters(read_scene(folder, Split(ViewSelection(names=[listed, "q"]))), "test") == "bq"
 
 
-def test_a_photograph_is_meant_before_one_of_another_kind(tmp_path):
+def test_exact_suffix_takes_precedence_over_others(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "a/1.jpg", "c.png"))
     scene = read_scene(tmp_path, Split(ViewSelection(names=["1.jpg"])))
     assert [view.name for view in scene.split("test")] == ["a/1.jpg"]
 
 
 @pytest.mark.parametrize("listed", ["1.jpg", "1", "1.png"])
-def test_a_whole_path_is_meant_before_the_end_of_another(tmp_path, listed):
+def test_full_path_takes_precedence_over_a_path_end(tmp_path, listed):
     write(tmp_path, **LENS, frames=frames("1.png", "a/1.png", "c.png"))
     scene = read_scene(tmp_path, Split(ViewSelection(names=[listed])))
     assert [view.name for view in scene.split("test")] == ["1.png"]
@@ -80,7 +80,7 @@ def test_a_file_lists_test_views(folder):
     assert letters(read_scene(folder, Split(ViewSelection(file="test.txt"))), "test") == "cx"
 
 
-def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_factory):
+def test_split_file_may_be_next_to_unprepared_photos(folder, tmp_path_factory):
     lists = tmp_path_factory.mktemp("photographs")
     (lists / "test.txt").write_text("d\n")
     assert letters(read_scene(folder, Split(ViewSelection(file="test.txt"), folder=lists)), "test") == "d"
@@ -99,7 +99,7 @@ def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_f
         (ViewSelection(every=1), "scene.holdout takes all 24 photographs"),
     ],
 )
-def test_a_list_that_is_wrong_is_refused(folder, choice, fault):
+def test_invalid_list_is_refused(folder, choice, fault):
     with pytest.raises(DataError, match=fault.replace("?", r"\?")):
         read_scene(folder, Split(choice))
 
@@ -112,27 +112,27 @@ def test_a_test_photograph_in_another_list_is_named(folder, split):
         read_scene(folder, split)
 
 
-def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
+def test_left_out_image_in_another_list_is_named(folder):
     fault = "scene.validation: the list of names: 'c' is left out by scene.train; .* or add it to scene.train"
     for train in (ViewSelection(every=2), ViewSelection(names=["b", "d"])):
         with pytest.raises(DataError, match=fault):
             read_scene(folder, Split(8, train, ViewSelection(names=["c"])))
 
 
-def test_photograph_held_out_by_number_is_not_called_left_out(folder):
+def test_image_held_out_by_number_is_not_reported_as_left_out(folder):
     names = [f"images/{letter}.jpg" for letter in LETTERS]
     Split(8, ViewSelection(names=["b", "d"]), ViewSelection(names=["a"])).check(folder, names)  # the placed ones decide
     with pytest.raises(DataError, match=r"'c' is left out by scene\.train"):
         Split(8, ViewSelection(names=["b", "d"]), ViewSelection(names=["c"])).check(folder, names)
 
 
-def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
+def test_ambiguous_name_is_refused(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
     with pytest.raises(DataError, match=r"'1.png' matches 'a/1.png' and 'b/1.png'; give more of the path"):
         read_scene(tmp_path, Split(ViewSelection(names=["1.png"])))
 
 
-def test_the_split_of_a_dataset_stands_unless_names_are_given(folder):
+def test_dataset_split_applies_unless_names_are_listed(folder):
     table = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps({**table, "test_filenames": ["images/a.png"]}))
     assert letters(read_scene(folder, Split(ViewSelection(every=8, offset=4))), "test") == "a"
@@ -165,19 +165,19 @@ def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
     assert letters(halved, "validation") == fold
 
 
-def test_a_fold_may_be_given(folder):
+def test_explicit_fold_is_used(folder):
     assert letters(read_scene(folder, Split(0, None, ViewSelection(every=8, offset=4))), "validation") == "emu"
     assert letters(read_scene(folder, Split(0, None, 12)), "validation") == "am"
 
 
-def test_a_fold_of_three_photographs_or_of_all_is_refused(folder):
+def test_too_large_fold_is_refused(folder):
     with pytest.raises(DataError, match="has 3 training photographs; expected at least 4 to keep some for validation"):
         read_scene(folder, Split(8, ViewSelection(names=["b", "c", "d"]), "auto"))
     with pytest.raises(DataError, match="takes 24 of 24 training photographs"):
         read_scene(folder, Split(0, None, 1))
 
 
-def test_a_run_knows_a_scene_whose_fold_is_another(folder):
+def test_run_detects_a_changed_fold(folder):
     whole, fold = (Identity.from_scene(read_scene(folder, Split(8, None, one)), {}) for one in (0, "auto"))
     assert whole.digest != fold.digest
     assert fold.changes(whole) == ["the split of 3 views (images/f.png, images/o.png, images/x.png)"]
@@ -217,7 +217,7 @@ def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
     assert len(caplog.records) == 1
 
 
-def test_a_dataset_without_any_photograph_is_refused(folder):
+def test_dataset_without_images_is_refused(folder):
     for file in (folder / "images").iterdir():
         file.unlink()
     with pytest.raises(DataError, match=r"24 of 24 image files are missing: .*put them back$"):
@@ -240,7 +240,7 @@ def test_a_dataset_without_any_photograph_is_refused(folder):
         ("missing=ignore", "'refuse' or 'skip'"),
     ],
 )
-def test_a_choice_that_is_wrong_is_explained(setting, fault):
+def test_invalid_selection_is_explained(setting, fault):
     with pytest.raises(ConfigError) as raised:
         load("splat_7k", [f"scene.{setting}"])
     assert fault in str(raised.value)
@@ -257,12 +257,12 @@ def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, c
     assert all(warned in text for text in told), told
 
 
-def test_every_nth_that_takes_none_for_testing_is_refused(folder):
+def test_every_nth_without_test_views_is_refused(folder):
     with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photographs .* lower its offset, or set"):
         read_scene(folder, Split(ViewSelection(every=100, offset=99)))
 
 
-def test_without_test_views_a_dry_run_has_no_lines_of_them(folder, tmp_path):
+def test_dry_run_without_test_views_omits_their_lines(folder, tmp_path):
     def described(holdout: int) -> str:
         return describe(
             load("splat_7k", [f"scene.path={folder}", f"scene.holdout={holdout}"]),

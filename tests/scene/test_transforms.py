@@ -169,12 +169,12 @@ def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> N
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"frames": 3}', '{"frames": [1]}', "\xff"])
-def test_file_that_is_no_transforms(tmp_path: Path, text: str) -> None:
+def test_file_without_transforms(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     assert "transforms.json: " in refusal(read_scene, tmp_path)
 
 
-def test_a_null_is_no_camera_model(tmp_path: Path) -> None:
+def test_null_camera_model_is_refused(tmp_path: Path) -> None:
     write(tmp_path, **LENS, frames=frames("a.png", "b.png", camera_model=None))
     assert len(read_scene(tmp_path).views) == 2
 
@@ -185,7 +185,7 @@ def test_too_many_frames_are_refused_before_they_are_read(tmp_path: Path, monkey
     assert "has 3 frames; expected at most 2: divide the scene" in refusal(read_scene, tmp_path)
 
 
-def test_what_frames_share_is_not_copied_for_each(tmp_path: Path) -> None:
+def test_shared_values_are_not_copied_per_frame(tmp_path: Path) -> None:
     shared = {f"key {i}": i for i in range(2000)}
     table = LENS | shared | {"frames": frames(*(f"{i}.png" for i in range(2000)))}
     (tmp_path / "transforms.json").write_text(json.dumps(table))
@@ -221,7 +221,7 @@ def test_mask_and_backslashes(tmp_path: Path) -> None:
 # ---- splits
 
 
-def test_blender_split_is_that_of_its_files(tmp_path: Path) -> None:
+def test_blender_split_follows_its_files(tmp_path: Path) -> None:
     table = {"camera_angle_x": 0.7}
     write(tmp_path, "transforms_train.json", **table, frames=frames("./train/r_0", "./train/r_1", "./train/r_10"))
     assert read_scene(tmp_path, holdout=2).test == ()
@@ -263,7 +263,7 @@ def test_nerfstudio_lists(tmp_path: Path, lists: dict, train: list[str], test: l
 
 
 @pytest.mark.parametrize("entries", ["a.png", [1], ["z.png"]])
-def test_nerfstudio_list_that_is_wrong(tmp_path: Path, entries) -> None:
+def test_invalid_nerfstudio_list(tmp_path: Path, entries) -> None:
     assert "test_filenames" in refusal(
         read_scene, write(tmp_path, **LENS, test_filenames=entries, frames=frames("a.png", "b.png"))
     )

@@ -25,7 +25,7 @@ def scene_at(path, *times):
 
 
 @pytest.mark.parametrize("time", [0, 1, 0.25, np.float32(0.5), None])
-def test_a_time_from_0_to_1_is_kept(time):
+def test_time_from_0_to_1_is_accepted(time):
     assert moment(time).time == time
     assert time is None or type(moment(time).time) is float
 
@@ -36,7 +36,7 @@ def test_invalid_time_is_refused_with_name_and_expectation(time):
         moment(time)
 
 
-def test_what_copies_a_view_keeps_its_time(tmp_path):
+def test_copied_views_keep_their_time(tmp_path):
     view = moment(0.75)
     scene = make_scene(tmp_path, [view], set(), None)
     copies = [view.resized(2), resize_view(view, (20, 20)), *resample([view], 3), scene.with_alpha("mask").views[0]]
@@ -46,14 +46,14 @@ def test_what_copies_a_view_keeps_its_time(tmp_path):
     assert [between.time for between in resample([moment(None), view], 3)] == [None] * 3
 
 
-def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):
+def test_changed_time_changes_the_scene_identity(tmp_path):
     one, other = (Identity.from_scene(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
     assert one.digest != other.digest
     assert other.changes(one) == ["the time of 1 view (v1)"]
     assert Identity.from_data(other.data()) == other
 
 
-def test_a_scene_that_does_not_move_is_the_scene_that_it_was(tmp_path):
+def test_static_scene_identity_has_no_time(tmp_path):
     still_one = scene_at(tmp_path, None, None)
     assert set(Identity.from_scene(still_one, {}).train["v0"]) == {"photograph", "mask", "camera"}
     moving = replace(still_one, views=tuple(replace(view, time=0.5) for view in still_one.views))

@@ -58,7 +58,7 @@ CASES = {  # views, and what is up within so many degrees
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_all_take_the_same_way_for_up(case):
+def test_up_direction_is_shared_by_its_users(case):
     views, expected, degrees = CASES[case]
     up, points = up_direction(views), np.zeros((9, 3), np.float32)
     assert np.linalg.norm(up) == pytest.approx(1)
@@ -67,13 +67,13 @@ def test_all_take_the_same_way_for_up(case):
     np.testing.assert_allclose(Viewpoint.from_points(points, views, views[0]).up, up, atol=1e-12)
 
 
-def test_all_on_their_side_have_the_mean_of_their_upward_axes():
+def test_sideways_views_use_the_mean_upward_axis():
     views = [rolled(view, 90) for view in orbit(0, range(0, 100, 10))]
     mean = np.mean([-view.world_to_camera[1, :3] for view in views], axis=0)
     np.testing.assert_allclose(up_direction(views), mean / np.linalg.norm(mean), atol=1e-6)
 
 
-def test_the_pivot_is_where_the_axes_meet():
+def test_pivot_is_where_view_axes_meet():
     center = np.array([1.0, -2.0, 3.0])
     places = np.random.default_rng(0).normal(0, 4, (12, 3))
     axes = (center - places) / np.linalg.norm(center - places, axis=1, keepdims=True)
