@@ -171,9 +171,10 @@ def check(
 
         _show_findings(result, as_json, lines(result), verdict(result), None if result["whole"] else OutputError)
     elif "model" in result:
-        from clsplat.gaussians.validate import lines, verdict
+        from clsplat.gaussians import validate
 
-        _show_findings(result, as_json, lines(result), verdict(result), None if result["valid"] else DataError)
+        findings, error = validate.lines(result), None if result["valid"] else DataError
+        _show_findings(result, as_json, findings, validate.verdict(result), error)
     elif as_json:
         terminal.show_json({**result, "valid": True})
     elif "parameters" in result:

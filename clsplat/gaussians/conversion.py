@@ -39,7 +39,7 @@ from clsplat.scene.scene import PointCloud
 # Merging models.
 
 LOG = logging.getLogger("clsplat")
-KEPT = ("near", "screen_variance", "background", "alpha")  # numbers taken from the first model
+SHARED = ("near", "screen_variance", "background", "alpha")  # taken from the first model
 
 
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
@@ -56,8 +56,8 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
         kinds = [_kind(m) for m in (first, model)]
         if kinds[0] != kinds[1]:
             raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
-        own, kept = model.rendering.comment(), first.rendering.comment()
-        if other := [f"{key} = {own.get(key, 'not given')}" for key in KEPT if own.get(key) != kept.get(key)]:
+        values, used = model.rendering.comment(), first.rendering.comment()
+        if other := [f"{key} = {values.get(key, 'not set')}" for key in SHARED if values.get(key) != used.get(key)]:
             LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(other), names[0])
     models = [model.with_origin(origin) for model in models]
     if any(model.filter_variance is None for model in models):
@@ -75,7 +75,7 @@ def _kind(model: Model) -> str:
     return "a mip model" if model.rendering.compensate else "a plain model"
 
 
-WORDS = ("scale", "rotate", "translate")
+OPERATIONS = ("scale", "rotate", "translate")
 QUALITIES = get_args(Quality)
 
 
@@ -86,32 +86,32 @@ class Changes:
     drop_below: float = 0.0  # opacity below which Gaussians are dropped
     transform: NDArray[np.float64] | None = None  # [4, 4], a uniform scale, rotation, and translation
     crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, world coordinates; Gaussians outside are dropped
-    sh_degree: int | None = None  # at most
+    sh_degree: int | None = None  # higher bands are dropped
     time: float | None = None  # of a moving model: the timestamp to extract
     world: bool = False  # write world coordinates instead of an origin
 
     def apply(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError if nothing is left, and ConfigError for an extreme transform."""
-        model = model if self.time is None else _at(model, self.time)
-        kept = model[model.opacities >= self.drop_below] if self.drop_below else model
+        model = model if self.time is None else _extract_frame(model, self.time)
+        changed = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
             try:
-                kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+                changed = changed.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
             except ValueError as error:
                 raise ConfigError(f"--transform: {error}") from error
         if self.crop is not None:
-            low, high = np.array(self.crop, np.float64).reshape(2, 3) - kept.origin
-            kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
-        if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
-            kept = replace(kept, sh_rest=with_degree(kept.tables(), self.sh_degree)["sh_rest"])
-        if not len(kept) and len(model):
+            low, high = np.array(self.crop, np.float64).reshape(2, 3) - changed.origin
+            changed = changed[((changed.means >= low) & (changed.means <= high)).all(axis=1)]
+        if self.sh_degree is not None and self.sh_degree < changed.sh_degree:
+            changed = replace(changed, sh_rest=with_degree(changed.tables(), self.sh_degree)["sh_rest"])
+        if not len(changed) and len(model):
             raise DataError(f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold")
-        return kept
+        return changed
 
 
 def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
-    """Return the options for writing a file.  Raises ConfigError for an unknown quality, or one without effect."""
+    """Return the options for writing a file.  Raises ConfigError for a quality that is unknown or has no effect."""
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
@@ -198,7 +198,7 @@ def _step(word: str, values: list[float]) -> NDArray[np.float64]:
     """Return the matrix of one step of a transform.  Raises ValueError."""
     from scipy.spatial.transform import Rotation
 
-    if word not in WORDS or len(values) != (1 if word == "scale" else 3):
+    if word not in OPERATIONS or len(values) != (1 if word == "scale" else 3):
         raise ValueError(word)
     matrix = np.eye(4)
     if word == "scale":
@@ -228,25 +228,25 @@ def check_degree(degree: int | None) -> int | None:
     return degree
 
 
-def _at(model: Model, time: float) -> Model:
+def _extract_frame(model: Model, time: float) -> Model:
     """Return a moving model at one time.  Raises ConfigError for a static one, DataError if nothing is visible."""
     if model.motion is None:
-        raise ConfigError("the model does not move; leave out --time and --frames")
+        raise ConfigError("the model does not move; omit --time and --frames")
     frame = model.at(time)
     if not len(frame):
         raise DataError(f"none of {len(model):,} Gaussians is visible at time {time:g}; give another time")
     return frame
 
 
-def _is_same(one: Path, other: Path) -> bool:
+def _is_same(path: Path, other: Path) -> bool:
     """Return whether two paths are the same file."""
     try:
-        return one.samefile(other)
-    except (OSError, ValueError):  # one does not exist
+        return path.samefile(other)
+    except (OSError, ValueError):  # one of them does not exist
         return False
 
 
-# Static models of a moving model, at one time or at many.
+# Static models of a moving model, at one or several timestamps.
 
 MAX_FRAMES = 10_000  # files
 
@@ -335,10 +335,10 @@ def _link_or_copy(file: Path, other: Path) -> None:
 
 def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
     """Raise ConfigError if a folder has frames of another series, which a player would show too."""
-    own = {file.name for file in files}
+    frames = {file.name for file in files}
     with raising_output_error(folder):
         existing = sorted(os.listdir(folder)) if folder.is_dir() else []
-    if others := [name for name in existing if names.fullmatch(name) and name not in own]:
+    if others := [name for name in existing if names.fullmatch(name) and name not in frames]:
         raise ConfigError(
             f"{folder / others[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
         )
@@ -358,8 +358,8 @@ def _split_name(out: Path) -> tuple[Path, str, str]:
 # A sky as Gaussians on a distant sphere, for programs without environment maps.
 
 COUNT = 10_000  # Gaussians, 2 degrees apart
-RADIUS = 10.0  # of the sphere, relative to the distance of SHARE of the model (WildGaussians, 2024)
-SHARE = 0.97
+RADIUS = 10.0  # of the sphere, relative to this QUANTILE of distances from the center (WildGaussians, 2024)
+QUANTILE = 0.97
 WIDTH = 0.65  # standard deviation, relative to the distance of neighbors; gaps let 2 % of the light through
 FLAT = 0.1  # standard deviation along the ray, relative to that across
 LOGIT = 6.0  # of the opacity of sky Gaussians
@@ -372,7 +372,7 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
     model = model.baked()
     means = model.means.astype(np.float64)
     center = np.median(means, axis=0)
-    radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), SHARE))
+    radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), QUANTILE))
     directions = fibonacci(count)
     across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
     added: dict[str, NDArray[Any]] = {

@@ -1,9 +1,10 @@
 """Defer Adam updates of the SH bands above 0 until a view sees their Gaussians.
 
-The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  So rows
-in a block that no view sees wait, and get their updates in order when a view sees the block: the bits are those of
-immediate updates.  This covers 81 % of the numbers of a Gaussian of SH degree 3.  Means, scales, quaternions, and
-opacities are not deferred, because they decide what is seen and keep moving by their moments.
+The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  The
+updates of a block of rows that no view sees are therefore recorded, and applied in order when a view sees the block;
+the results are bit-identical to those of immediate updates.  This covers 81 % of the numbers of a Gaussian of SH degree
+3.  Means, scales, quaternions, and opacities are not deferred, because they determine which Gaussians are visible, and
+their moments keep changing them.
 """
 
 from typing import Any, ClassVar
@@ -16,27 +17,27 @@ from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import HARMONICS
 from clsplat.opencl.device import Array
 
-LONGEST = 32  # deferred updates at most; then all rows are updated in one pass
+MAX_UPDATES = 32  # deferred at most; then all rows are updated in one pass
 
 
 class Deferred:
     """The deferred updates of `sh_rest` and its moments.
 
-    Any code that reads other rows than those that a view sees calls `flush` first, as `Gaussians` does.
+    Code that reads rows outside the current view must call `flush` first, as `Gaussians` does.
     """
 
     names: ClassVar[tuple[str, ...]] = HARMONICS
 
-    def __init__(self, gaussians: Gaussians, longest: int = LONGEST) -> None:
-        """longest: deferred updates at most; results do not depend on it."""
+    def __init__(self, gaussians: Gaussians, max_updates: int = MAX_UPDATES) -> None:
+        """max_updates: the number of updates after which all are applied; results do not depend on it."""
         device = gaussians.device
-        self.gaussians, self.longest = gaussians, longest
-        self.updates = 0  # recorded now
+        self.gaussians, self.max_updates = gaussians, max_updates
+        self.updates = 0  # recorded since the last flush
         self._degree = 0  # SH degree of the recorded updates
         self._lanes = int(device.tuning["LANES"])
-        self._factors = device.zeros((longest, 2))
-        self._all = device.zeros(self._lanes, np.uint32)  # replaces the keys of a view
-        self._done = device.zeros(self._blocks, np.uint32)
+        self._factors = device.zeros((max_updates, 2))
+        self._visible = device.zeros(self._lanes, np.uint32)  # replaces the depth keys of a view, for all blocks
+        self._done = device.zeros(self._blocks, np.uint32)  # updates applied to each block
 
     @property
     def _blocks(self) -> int:
@@ -56,7 +57,7 @@ class Deferred:
         if self.updates:
             on_host = self.gaussians.on_host
             for _ in on_host.parts() if on_host else [None]:
-                self._replay(self._all, every=0xFFFFFFFF)
+                self._replay(self._visible, every=0xFFFFFFFF)
             self._done.fill(0)
             self.updates = 0
 
@@ -65,14 +66,14 @@ class Deferred:
 
         All deferred updates are applied if the degree changes or the list is full.
         """
-        if self.updates == self.longest or degree != self._degree:
+        if self.updates == self.max_updates or degree != self._degree:
             self.flush()
         self._degree = degree
-        if self._done.shape != (self._blocks,):  # rows were moved, after a flush
+        if self._done.shape != (self._blocks,):  # rearranged since the last flush
             self._done = self.gaussians.device.zeros(self._blocks, np.uint32)
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
-        """Record an update that the blocks in the view have already had; factors: rate and correction2 of adam.h.
+        """Record an update that visible blocks have already received; factors: rate and correction2 of adam.h.
 
         `catch_up` must have been called before, with the same keys.
         """
@@ -106,4 +107,4 @@ class Deferred:
             count=self.gaussians.count,
         )
         if on_host:
-            on_host.begin_to_fetch()
+            on_host.start_download()

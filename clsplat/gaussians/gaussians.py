@@ -23,7 +23,7 @@ from clsplat.gaussians.sky import DeviceSky
 from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, Struct, check_rows, moment_tables
 from clsplat.opencl.device import Array, Device
 
-# Finding NaN and infinity.
+# Detection of NaN and infinity.
 
 
 def not_finite(gaussians: Struct) -> list[str]:
@@ -125,12 +125,12 @@ class Gaussians:
         self.tables[name] = Table(array, components, zero_fresh)
 
     def move_to_host(self) -> None:
-        """Move the SH bands above 0 and their moments to the host; the device keeps those that a view sees."""
+        """Move the SH bands above 0 and their moments to the host; the device holds only those visible in a view."""
         if self.on_host:
             return
-        present = {name: self.get(name) for name in HARMONICS if name in self.tables}
+        harmonics = {name: self.get(name) for name in HARMONICS if name in self.tables}
         self.on_host = HostTables(self)
-        for name, values in present.items():
+        for name, values in harmonics.items():
             self.add(name, values.shape[1], self.tables[name].zero_fresh)
             self.set(name, values)
 
@@ -195,14 +195,14 @@ class Gaussians:
             )
 
     def lower_sh_degree(self, degree: int) -> None:
-        """Drop SH bands above a degree, and their moments; a lower degree stays."""
+        """Drop the SH bands above `degree` and their moments, if there are any."""
         if degree >= self.sh_degree:
             return
         self.sh_degree, components = degree, 3 * (sh_coefficients(degree) - 1)
         for name in self.tables.keys() & set(HARMONICS):
-            kept = self.get(name)[:, :components]
+            lower_bands = self.get(name)[:, :components]
             self.add(name, components, self.tables[name].zero_fresh)
-            self.set(name, kept)
+            self.set(name, lower_bands)
 
     @property
     def trained(self) -> tuple[str, ...]:
@@ -231,9 +231,9 @@ class Gaussians:
         capacity = self.capacity
         self._up_to_date("sh_rest")
         if count > capacity:
-            widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
-            roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
-            capacity = _aligned(max(count, roomy))
+            row_bytes = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
+            grown = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
+            capacity = _aligned(max(count, grown))
         on_host = self.on_host.rearranged(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
         for table in (table for name, table in self.tables.items() if name not in on_host):
             moved = self.device.zeros((table.components, capacity))
@@ -279,7 +279,7 @@ def _aligned(count: int) -> int:
 
 # Gaussians that a render omits: those hidden in a training view, and those dropped in a step.
 
-HIDDEN_VIEWS = 22  # per component: whole numbers that to_VI in lanes.h converts exactly
+HIDDEN_VIEWS = 22  # bits per component; to_VI in lanes.h converts such integers exactly
 
 
 def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
@@ -288,7 +288,7 @@ def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
     View v has bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS.
     """
     views, count = hidden.shape
-    bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # whole numbers
+    bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # integers
     for view in range(views):
         plane, bit = divmod(view, HIDDEN_VIEWS)
         bits[:, plane] += hidden[view] * np.float32(1 << bit)
@@ -297,10 +297,10 @@ def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
     gaussians.set(HIDDEN, bits)
 
 
-def visibility_arguments(model: DeviceModel, view: int | None, drawn: Array) -> dict[str, Any]:
+def visibility_arguments(model: DeviceModel, view: int | None, mask: Array) -> dict[str, Any]:
     """Return the arguments of project_forward that omit Gaussians.
 
-    view: the index of a training view with hidden Gaussians; drawn: [S], written if the model has a dropout.
+    view: the index of a training view with hidden Gaussians; mask: [S], written if the model has a dropout.
     """
     hidden = _hidden(model.gaussians, view)
     if model.dropout is None:
@@ -309,14 +309,14 @@ def visibility_arguments(model: DeviceModel, view: int | None, drawn: Array) -> 
     gaussians.device.program("dropout.cl").draw_left_out(
         items=gaussians.count,
         **hidden,
-        left_out=drawn,
+        left_out=mask,
         below=round(dropout.probability * 2**32),
         seed=dropout.seed,
         step=dropout.step,
         stride=gaussians.capacity,
         count=gaussians.count,
     )
-    return {"hidden": drawn, "hidden_plane": 0, "hidden_bit": 1, "opacity_factor": dropout.opacity_factor}
+    return {"hidden": mask, "hidden_plane": 0, "hidden_bit": 1, "opacity_factor": dropout.opacity_factor}
 
 
 def _hidden(gaussians: Gaussians, view: int | None) -> dict[str, Any]:

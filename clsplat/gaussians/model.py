@@ -37,7 +37,7 @@ from clsplat.formats.splats import (
 )
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
-from clsplat.gaussians.motion import at_time, transformed_motion
+from clsplat.gaussians.motion import evaluate_at, transformed_motion
 from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.scene import far_origin, position_text
@@ -62,9 +62,9 @@ class Rendering:
         """Read the numbers from a file's comment; the defaults are those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate", "pixel_box")
-        given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
+        numbers = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
         return cls(
-            **{**mip, **given},
+            **{**mip, **numbers},
             background=comment["background"] if comment.get("background") in ("black", "white") else None,
             alpha="mask" if comment.get("alpha") == "mask" else "transparency",
             notes=dict(comment),
@@ -73,10 +73,10 @@ class Rendering:
     def comment(self) -> dict[str, Any]:
         """Return the values for a model file's comment."""
         numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
-        known: dict[str, Any] = {"background": self.background} if self.background else {}
+        optional: dict[str, Any] = {"background": self.background} if self.background else {}
         if self.pixel_box or "pixel_box" in self.notes:  # leaves files of other models unchanged
-            known["pixel_box"] = self.pixel_box
-        return {**self.notes, **numbers, **known, "alpha": self.alpha}
+            optional["pixel_box"] = self.pixel_box
+        return {**self.notes, **numbers, **optional, "alpha": self.alpha}
 
 
 # Paths of models.
@@ -175,11 +175,11 @@ class Model:
             raise ValueError(f"time is {time:g}; expected a number from 0 (start) to 1 (end)")
         if self.motion is None:
             return self
-        tables: dict[str, Any] = dict(at_time(self.tables(), time))
-        if lost := int(not_finite(tables).sum()):
+        tables: dict[str, Any] = dict(evaluate_at(self.tables(), time))
+        if invalid := int(not_finite(tables).sum()):
             raise DataError(
-                f"time {time:g}, {lost:,} Gaussians have no finite position; keep speeds below {MAX_VALUE:g}: "
-                "`clsplat convert MODEL OTHER.ply` drops the others"
+                f"at time {time:g}, {invalid:,} Gaussians have no finite position; keep speeds below {MAX_VALUE:g}, or "
+                "drop the faster Gaussians with `clsplat convert MODEL OTHER.ply`"
             )
         return replace(self, **tables, motion=None)
 
@@ -213,8 +213,8 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; view-dependent colors rotate with it.
 
-        rotation: [3, 3]; translation: [3] scene units.  An origin moves in place of the means' zero.  Raises ValueError
-        for a matrix that is not a rotation, and where the result is more than a model file holds.
+        rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means.
+        Raises ValueError for a matrix that is not a rotation, and if the result does not fit in a model file.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
         if np.shape(translation) != (3,):
@@ -240,20 +240,20 @@ class Model:
             tables = {name: table.astype(np.float32) for name, table in changed.items()}
         near = self.rendering.near * scale
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
-            raise ValueError("use a smaller scale and translation; such numbers do not fit in a model file")
+            raise ValueError("the result does not fit in a model file; use a smaller scale and translation")
         sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
         return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky, origin=origin)
 
     def with_origin(self, origin: NDArray[np.floating]) -> "Model":
         """Return the model with its means relative to another origin, [3] world coordinates.
 
-        Many formats and programs lose the origin.  A model without one that is nearer to zero than to `origin` is
-        therefore taken as relative to `origin` already.
+        Many formats and programs lose the origin.  The means of a model without one are therefore assumed to be
+        relative to `origin` already if they are closer to zero than to `origin`.
         """
         if not self.origin.any() and np.any(origin) and len(self):
-            middle = np.median(self.means, axis=0).astype(np.float64)
-            if np.linalg.norm(middle) < np.linalg.norm(middle - origin):
-                LOG.info("the model names no origin; its means are taken as relative to %s", position_text(origin))
+            center = np.median(self.means, axis=0).astype(np.float64)
+            if np.linalg.norm(center) < np.linalg.norm(center - origin):
+                LOG.info("the model has no origin; its means are assumed relative to %s", position_text(origin))
                 return replace(self, origin=origin)
         shift = self.origin - origin
         return replace(self, means=self.means + shift, origin=origin) if shift.any() else self
@@ -278,10 +278,10 @@ class Model:
     def save(self, path: str | Path, options: Writing | None = None) -> str:
         """Write a file in the format of its name: .ply, .spz, .sog, .glb, and others (docs/formats.md).
 
-        A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.  A
-        sky is written beside it, as NAME_sky.json, which names the SHA-256 of the file: no other model takes it.
-        Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
-        Raises ConfigError for another name, and for world coordinates that the format cannot hold, and OutputError when
+        A PLY stores a world filter as the property `filter_3D`; for other formats, it is baked.  A sky is written next
+        to the model as NAME_sky.json, which holds the SHA-256 of the model file, so that no other model uses it.
+        Returns the SHA-256 of the file, or of meta.json for a SOG folder.
+        Raises ConfigError for an unknown extension or world coordinates that the format cannot hold, and OutputError if
         the file cannot be written.
         """
         model = self if writing_format(Path(path)).keeps_filter else self.baked()
@@ -291,19 +291,19 @@ class Model:
         return digest
 
     def _in_world(self, path: Path) -> SplatFile:
-        """Return what a file in world coordinates holds: means in float64 where float32 is too coarse."""
+        """Return the file content in world coordinates; means are float64 if float32 is too coarse."""
         if not self.origin.any():
-            LOG.warning("%s: the model names no origin; its coordinates are written as they are", path)
+            LOG.warning("%s: the model has no origin; its coordinates are written unchanged", path)
             return self.to_splat_file()
         means: Any = self.means + self.origin
         if float32_holds(means, self.log_scales):
             means = means.astype(np.float32)
         elif writing_format(path).keeps_doubles:
-            LOG.info("%s: x, y and z are doubles, since floats are too coarse for world coordinates", path)
+            LOG.info("%s: x, y, and z are doubles, since floats are too coarse for world coordinates", path)
         else:
             raise ConfigError(
-                f"{path}: world coordinates around {position_text(self.origin)} need more digits than this format has; "
-                "write a .ply, or leave --world out: GLB and OpenUSD keep the origin in their node"
+                f"{path}: world coordinates around {position_text(self.origin)} exceed the precision of this format; "
+                "write a .ply, or omit --world: GLB and OpenUSD store the origin in their node"
             )
         local = replace(self, origin=np.zeros(3)).to_splat_file()
         return replace(local, parameters={**local.parameters, "means": means})
@@ -335,28 +335,28 @@ class Model:
 
 
 LOG = logging.getLogger("clsplat")
-COARSE = 0.05  # of the median scale: a spacing of positions that shows
+COARSE = 0.05  # spacing of positions that becomes visible, relative to the median scale
 
 
 def float32_holds(means: NDArray[np.floating], log_scales: Floats) -> bool:
-    """Return whether float32 numbers are dense enough for means, [N, 3], of Gaussians with these scales, [N, 3].
+    """Return whether float32 is precise enough for the means, [N, 3], of Gaussians with these scales, [N, 3].
 
-    Beyond MAX_NUMBER they are not coordinates, and stay as they are.
+    Also returns True beyond MAX_NUMBER, where means are not coordinates.
     """
     if not len(means):
         return True
-    place = np.abs(np.median(means, axis=0)).max()
-    if place >= MAX_NUMBER:
+    magnitude = np.abs(np.median(means, axis=0)).max()
+    if magnitude >= MAX_NUMBER:
         return True
-    spacing = np.spacing(np.float32(place))
+    spacing = np.spacing(np.float32(magnitude))
     return bool(spacing <= COARSE * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
 
 
 def load(path: str | Path, options: Reading | None = None) -> Model:
     """Read a model file of any format (docs/formats.md), or the model of a run folder.
 
-    The origin is what the file says; means in world coordinates that float32 cannot hold get one.
-    Raises DataError when it is missing, damaged or not a splat.
+    If the file has no origin and float32 is too coarse for its means, an origin near them is chosen.
+    Raises DataError if the file is missing, damaged, or not a splat model.
     """
     path = Path(path)
     file = read(model_path(path), options)

@@ -25,15 +25,15 @@ def static_motion(count: int, width: int) -> NDArray[np.float32]:
 
 
 def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the factor of each opacity, [N] in (0, 1], at one time or at one time per Gaussian, [N]."""
+    """Return the factor on each opacity, [N] in (0, 1], at one time or at one time per Gaussian, [N]."""
     fields, table = motion_fields(motion.shape[1]), motion.astype(np.float64)
     dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):
         return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
 
 
-def at_time(parameters: Parameters, time: float) -> Parameters:
-    """Return static Gaussians at a time: those visible then, without motion."""
+def evaluate_at(parameters: Parameters, time: float) -> Parameters:
+    """Return the Gaussians that are visible at a time as static Gaussians."""
     motion = parameters[MOTION].astype(np.float64)
     fields, factor = motion_fields(motion.shape[1]), presence(motion, time)
     is_visible = factor >= FAINTEST
@@ -44,7 +44,7 @@ def at_time(parameters: Parameters, time: float) -> Parameters:
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         if name in fields:
             moved = moved + motion[:, fields[name]] * dt**order
-    with np.errstate(over="ignore", invalid="ignore"):  # Model.at refuses such values
+    with np.errstate(over="ignore", invalid="ignore"):  # Model.at rejects such values
         tables["means"] = moved.astype(np.float32)
     if "turn" in fields:
         tables["quats"] = (tables["quats"] + motion[:, fields["turn"]] * dt).astype(np.float32)
@@ -78,14 +78,15 @@ def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Para
             "time (`clsplat convert MODEL OUT --time T`)"
         )
     return [
-        {**one, MOTION: one.get(MOTION, static_motion(len(one["means"]), *widths))} if widths else one for one in tables
+        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *widths))} if widths else table
+        for table in tables
     ]
 
 
 def shift_time_center(
     tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return means, quaternions, and motion of the same paths with time centers later by `by`, [N]."""
+    """Shift time centers by `by`, [N]; return means, quaternions, and motion of the same paths."""
     motion, dt = tables[MOTION].copy(), by[:, None]
     fields, zeros = motion_fields(motion.shape[1]), np.zeros((len(by), 3))
     first, second, third = (

@@ -1,8 +1,8 @@
 """Offload the SH bands above 0 and their moments to host memory.
 
-They are 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device has the blocks of LANES rows
-that a view sees, in slots (cl_kernels/slots.h), in row order: uploaded before the view is rendered, and downloaded
-before the next one.
+They are 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device holds the blocks of LANES rows
+that a view sees in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is rendered, and
+downloaded before the next one.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,21 +16,21 @@ from clsplat.opencl.device import Array
 
 NO_SLOT = 0xFFFFFFFF  # slots.h
 GROWTH = 1.25  # of the number of slots, when a view needs more
-MIN_ROWS = 4096  # of the slots; also the rows per upload when all are needed
+MIN_ROWS = 4096  # of all slots together; also the rows per upload when all blocks are needed
 
 
 class HostTables:
     """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
-        """gaussians: in its `tables`, each of these tables is replaced by its slots."""
+        """gaussians: its `tables` will hold the slots instead of the offloaded tables."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}
-        self.held = np.zeros(0, np.int64)  # blocks in the slots, in order
+        self.loaded = np.zeros(0, np.int64)  # blocks in the slots, in order
         self.slot = self._no_slots()  # slot of each block
         self._slots = 0
-        self._fetched: dict[str, Callable[[], NDArray[np.float32]]] = {}  # pending downloads of changed slots
+        self._downloads: dict[str, Callable[[], NDArray[np.float32]]] = {}  # pending, of changed slots
 
     def __contains__(self, name: str) -> bool:
         return name in self.tables
@@ -46,64 +46,64 @@ class HostTables:
 
     def add(self, name: str, components: int) -> Array:
         """Add a table of zeros; return its slots."""
-        self.put_back()
+        self.finish_download()
         self._forget_slots()
         self.tables[name] = np.zeros((self._blocks, components, self.lanes), np.float32)
         return self.device.zeros((self._slots, components, self.lanes))
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Return a table, [N, components]."""
-        self.put_back()
+        self.finish_download()
         table = self.tables[name]
         rows = table.transpose(0, 2, 1).reshape(self._blocks * self.lanes, table.shape[1])
         return np.ascontiguousarray(rows[: self.gaussians.count])
 
     def set(self, name: str, values: NDArray[np.float32]) -> None:
         """Replace a table by [N, components]."""
-        self.put_back()
+        self.finish_download()
         self._forget_slots()
         count, components = values.shape
         rows = np.zeros((self._blocks * self.lanes, components), np.float32)
         rows[:count] = values
         self.tables[name] = np.ascontiguousarray(rows.reshape(self._blocks, self.lanes, components).transpose(0, 2, 1))
 
-    def bring(self, depth_key: Array) -> None:
-        """Upload the blocks that a view sees and wait.  depth_key: [S], all bits set for culled Gaussians."""
+    def upload_visible(self, depth_key: Array) -> None:
+        """Upload the blocks that a view sees, and wait.  depth_key: [S], all bits set for culled Gaussians."""
         rows = self._blocks * self.lanes
-        seen = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
-        self.load(np.flatnonzero(seen))
+        is_visible = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
+        self.load(np.flatnonzero(is_visible))
 
     def load(self, blocks: NDArray[np.int64]) -> None:
         """Load these blocks, in ascending order, into the slots."""
-        self.put_back()
-        if np.array_equal(blocks, self.held):
+        self.finish_download()
+        if np.array_equal(blocks, self.loaded):
             return
         if len(blocks) > self._slots:
             self._slots = max(int(GROWTH * len(blocks)), MIN_ROWS // self.lanes)
             for name, table in self.tables.items():
-                held = self.gaussians.tables[name]
-                held.array = self.device.empty(0)  # released before its successor is allocated
-                held.array = self.device.empty((self._slots, table.shape[1], self.lanes))
+                slots_of_table = self.gaussians.tables[name]
+                slots_of_table.array = self.device.empty(0)  # frees the old slots before new ones are allocated
+                slots_of_table.array = self.device.empty((self._slots, table.shape[1], self.lanes))
         for name, table in self.tables.items():
             self._part(name, len(blocks)).set(table[blocks])
         slots = np.full(self.slot.shape, NO_SLOT, np.uint32)
         slots[blocks] = np.arange(len(blocks))
         self.slot.set(slots)
-        self.held = blocks
+        self.loaded = blocks
 
-    def begin_to_fetch(self) -> None:
-        """Start to download the slots after the commands enqueued so far."""
-        self._fetched = {name: self._part(name, len(self.held)).get_later() for name in self.tables}
+    def start_download(self) -> None:
+        """Start downloading the slots, after the commands enqueued so far."""
+        self._downloads = {name: self._part(name, len(self.loaded)).get_later() for name in self.tables}
 
-    def put_back(self) -> None:
+    def finish_download(self) -> None:
         """Wait for the download and write it into the tables."""
-        for name, values in self._fetched.items():
-            self.tables[name][self.held] = values()
-        self._fetched = {}
+        for name, values in self._downloads.items():
+            self.tables[name][self.loaded] = values()
+        self._downloads = {}
 
     def parts(self) -> Iterator[None]:
-        """Load all blocks into the slots, some at a time, and finally those loaded before."""
-        before, size = self.held, max(self._slots, MIN_ROWS // self.lanes)
+        """Load all blocks into the slots, some at a time, and finally the blocks that were loaded before."""
+        before, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
         for first in range(0, self._blocks, size):
             self.load(np.arange(first, min(first + size, self._blocks)))
             yield
@@ -132,7 +132,7 @@ class HostTables:
         return self.device.upload(np.full(max(self.gaussians.capacity // self.lanes, 1), NO_SLOT, np.uint32))
 
     def _forget_slots(self) -> None:
-        self.held, self.slot = np.zeros(0, np.int64), self._no_slots()
+        self.loaded, self.slot = np.zeros(0, np.int64), self._no_slots()
 
 
 def slot_arguments(gaussians: Struct) -> dict[str, Any]:

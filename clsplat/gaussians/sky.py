@@ -26,7 +26,7 @@ def signs(directions: NDArray[np.floating]) -> Floats:
 
 
 def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
-    """Map directions, [..., 3], to texel coordinates, [..., 2] from -0.5; texel centers are whole numbers."""
+    """Map directions, [..., 3], to texel coordinates, [..., 2] from -0.5; texel centers are integers."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
     below = np.minimum(directions[..., 2:], 0)
@@ -75,21 +75,21 @@ def bilinear_weights(fractions: Floats) -> Floats:
 
 
 def sample_texels(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> Floats:
-    """Return the values of a map, [side * side, C], in directions [..., 3]: [..., C]."""
+    """Return the values of a map, [side * side, C], in directions, [..., 3], as [..., C]."""
     side = int(np.sqrt(len(texels)))
-    place = texel_positions(directions, side)
-    first = np.floor(place).astype(np.int64)
-    found = texels[bilinear_texels(first[..., 0], first[..., 1], side)]
-    return np.asarray(np.einsum("...kc,...k->...c", found, bilinear_weights(place - first)))
+    position = texel_positions(directions, side)
+    first = np.floor(position).astype(np.int64)
+    values = texels[bilinear_texels(first[..., 0], first[..., 1], side)]
+    return np.asarray(np.einsum("...kc,...k->...c", values, bilinear_weights(position - first)))
 
 
 LOG = logging.getLogger("clsplat")
 
 SIDES = 8, 512  # texels: smallest and largest
 MEANING = (
-    "colors behind the model by direction, an octahedral map: with s = |x| + |y| + |z| the direction (x, y, z) of the "
-    "scene lies at (u, v) = (x, y) / s, where z < 0 at (x - sign(x) z, y - sign(y) z) / s; texels, red, green and "
-    "blue, lie row by row at u, v = -1 + (2 i + 1) / side"
+    "colors behind the model by direction, as an octahedral map: with s = |x| + |y| + |z|, the direction (x, y, z) of "
+    "the scene maps to (u, v) = (x, y) / s, or if z < 0 to (x - sign(x) z, y - sign(y) z) / s; texels are red, green, "
+    "and blue, stored row by row, with centers at u, v = -1 + (2 i + 1) / side"
 )
 
 
@@ -101,7 +101,7 @@ class DeviceSky:
     side: int
 
     def host(self) -> "Sky":
-        """Copy it to the host."""
+        """Copy the map to the host."""
         return Sky(np.ascontiguousarray(self.texels.get().T))
 
 
@@ -130,8 +130,8 @@ class Sky:
         Raises OutputError.
         """
         rows = [[float(value) for value in texel] for texel in self.texels]
-        own = dict(sorted(models.items()))
-        data = {"meaning": MEANING, "type": "directions", "models": own, "side": self.side, "texels": rows}
+        hashes = dict(sorted(models.items()))
+        data = {"meaning": MEANING, "type": "directions", "models": hashes, "side": self.side, "texels": rows}
         write_text(path, json.dumps(data) + "\n")
 
 
@@ -141,22 +141,22 @@ def sky_path(model: Path) -> Path:
 
 
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
-    """Write the sky of a model file with this SHA-256 next to it; without a sky, remove the model from an existing one.
+    """Write a sky next to its model file, whose SHA-256 is `digest`; if `sky` is None, remove the model from the file.
 
-    Other models of the same stem keep an identical sky.  Raises OutputError.
+    Other models with the same stem keep an identical sky.  Raises OutputError.
     """
     path = sky_path(model)
     try:
-        before, models = _read(path) if path.is_file() else (None, {})
+        old, models = _read(path) if path.is_file() else (None, {})
     except DataError:  # a damaged sky belongs to no model
-        before, models = None, {}
-    others = {name: known for name, known in models.items() if name != model.name and (sky or known != digest)}
+        old, models = None, {}
+    others = {name: other for name, other in models.items() if name != model.name and (sky or other != digest)}
     if sky:
-        same = before is not None and np.array_equal(before.texels, sky.texels)
-        sky.write(path, {**(others if same else {}), model.name: digest})
-    elif before and others:
-        before.write(path, others)
-    elif before and models:
+        is_same = old is not None and np.array_equal(old.texels, sky.texels)
+        sky.write(path, {**(others if is_same else {}), model.name: digest})
+    elif old and others:
+        old.write(path, others)
+    elif old and models:
         try:
             path.unlink()
         except OSError as error:
@@ -177,8 +177,8 @@ def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
     if sha256(model) in models.values():
         return sky
     LOG.warning(
-        "%s: the sky belongs to another model than %s, or the model has changed; it is not rendered; copy or export "
-        "the model and its sky again",
+        "%s: the sky does not belong to %s, or the model has changed, so the sky is not rendered; copy or export the "
+        "model and its sky again",
         *(path, model.name),
     )
     return None

@@ -27,7 +27,7 @@ class DeferredUpdates(Protocol):
         """Make room for recording an update of the bands up to `degree`."""
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
-        """Record an update that the rows in the view have already had."""
+        """Record an update that the rows in the view have already received."""
 
 
 class Struct(Protocol):

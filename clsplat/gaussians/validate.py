@@ -12,7 +12,7 @@ from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
 from clsplat.scene.scene import position_text
 
-ENOUGH = 16  # Gaussians needed for statistics
+MIN_COUNT = 16  # Gaussians needed for statistics
 FLAT = 1e-6  # scene units; smaller scales are those of discs or needles
 FAINT = 0.999 / 255  # opacities below are not rendered
 LARGE = 0.05  # relative to the extent; linear scales misread as logarithms exceed it
@@ -37,11 +37,11 @@ def examine(path: Path) -> dict[str, Any]:
     codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
     bad = not_finite(model.tables())
-    whole = model[~bad] if bad.any() else model
+    finite = model[~bad] if bad.any() else model
     findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians have values that are not finite"] if bad.any() else []
-    findings += [message] if (message := too_large_message(whole.tables())) else []
-    findings += _activated(whole)
-    length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
+    findings += [message] if (message := too_large_message(finite.tables())) else []
+    findings += _find_activated(finite)
+    length = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):
         findings.append(f"{zero} quaternions have length 0")
     if not len(model):
@@ -56,58 +56,59 @@ def examine(path: Path) -> dict[str, Any]:
         "mode": "box" if model.rendering.pixel_box else "mip" if model.rendering.compensate else "default",
         "world_filter": model.filter_variance is not None,
         "moves": model.motion is not None,
-        "ranges": _ranges(whole),
-        "bounds": [whole.means.min(axis=0).tolist(), whole.means.max(axis=0).tolist()] if len(whole) else [],
+        "ranges": _ranges(finite),
+        "bounds": [finite.means.min(axis=0).tolist(), finite.means.max(axis=0).tolist()] if len(finite) else [],
         **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
             "not_finite": int(bad.sum()),
             "no_rotation": zero,
-            "flat": int((whole.log_scales < np.log(FLAT)).any(axis=1).sum()),
-            "invisible": int((whole.opacities < FAINT).sum()),
+            "flat": int((finite.log_scales < np.log(FLAT)).any(axis=1).sum()),
+            "invisible": int((finite.opacities < FAINT).sum()),
         },
         "findings": findings,
         "valid": not findings,
     }
 
 
-def lines(found: dict[str, Any]) -> str:
+def lines(report: dict[str, Any]) -> str:
     """Format the result of `examine`, one line per fact."""
-    marks = " (mip)" * (found["mode"] == "mip") + " (filter_3D)" * found["world_filter"] + " (moves)" * found["moves"]
-    rows = [
-        f"{found['model']}: {found['format']}, {found['gaussians']:,} Gaussians, SH degree {found['sh_degree']}{marks}"
-    ]
-    for name, (low, middle, high) in found["ranges"].items():
+    marks = (
+        " (mip)" * (report["mode"] == "mip") + " (filter_3D)" * report["world_filter"] + " (moves)" * report["moves"]
+    )
+    degree = f"SH degree {report['sh_degree']}{marks}"
+    rows = [f"{report['model']}: {report['format']}, {report['gaussians']:,} Gaussians, {degree}"]
+    for name, (low, middle, high) in report["ranges"].items():
         rows.append(f"  {name:<12} {low:.4g} to {high:.4g}, median {middle:.4g}")
-    for low, high in [found["bounds"]] if found["bounds"] else []:
+    for low, high in [report["bounds"]] if report["bounds"] else []:
         text = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
         rows.append(f"  {'bounds':<12} ({next(text)}) to ({next(text)})")
-    if origin := found.get("origin"):
+    if origin := report.get("origin"):
         rows.append(f"  {'origin':<12} {position_text(np.array(origin))}, to which the bounds are relative")
-    counts = found["degenerate"]
+    counts = report["degenerate"]
     rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {words}" for name, words in DEGENERATE.items()))
     return "\n".join(rows)
 
 
-def verdict(found: dict[str, Any]) -> str:
+def verdict(report: dict[str, Any]) -> str:
     """Summarize the result of `examine` in one sentence."""
-    if found["valid"]:
-        return f"{found['model']}: valid"
-    if not found["gaussians"]:
-        return f"{found['model']}: it has no Gaussians; export it again"
-    remedy = "write it again" if found["format"] == "streamed SOG" else "export it again"
-    if found["degenerate"]["not_finite"]:
+    if report["valid"]:
+        return f"{report['model']}: valid"
+    if not report["gaussians"]:
+        return f"{report['model']}: it has no Gaussians; export it again"
+    remedy = "write it again" if report["format"] == "streamed SOG" else "export it again"
+    if report["degenerate"]["not_finite"]:
         remedy += ", or drop invalid Gaussians with `clsplat convert`"
-    return f"{found['model']}: {'; '.join(found['findings'])}; {remedy}"
+    return f"{report['model']}: {'; '.join(report['findings'])}; {remedy}"
 
 
-def _activated(model: Model) -> list[str]:
+def _find_activated(model: Model) -> list[str]:
     """Return findings about values that look already activated."""
-    if len(model) < ENOUGH:
+    if len(model) < MIN_COUNT:
         return []
     findings = []
     extent = float(np.linalg.norm(np.ptp(model.means.astype(np.float64), axis=0)))
-    middle = float(np.exp(min(float(np.median(model.log_scales)), 80)))
-    if (model.log_scales >= 0).mean() > NEARLY_ALL and middle > LARGE * extent:
+    median_scale = float(np.exp(min(float(np.median(model.log_scales)), 80)))
+    if (model.log_scales >= 0).mean() > NEARLY_ALL and median_scale > LARGE * extent:
         findings.append("its scales look linear, not logarithmic")
     logit = model.logit_opacity
     if ((logit >= 0) & (logit <= 1)).mean() > NEARLY_ALL:

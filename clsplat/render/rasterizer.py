@@ -138,7 +138,7 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
         no_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
         depth_key = project(workspace, replace(model, degree=0), camera, no_band, splats, radius).depth_key
         if on_host:
-            on_host.bring(depth_key)
+            on_host.upload_visible(depth_key)
         if deferred:
             deferred.catch_up(depth_key)
 

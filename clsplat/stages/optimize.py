@@ -21,7 +21,7 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
-from clsplat.training.checkpoint import copy_model, finite_values, put_back
+from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
@@ -173,7 +173,7 @@ class ValidatedTraining(Training):
             return
         with run.editing_tables():
             if best.measured.step != run.step:
-                put_back(run, run.best_tables, best)
+                restore_best(run, run.best_tables, best)
                 run.adam = run.stats = None
                 run.scalars.update(best.scalars)
             run.metrics.update(best.metrics)

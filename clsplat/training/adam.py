@@ -226,7 +226,7 @@ class Adam:
         if deferred:
             deferred.record(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:
-            self.gaussians.on_host.begin_to_fetch()
+            self.gaussians.on_host.start_download()
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Return the bias-corrected rate and the correction of moment 2 for a parameter's next update."""

@@ -142,7 +142,7 @@ def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -
             run.modules[name].load(values, split(tables, f"{name}/")[0])
 
 
-# The tables of the best model of a run: copied to the host, and put back.
+# The tables of the best model of a run: copied to the host, and restored.
 
 
 def copy_model(run: Run) -> Tables:
@@ -150,8 +150,8 @@ def copy_model(run: Run) -> Tables:
     return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
 
 
-def put_back(run: Run, tables: Tables, best: Best) -> None:
-    """Make a copied model the run's model."""
+def restore_best(run: Run, tables: Tables, best: Best) -> None:
+    """Make the copy of the best model the run's model."""
     of_modules, of_gaussians = split(tables, MODULES)
     put_back_modules(run, best.modules, of_modules)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), best.degree)

@@ -121,7 +121,7 @@ def test_moments_of_a_model_that_stands_still_are_refused(tmp_path):
     still = tmp_path / "still.ply"
     moving_model().at(0.5).save(still)
     for out, asked in (("out.spz", {"time": 0.5}), ("out", {"frames": 3})):
-        with pytest.raises(ConfigError, match="the model does not move; leave out --time and --frames"):
+        with pytest.raises(ConfigError, match="the model does not move; omit --time and --frames"):
             clsplat.convert(still, tmp_path / out, **asked)
     assert [path.name for path in tmp_path.iterdir()] == ["still.ply"]
 

@@ -8,7 +8,7 @@ import pytest
 
 import clsplat
 from clsplat.formats.splats import MOTION, motion_fields, motion_width
-from clsplat.gaussians.motion import at_time
+from clsplat.gaussians.motion import evaluate_at
 from clsplat.metrics.images import psnr, to_8_bits
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
@@ -52,7 +52,7 @@ def test_motion_is_packed_beside_the_other_planes(width):
     straight = slice(0, fields["turn"].start if "turn" in fields else width)
     np.testing.assert_allclose(found.motion[:, straight], known[:, straight], rtol=1e-3, atol=1e-4)
     tables = {name: values[order] for name, values in model.tables().items()}
-    later = at_time({**tables, MOTION: np.where(np.arange(width) == 4, 12.0, known).astype(np.float32)}, 0.7)
+    later = evaluate_at({**tables, MOTION: np.where(np.arange(width) == 4, 12.0, known).astype(np.float32)}, 0.7)
     if "turn" in fields:
         dt = 0.7 - found.motion[:, 3:4]
         turned = found.quats + np.roll(found.motion[:, fields["turn"]], 1, axis=1) * dt
