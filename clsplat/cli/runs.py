@@ -171,10 +171,11 @@ def check(
 
         _show_findings(result, as_json, lines(result), verdict(result), None if result["whole"] else OutputError)
     elif "model" in result:
-        from clsplat.gaussians import validate
+        from clsplat.gaussians.validate import lines as model_lines
+        from clsplat.gaussians.validate import verdict as model_verdict
 
-        findings, error = validate.lines(result), None if result["valid"] else DataError
-        _show_findings(result, as_json, findings, validate.verdict(result), error)
+        error = None if result["valid"] else DataError
+        _show_findings(result, as_json, model_lines(result), model_verdict(result), error)
     elif as_json:
         terminal.show_json({**result, "valid": True})
     elif "parameters" in result:

@@ -233,7 +233,7 @@ def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, c
     model[::2].save(tmp_path / "elsewhere" / "other.spz")
     shutil.copy(tmp_path / "elsewhere" / "other.spz", tmp_path / "scene.spz")
     assert clsplat.load(tmp_path / "scene.spz").sky is None
-    assert "other model than scene.spz" in caplog.text
+    assert "the sky does not belong to scene.spz" in caplog.text
     replace(model, sky=None).save(tmp_path / "scene.ply")
     assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
 
