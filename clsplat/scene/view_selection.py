@@ -1,4 +1,4 @@
-"""Select views of a scene by name: every n-th, a list, or the lines of a file; split a scene with them."""
+"""Select views of a scene by name (every n-th, a list, or the lines of a file), and split a scene by them."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -53,11 +53,11 @@ class ViewSelection(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_meant(cls, value: Any) -> Any:
-        """Explain what is wrong with tables that are nearly right."""
+    def _check_notation(cls, value: Any) -> Any:
+        """Explain common mistakes."""
         if not isinstance(value, dict):
             return value
-        if any(isinstance(key, str) and ":" in key and given is None for key, given in value.items()):
+        if any(isinstance(key, str) and ":" in key and content is None for key, content in value.items()):
             raise ValueError(f"{NOTATIONS} (YAML needs a space after each colon)")
         offset = value.get("offset")
         if isinstance(offset, int) and offset < 0:
@@ -67,17 +67,17 @@ class ViewSelection(Settings):
         return value
 
     @model_validator(mode="after")
-    def _of_one_kind(self) -> "ViewSelection":
-        given = [self.every, self.names, self.file]
-        if sum(value is not None for value in given) != 1 or (self.offset and self.every is None):
+    def _check_kind(self) -> "ViewSelection":
+        kinds = [self.every, self.names, self.file]
+        if sum(value is not None for value in kinds) != 1 or (self.offset and self.every is None):
             raise ValueError(NOTATIONS)
         if self.every is not None and self.offset >= self.every:
             raise ValueError(f"expected an offset less than every, {self.every}")
         return self
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
-        place = super().input_path(key, scene)
-        return place and Path(scene or "") / place
+        path = super().input_path(key, scene)
+        return path and Path(scene or "") / path
 
     def select(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
         """Return the indices of the selected `names`.
@@ -87,17 +87,17 @@ class ViewSelection(Settings):
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
-        place, listed = self._listed(folders)
+        source, listed = self._listed(folders)
         index, excluded = _NameIndex(names), {key: _NameIndex(taken) for key, taken in others.items()}
-        found_at = {name: index.indices_of(name) for name in listed}
-        for name in [name for name, matches in found_at.items() if not matches]:
+        matches_of = {name: index.indices_of(name) for name in listed}
+        for name in [name for name, matches in matches_of.items() if not matches]:
             for key in (key for key, taken in excluded.items() if taken.indices_of(name)):
                 if key != "missing":
-                    raise _taken(place, name, key)
-                del found_at[name]
-        if lost := len({*listed}) - len(found_at):
-            LOG.info("%s: skipped %s whose photograph is missing", place, pluralize(lost, "name"))
-        return {_only(name, matches, names, place) for name, matches in found_at.items()}
+                    raise _excluded_error(source, name, key)
+                del matches_of[name]
+        if lost := len({*listed}) - len(matches_of):
+            LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(lost, "name"))
+        return {_only_match(name, matches, names, source) for name, matches in matches_of.items()}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
         """Return the listed names, some of which may be left out later; none for every n-th.
@@ -106,18 +106,18 @@ class ViewSelection(Settings):
         """
         if self.every is not None:
             return []
-        place, listed = self._listed(folders)
+        source, listed = self._listed(folders)
         index, excluded = _NameIndex(names), {key: {*taken} for key, taken in others.items()}
         matches = {name: index.indices_of(name) for name in listed}
         for name, indices in matches.items():
             if not indices:
-                raise _unknown(name, names, place)
+                raise _unknown_name_error(name, names, source)
             for key in (key for key, taken in excluded.items() if {names[i] for i in indices} <= taken):
-                raise _taken(place, name, key)
+                raise _excluded_error(source, name, key)
         return [names[i] for indices in matches.values() for i in indices]
 
     def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
-        """The source of the listed names, for messages, and the names.  Raises DataError for a bad or an empty file."""
+        """Return the source of the names, for messages, and the names.  Raises DataError for a bad or empty file."""
         if self.file is None:
             return "the list of names", self.names or []
         files = [folder / self.file for folder in folders]
@@ -125,7 +125,7 @@ class ViewSelection(Settings):
         lines = (line.strip() for line in read_text(path, limit=LARGEST).splitlines())
         if listed := [line for line in lines if line and not line.startswith("#")]:
             return str(path), listed
-        raise DataError(f"{path}: is empty; expected the name of a photograph in each line")
+        raise DataError(f"{path}: the file is empty; write one photo name per line")
 
 
 Number = Annotated[int, Field(ge=0)]
@@ -133,20 +133,20 @@ Chosen = Annotated[Number | ViewSelection, in_one_sentence(NOTATIONS)]
 ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
-def _taken(place: str, name: str, key: TakenBy) -> DataError:
-    """The error for a name that cannot be selected, since another setting of the scene excludes it."""
-    why, remedy = {
+def _excluded_error(source: str, name: str, key: TakenBy) -> DataError:
+    """Return the error for a name that another setting of the scene excludes."""
+    reason, remedy = {
         "holdout": ("is a test view", "from scene.holdout"),
         "train": ("is left out by scene.train", "add it to scene.train"),
     }[key]
-    message = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
-    return MissingViewError(f"{place}: {message}")
+    message = f"{quote(name)} {reason}; expected training photographs: remove it from this list, or {remedy}"
+    return MissingViewError(f"{source}: {message}")
 
 
 def choose(
     choice: int | ViewSelection, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE
 ) -> set[int]:
-    """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
+    """Return the indices of the selected names; a number selects every n-th, starting with the first, and 0 none.
 
     Raises DataError as ViewSelection.select does.
     """
@@ -154,7 +154,7 @@ def choose(
 
 
 class _NameIndex:
-    """Find views by the ends of their names: `a/b.png`, `b.png` and `b` are the same view."""
+    """Find views by the last parts of their names: `a/b.png`, `b.png` and `b` name the same view."""
 
     def __init__(self, names: Sequence[str]):
         paths = [PurePosixPath(name) for name in names]
@@ -176,38 +176,42 @@ class _NameIndex:
 
 
 def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Each end of each path, including the whole path, with the index of the path."""
+    """Yield the last 1, 2, … parts of each path with the index of the path."""
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
 def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
-    """The indices of each key."""
+    """Return the indices of each key."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for parts, i in indexed:
         groups.setdefault(parts, []).append(i)
     return groups
 
 
-def _only(listed: str, matches: Sequence[int], names: Sequence[str], place: str) -> int:
-    """The only match.  Raises DataError for none or several."""
+def _only_match(listed: str, matches: Sequence[int], names: Sequence[str], source: str) -> int:
+    """Return the only match.  Raises DataError for none or several."""
     if len(matches) == 1:
         return matches[0]
     if matches:
-        both = " and ".join(quote(names[i]) for i in matches[:2])
-        raise MissingViewError(f"{place}: {quote(listed)} matches {both}; give more of the path")
-    raise _unknown(listed, names, place)
+        candidates = " and ".join(quote(names[i]) for i in matches[:2])
+        raise MissingViewError(f"{source}: {quote(listed)} matches {candidates}; give more of the path")
+    raise _unknown_name_error(listed, names, source)
 
 
-def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
-    near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
-    more = f"did you mean {quote(near[0])}?" if near else f"the first is {quote(names[0])}: correct or remove the name"
-    return MissingViewError(f"{place}: no photograph is called {quote(listed)}; {more}")
+def _unknown_name_error(listed: str, names: Sequence[str], source: str) -> DataError:
+    similar = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
+    more = (
+        f"did you mean {quote(similar[0])}?"
+        if similar
+        else f"the first is {quote(names[0])}: correct or remove the name"
+    )
+    return MissingViewError(f"{source}: no photograph is called {quote(listed)}; {more}")
 
 
 # Split a scene into training, validation and test views.
 
 FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name; not the first one, which is often at the end of a path
-MIN_TRAIN = 4  # training views from which some can be kept for validation
+MIN_TRAIN = 4  # training views: with fewer, none can be held out for validation
 
 
 @dataclass(frozen=True)
@@ -222,27 +226,27 @@ class Split:
 
     @property
     def of_reader(self) -> int:
-        """The holdout that a reader applies if the dataset has no split."""
+        """The holdout for a reader, which it applies if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def applied(self, scene: Scene) -> Scene:
         """Return the scene, read with `of_reader`, with this split.
 
-        Raises DataError for wrong names, or when a split takes all views.
+        Raises DataError for wrong names, or when one split takes all views.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if isinstance(self.holdout, ViewSelection) and not (
             self.holdout.every and scene.test
         ):  # the dataset says which
             names = [view.name for view in scene.views]
-            test = _chosen(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
+            test = _select(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; name fewer of them, "
+                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; name fewer, "
                     "or raise `every`, to leave some for training"
                 )
             if not test:
-                remedy = "lower its offset" if self.holdout.every else "name others, whose photographs are there"
+                remedy = "lower its offset" if self.holdout.every else "name photographs that are there"
                 raise DataError(
                     f"{scene.path}: scene.holdout takes 0 of {len(names)} photographs for testing; expected some: "
                     f"{remedy}, or set scene.holdout to 0 for none"
@@ -250,20 +254,22 @@ class Split:
             scene = _with_test(scene, test)
         left_out: list[str] = []
         if self.train is not None:
-            kept = _of(scene, "train", self.train, folders) | set(scene.test)
-            if kept == set(scene.test):
+            remaining = _select_training(scene, "train", self.train, folders) | set(scene.test)
+            if remaining == set(scene.test):
                 raise DataError(f"{scene.path}: scene.train leaves no photograph to train on; expected some")
-            LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(kept), "photograph"))
-            views = [view for i, view in enumerate(scene.views) if i in kept]
-            left_out = [view.name for i, view in enumerate(scene.views) if i not in kept]
+            LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(remaining), "photograph"))
+            views = [view for i, view in enumerate(scene.views) if i in remaining]
+            left_out = [view.name for i, view in enumerate(scene.views) if i not in remaining]
             tested = {scene.views[i].name for i in scene.test}
             smaller = replace(scene, views=tuple(views))
             scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
         return self.with_validation(scene, left_out)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError for lists that cannot fit the photographs in a folder, however many can be placed: with
-        unknown names, or with a photograph in two roles."""
+        """Raise DataError for lists that do not fit the photos in a folder: unknown names, or a photo in two lists.
+
+        Photos need not have poses yet.
+        """
         others: dict[TakenBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, ViewSelection):
@@ -274,11 +280,11 @@ class Split:
                 if listed and key == "holdout":
                     others["holdout"] = [*listed]
                 if listed and key == "train":
-                    free = listed | self._counted_out(names)
+                    free = listed | self._held_out(names)
                     others["train"] = [name for name in names if name not in free]
 
-    def _counted_out(self, names: Sequence[str]) -> set[str]:
-        """The names that a number holds out for testing, if all are placed."""
+    def _held_out(self, names: Sequence[str]) -> set[str]:
+        """Return the names that are held out for testing by number, if all photos get poses."""
         every, offset = self.of_reader, 0
         if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset
@@ -293,7 +299,11 @@ class Split:
         if self.validation == 0:
             return scene
         chosen = self.validation
-        fold = _auto(scene) if chosen == "auto" else _of(scene, "validation", chosen, folders, left_out)
+        fold = (
+            _validation_fold(scene)
+            if chosen == "auto"
+            else _select_training(scene, "validation", chosen, folders, left_out)
+        )
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
@@ -304,23 +314,23 @@ class Split:
 
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
-    """The scene with other test views, and its extent."""
+    """Return the scene with other test views, and with the extent of its training views."""
     train = other_views(scene.path, len(scene.views), test)
     extent = camera_extent([scene.views[i] for i in train])
     return replace(scene, train=train, test=tuple(sorted(test)), extent=extent)
 
 
-def _of(
+def _select_training(
     scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
 ) -> set[int]:
-    """The indices of the selected training views; key: the setting that selects them."""
+    """Return the indices of the selected training views; key: the setting that selects them."""
     names = [scene.views[i].name for i in scene.train]
     tested = [scene.views[i].name for i in scene.test]
     others: Taken = {"holdout": tested, "train": left_out, "missing": scene.skipped}
-    return {scene.train[i] for i in _chosen(scene, key, choice, names, folders, others)}
+    return {scene.train[i] for i in _select(scene, key, choice, names, folders, others)}
 
 
-def _chosen(
+def _select(
     scene: Scene,
     key: str,
     choice: int | ViewSelection,
@@ -328,20 +338,20 @@ def _chosen(
     folders: Sequence[Path],
     others: Taken = NONE,
 ) -> set[int]:
-    """The indices of the selected names.  Raises DataError that names the setting."""
+    """Return the indices of the selected names.  Raises DataError with the name of the setting."""
     try:
         return choose(choice, names, folders, others)
     except DataError as error:
         raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
 
 
-def _auto(scene: Scene) -> set[int]:
-    """Every 8th of the training views, and at least two of them."""
+def _validation_fold(scene: Scene) -> set[int]:
+    """Return every 8th training view, and at least two."""
     count = len(scene.train)
     if count < MIN_TRAIN:
         raise DataError(
-            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected at least {MIN_TRAIN} to keep some "
-            "for validation: take more, or set scene.validation to 0"
+            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected at least {MIN_TRAIN} to hold "
+            "some out for validation: take more, or set scene.validation to 0"
         )
     order = sorted(scene.train, key=lambda i: scene.views[i].name)
     fold = order[FOLD_OFFSET::FOLD]

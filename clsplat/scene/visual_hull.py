@@ -1,7 +1,7 @@
 """Points for photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
 
-A box is split into cells, as an octree (Szeliski 1993).  A cell that lies outside the silhouette of one view is empty;
-one that lies inside all silhouettes is full; the others are split.  The last of them are full where their center is.
+A box is split into cells, as an octree (Szeliski 1993).  A cell outside the silhouette of any view is empty, and a cell
+inside all silhouettes is full; the others are split.  Cells of the last level are full if their centers are.
 """
 
 import math
@@ -18,14 +18,14 @@ from clsplat.scene.view import View
 
 Floats = NDArray[np.floating]
 Bools = NDArray[np.bool_]
-Cells = NDArray[np.integer]  # [M, 3], places in a grid
-LONG_SIDE = 400  # px, of the photographs that are read
-MAX_VIEWS = 64  # that are read
+Cells = NDArray[np.integer]  # [M, 3], indices in a grid
+LONG_SIDE = 400  # px, of the photos as read
+MAX_VIEWS = 64  # used for the silhouettes
 COARSEST, FINEST = 16, 256  # cells along a side of the box
-HALF, OPAQUE = 127, 250  # alpha from which a pixel belongs to the silhouette, and shows its color alone
-LEAST_VIEWS, LEAST_SHARE = 2, 0.25  # that see a cell, in number and of all
+HALF, OPAQUE = 127, 250  # alpha above which a pixel is in the silhouette, and from which its color is used
+MIN_VIEWS, MIN_FRACTION = 2, 0.25  # views that must see a cell: a number, and a fraction of all
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
-BEHIND = 2.0  # sides of a cell that a point may lie behind the first one of its place in the image, and be visible
+MAX_BEHIND = 2.0  # cell sides by which a visible point may be behind the nearest point of its pixel
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Silhouette:
         return np.ascontiguousarray(self.rgba[:, :, 3])
 
     def project(self, points: NDArray[np.float32]) -> "Projection":
-        """Return where points [M, 3] lie in the image."""
+        """Project points, [M, 3], into the image."""
         c, pose = self.view.camera, self.view.world_to_camera
         matrix = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose).astype(np.float32)
-        # not a matrix product: the libraries that compute those sum in an order that follows the number of threads
+        # no matrix product: BLAS sums in an order that depends on the number of threads
         x, y, depth = (sum(row[k] * points[:, k] for k in range(3)) + row[3] for row in matrix)
         ahead = depth > 0
         safe = np.where(ahead, depth, 1)
@@ -54,7 +54,7 @@ class Silhouette:
         return Projection(inside, row[inside], column[inside], depth[inside])
 
     def radius(self, size: float, depth: Floats) -> int:
-        """Return the radius in pixels that nothing of a ball exceeds, at the nearest of some depths."""
+        """Return an upper bound, px, of the projected radius of a ball at the smallest of some depths."""
         c = self.view.camera
         slant = math.hypot(1, max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy)
         return min(math.ceil(slant * size * max(c.fx, c.fy) / float(depth.min())), max(c.width, c.height))
@@ -62,7 +62,7 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class Projection:
-    """Points in an image; K of M lie in it."""
+    """The projections of M points, of which K are in the image."""
 
     inside: Bools  # [M]
     row: NDArray[np.integer]  # [K] px
@@ -78,36 +78,36 @@ def hull_points(
     count: int,
     seed: int,
 ) -> PointCloud:
-    """Return at most `count` colored points on the hull, in a box of 2 `half_side` around `center` [3], perhaps none.
+    """Return at most `count` colored points on the hull, in a box of side 2 `half_side` around `center`, [3].
 
-    `load` returns a photograph with its alpha, [H, W, 4], or None without transparency.  The last cells are those of
-    which there are `count` or more on the surface, about, unless they would be smaller than the box by FINEST.
+    `load` returns a photo with its alpha, [H, W, 4], or None without transparency.  Cells are split until about `count`
+    of them are on the surface, or until there are FINEST along a side of the box.
     """
     silhouettes = list(_silhouettes(views, load))
     full, number = np.zeros((COARSEST,) * 3, bool), COARSEST
     cells: Cells = np.argwhere(~full)
     while True:
         centers, side = _centers(cells, center, half_side, number)
-        inside, cut = _within(silhouettes, centers, HALF_DIAGONAL * side)
+        inside, cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
         full[tuple(cells[inside].T)] = True
         cells, number = _split(cells[cut]), 2 * number
         full = full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
         if cut.sum() >= count or number == FINEST:
             break
-    inside, _ = _within(silhouettes, _centers(cells, center, half_side, number)[0], 0)
+    inside, _ = _classify(silhouettes, _centers(cells, center, half_side, number)[0], 0)
     full[tuple(cells[inside].T)] = True
     points, side = _centers(
         np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), center, half_side, number
     )
-    colors, seen = _colors(silhouettes, points, side)
-    points, colors = points[seen], colors[seen]
+    colors, visible = _colors(silhouettes, points, side)
+    points, colors = points[visible], colors[visible]
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
     return PointCloud(points[chosen], colors[chosen])
 
 
 def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
-    for place in np.unique(np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)):
-        view = views[place]
+    for index in np.unique(np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)):
+        view = views[index]
         small = view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         rgba = load(small)
         if rgba is not None:
@@ -115,53 +115,53 @@ def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8]
 
 
 def _split(cells: Cells) -> Cells:
-    """The eight parts of each cell, [8 M, 3]."""
+    """Return the eight children of each cell, [8 M, 3]."""
     return (2 * cells[:, None] + np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
 
 
 def _centers(cells: Cells, center: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
-    """The centers of cells of a box that has `number` along a side, [M, 3], and their side."""
+    """Return the centers, [M, 3], and the side of cells in a box with `number` of them along a side."""
     side = 2 * half_side / number
     return (center - half_side + side * (cells + 0.5)).astype(np.float32), side
 
 
-def _within(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
-    """Which balls around points, [M], lie inside all silhouettes in whose images they are, and which on the edge of one
-    and outside none.  Neither are those that few views see: nobody knows what is there."""
+def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
+    """Return which balls, [M], are inside the silhouettes of all views that see them, and which are on the edge of one
+    and outside none.  Balls that few views see are neither, since nothing is known about them."""
     full, left, seen = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:
-        place = silhouette.project(centers[left])
-        if not len(place.depth):
+        projection = silhouette.project(centers[left])
+        if not len(projection.depth):
             continue
-        around = np.ones((2 * silhouette.radius(radius, place.depth) + 1,) * 2, np.uint8)
-        here = left[place.inside]
+        around = np.ones((2 * silhouette.radius(radius, projection.depth) + 1,) * 2, np.uint8)
+        here = left[projection.inside]
         seen[here] += 1
-        full[here[cv2.erode(silhouette.alpha, around)[place.row, place.column] <= HALF]] = False
-        stays = ~place.inside
-        stays[place.inside] = cv2.dilate(silhouette.alpha, around)[place.row, place.column] > HALF
-        left = left[stays]
+        full[here[cv2.erode(silhouette.alpha, around)[projection.row, projection.column] <= HALF]] = False
+        remains = ~projection.inside
+        remains[projection.inside] = cv2.dilate(silhouette.alpha, around)[projection.row, projection.column] > HALF
+        left = left[remains]
     touched = np.zeros(len(centers), bool)
     touched[left] = True
-    touched &= seen >= max(LEAST_VIEWS, LEAST_SHARE * len(silhouettes))
+    touched &= seen >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
     return touched & full, touched & ~full
 
 
 def _colors(
     silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], Bools]:
-    """The mean colors of points, [M, 3] in [0, 1], in the views that show them, and which are shown."""
+    """Return the mean colors, [M, 3] in [0, 1], of points in the views that show them, and which are shown, [M]."""
     total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     for silhouette in silhouettes:
-        place, camera = silhouette.project(points), silhouette.view.camera
-        if not len(place.depth):
+        projection, camera = silhouette.project(points), silhouette.view.camera
+        if not len(projection.depth):
             continue
-        cell = max(1, math.ceil(side * max(camera.fx, camera.fy) / float(np.median(place.depth))))  # px
-        first = np.full((camera.height // cell + 1, camera.width // cell + 1), np.inf, np.float32)
-        np.minimum.at(first, (place.row // cell, place.column // cell), place.depth)
-        shown = place.depth <= first[place.row // cell, place.column // cell] + BEHIND * side
-        rgba = silhouette.rgba[place.row, place.column]
+        cell = max(1, math.ceil(side * max(camera.fx, camera.fy) / float(np.median(projection.depth))))  # px
+        nearest = np.full((camera.height // cell + 1, camera.width // cell + 1), np.inf, np.float32)
+        np.minimum.at(nearest, (projection.row // cell, projection.column // cell), projection.depth)
+        shown = projection.depth <= nearest[projection.row // cell, projection.column // cell] + MAX_BEHIND * side
+        rgba = silhouette.rgba[projection.row, projection.column]
         shown &= rgba[:, 3] >= OPAQUE
-        here = np.flatnonzero(place.inside)[shown]
+        here = np.flatnonzero(projection.inside)[shown]
         total[here] += rgba[shown, :3]
         number[here] += 1
     return np.asarray(total / np.maximum(255 * number, 1)[:, None], np.float32), number > 0

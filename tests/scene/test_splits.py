@@ -171,7 +171,9 @@ def test_explicit_fold_is_used(folder):
 
 
 def test_too_large_fold_is_refused(folder):
-    with pytest.raises(DataError, match="has 3 training photographs; expected at least 4 to keep some for validation"):
+    with pytest.raises(
+        DataError, match="has 3 training photographs; expected at least 4 to hold some out for validation"
+    ):
         read_scene(folder, Split(8, ViewSelection(names=["b", "c", "d"]), "auto"))
     with pytest.raises(DataError, match="takes 24 of 24 training photographs"):
         read_scene(folder, Split(0, None, 1))
@@ -198,7 +200,7 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
     with pytest.raises(DataError, match="no photograph is called 'z'"):
         read_scene(folder, Split(ViewSelection(names=["a", "c", "z"]), missing="skip"))
-    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name others, whose photographs are there"):
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name photographs that are there"):
         read_scene(folder, Split(ViewSelection(names=["c"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
         read_scene(folder, Split(0, train=ViewSelection(names=["c"]), missing="skip"))
