@@ -71,7 +71,7 @@ def reads_or_refuses(path: Path) -> None:
         assert len(widths) == 1
 
 
-def test_every_reader_of_the_table_is_here():
+def test_every_reader_is_fuzzed():
     own = {"PLY", "streamed SOG"}  # in test_ply.py, and below
     assert {codec.name for codec in CODECS if codec.read} == own | NAMES.keys() | {"ksplat"}
 
@@ -88,7 +88,7 @@ def test_a_damaged_model_is_read_or_refused(name, folder: Path):
     reads()
 
 
-def test_what_a_damaged_spz_holds_is_read_or_refused(folder: Path):
+def test_damaged_content_of_an_spz_is_read_or_refused(folder: Path):
     """The damage lies inside of the compression."""
     plain = [zlib.decompress(data, 31) for data in seeds("SPZ", folder) if data[:2] == b"\x1f\x8b"]
 
@@ -100,7 +100,7 @@ def test_what_a_damaged_spz_holds_is_read_or_refused(folder: Path):
     reads()
 
 
-def test_a_damaged_part_of_a_sog_is_read_or_refused(folder: Path):
+def test_damaged_sog_member_is_read_or_refused(folder: Path):
     """The ZIP is whole; its meta.json or an image is not."""
     with zipfile.ZipFile(io.BytesIO(seeds("SOG", folder)[1])) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}

@@ -85,7 +85,7 @@ def test_a_damaged_setting_is_valid_or_refused(name):
     reads()
 
 
-def test_any_word_as_a_value_is_valid_or_refused():
+def test_any_string_value_is_valid_or_refused():
     places = [key.key_path for key in settable(load("splat_7k").settings)]
 
     @fuzzed(100, place=one_of(places), word=one_of([*WORDS, *YAML]))

@@ -85,7 +85,7 @@ def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["status.json", "checksums.json", INPUTS])
-def test_a_damaged_file_of_a_whole_run_is_read_equal_or_told(name, run: Path):
+def test_damaged_run_file_is_read_equal_or_reported(name, run: Path):
     before = (run / name).read_bytes()
     whole = verify(RunState.read(run))
     assert whole["whole"], whole

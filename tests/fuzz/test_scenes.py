@@ -129,7 +129,7 @@ def test_a_damaged_table_of_sizes_is_read_or_refused(folder):
     reads()
 
 
-def test_a_damaged_table_of_moments_is_read_or_refused(folder):
+def test_damaged_table_of_times_is_read_or_refused(folder):
     path, _ = colmap(folder, "txt")
     moments = {image.name: float(i) for i, image in enumerate(tiny_model().images)}
 
@@ -142,7 +142,7 @@ def test_a_damaged_table_of_moments_is_read_or_refused(folder):
     (path / "images" / "times.json").unlink()
 
 
-def test_cameras_of_videos_that_are_damaged_are_read_or_refused(folder):
+def test_damaged_video_cameras_are_read_or_refused(folder):
     path = folder / "videos_of_two"
     for name in ("a/0.png", "a/1.png", "b/0.png", "b/1.png"):
         photo(path / "videos" / name)

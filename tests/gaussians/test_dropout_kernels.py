@@ -16,7 +16,7 @@ COUNTS = (1, 15, 16, 17, 63, 64, 65)
 
 
 @on_devices("count", COUNTS)
-def test_a_step_leaves_out_what_the_oracle_draws(device, rng, count):
+def test_step_drops_what_the_reference_draws(device, rng, count):
     case = replace(random_case(rng, count), dropout=DROPOUT)
     assert_within_bounds(check_dropout(device, case, rng, "the scene"))
     assert_within_bounds(check_hidden(device, case, rng))
@@ -27,7 +27,7 @@ def test_filters_and_dropout_multiply(device, rng):
     assert_within_bounds(check_dropout(device, replace(case, dropout=DROPOUT), rng, "the scene"))
 
 
-def test_the_share_that_is_left_out_is_the_probability():
+def test_dropped_fraction_equals_the_probability():
     drawn = [ref.dropped(0.2, 7, step, 500).mean() for step in range(1, 41)]
     assert abs(np.mean(drawn) - 0.2) < 0.01
     assert len(set(drawn)) > 10, "other steps draw others"
@@ -35,7 +35,7 @@ def test_the_share_that_is_left_out_is_the_probability():
 
 
 @on_one_setting
-def test_the_mean_of_many_pictures_is_the_picture(device, rng):
+def test_mean_of_many_renders_is_the_full_render(device, rng):
     """Of one layer, in which no Gaussian covers another: opacities are larger by as much as fewer are drawn."""
     case = random_case(rng, 12, 64, 64)
     places = np.stack(np.meshgrid([-0.3, 0, 0.3], [-0.4, -0.15, 0.15, 0.4]), axis=-1).reshape(12, 2) * 3

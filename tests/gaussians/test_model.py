@@ -23,7 +23,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("degree", "filtered"), list(zip(WIDTHS, (False, True, True, False), strict=True)))
-def test_a_file_read_and_written_again_has_the_same_bytes(tmp_path, rng, degree, filtered):
+def test_round_trip_gives_the_same_bytes(tmp_path, rng, degree, filtered):
     case = random_case(rng, 7)
     model = model_of(with_world_filter(case, rng) if filtered else case, degree)
     model = replace(model, rendering=Rendering(0.3, 0.1, 1.0, "white", "mask", {"version": "0"}))
@@ -43,7 +43,7 @@ def test_a_run_folder_is_a_model(tmp_path, rng):
     assert len(load(tmp_path)) == 3
 
 
-def test_views_are_the_values_after_activation(rng):
+def test_properties_are_activated_values(rng):
     case = random_case(rng, 9)
     model = model_of(case)
     exact = case.gaussians()
@@ -54,7 +54,7 @@ def test_views_are_the_values_after_activation(rng):
     assert all(table.dtype == np.float32 for table in (model.scales, model.opacities, model.colors))
 
 
-def test_rows_are_chosen_by_mask_slice_index_and_indices(rng):
+def test_rows_are_selected_by_mask_slice_or_index(rng):
     model = model_of(with_world_filter(random_case(rng, 9), rng), 1)
     mask = model.opacities > np.median(model.opacities)
     for chosen, rows in ((mask, np.flatnonzero(mask)), (slice(1, 8, 3), [1, 4, 7]), (4, [4]), ([5, 5], [5, 5])):
@@ -65,7 +65,7 @@ def test_rows_are_chosen_by_mask_slice_index_and_indices(rng):
     assert model[:0].sh_degree == 1
 
 
-def test_a_model_shares_no_memory_with_arrays_or_other_models(rng):
+def test_model_shares_no_memory(rng):
     given = with_world_filter(random_case(rng, 9), rng).parameters
     model = Model(**given)
     for other in (given, model[:4].tables(), model[:].tables(), model.transformed().tables(), model.baked().tables()):
@@ -91,13 +91,13 @@ def test_moved_model_looks_the_same_to_a_moved_camera(device, rng, degree):
     np.testing.assert_allclose(after.depth, scale * before.depth, rtol=1e-3)
 
 
-def test_nothing_moves_without_a_movement(rng):
+def test_identity_transform_changes_nothing(rng):
     model = model_of(random_case(rng, 5))
     for name, table in model.transformed().tables().items():
         np.testing.assert_allclose(getattr(model, name), table, atol=1e-6, err_msg=name)
 
 
-def test_turned_harmonics_are_the_old_from_the_turned_side(rng):
+def test_rotated_harmonics_match_rotated_directions(rng):
     turn = random_rotation(rng)
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -120,7 +120,7 @@ def test_turned_harmonics_are_the_old_from_the_turned_side(rng):
         ({"translation": 1.0}, r"the translation has shape \(\)"),
     ],
 )
-def test_what_is_no_movement_is_refused(rng, movement, message):
+def test_invalid_transform_is_refused(rng, movement, message):
     with pytest.raises(ValueError, match=message):
         model_of(random_case(rng, 2)).transformed(**movement)
 
@@ -132,7 +132,7 @@ def test_what_is_no_movement_is_refused(rng, movement, message):
         *(("sh_base", (3,)), ("sh_rest", (3, 7))),
     ],
 )
-def test_a_table_of_a_wrong_shape_is_named(rng, name, shape):
+def test_table_of_a_wrong_shape_is_named(rng, name, shape):
     tables = {**random_case(rng, 3).parameters, name: np.zeros(shape)}
     wrong = "quats" if name == "means" and shape == (2, 3) else name  # the means say how many there are
     with pytest.raises(ValueError, match=rf"^{wrong} has shape .*; expected \([23], [\d or]+\)"):
@@ -144,7 +144,7 @@ def test_tables_become_float32(rng):
     assert all(table.dtype == np.float32 for table in Model(**tables).tables().values())
 
 
-def test_a_model_shows_itself(rng):
+def test_model_has_a_rich_display(rng):
     model = model_of(random_case(rng, 3))
     assert repr(model) == "Model(3 Gaussians, SH degree 3)"
     for one in (model, model[:0]):
@@ -153,7 +153,7 @@ def test_a_model_shows_itself(rng):
         assert f"Gaussians{len(one)}" in page.text.replace("\n", "")
 
 
-def test_a_scene_shows_four_photographs_and_escapes_their_names(tiny_scene):
+def test_scene_display_has_four_images_and_escaped_names(tiny_scene):
     import clsplat
 
     scene = clsplat.read_scene(tiny_scene)

@@ -41,7 +41,7 @@ def test_a_ply_keeps_the_motion(tmp_path, width):
         assert f"property float {column}\n".encode() in (tmp_path / "model.ply").read_bytes()
 
 
-def test_a_part_of_a_motion_is_refused(tmp_path):
+def test_partial_motion_is_refused(tmp_path):
     moving_model(8).save(tmp_path / "model.ply")
     data = (tmp_path / "model.ply").read_bytes().replace(b"float acceleration_1\n", b"float acceleration_9\n")
     (tmp_path / "model.ply").write_bytes(data)
@@ -50,14 +50,14 @@ def test_a_part_of_a_motion_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog", "a.splat", "a.glb", "a.usda"])
-def test_other_formats_refuse_what_they_would_lose(tmp_path, name):
+def test_other_formats_refuse_motion(tmp_path, name):
     with pytest.raises(DataError, match="--time T"):
         moving_model().save(tmp_path / name)
     assert not (tmp_path / name).exists()
     moving_model().at(0.5).save(tmp_path / name)
 
 
-def test_a_moment_has_the_formulas_of_the_kernel():
+def test_snapshot_follows_the_kernels_formulas():
     model = moving_model(motion_width(3, True))
     moment, motion = model.at(0.25), model.motion.astype(np.float64)
     there = presence(motion, 0.25) >= 1 / 255
@@ -75,7 +75,7 @@ def test_a_moment_has_the_formulas_of_the_kernel():
         model.at(1.5)
 
 
-def test_a_moment_of_a_model_that_was_moved_is_the_moment_moved():
+def test_snapshot_of_a_moved_model_is_the_moved_snapshot():
     model, turn = moving_model(motion_width(2, True)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     one, other = model.transformed(2.0, turn, (1, 2, 3)).at(0.6), model.at(0.6).transformed(2.0, turn, (1, 2, 3))
     for name, table in one.tables().items():
@@ -92,7 +92,7 @@ def test_merged_models_move_as_before():
         merge_models([moving, moving_model(8)], ["a", "b"])
 
 
-def test_convert_writes_moments(tmp_path: Path):
+def test_convert_writes_snapshots(tmp_path: Path):
     model, source = moving_model(), tmp_path / "moving.ply"
     model.save(source)
     clsplat.convert(source, tmp_path / "one.spz", time=0.5)
@@ -109,7 +109,7 @@ def test_convert_writes_moments(tmp_path: Path):
             clsplat.convert(source, tmp_path / "frames", **wrong)
 
 
-def test_a_series_tells_once_what_its_format_does_not_keep(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_series_reports_lost_data_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     model = moving_model()
     replace(model, rendering=replace(model.rendering, background="white")).save(tmp_path / "moving.ply")
     clsplat.convert(tmp_path / "moving.ply", tmp_path / "frame.spz", frames=3)
@@ -117,7 +117,7 @@ def test_a_series_tells_once_what_its_format_does_not_keep(tmp_path: Path, caplo
     assert told.startswith(str(tmp_path / "frame_0000.spz"))
 
 
-def test_moments_of_a_model_that_stands_still_are_refused(tmp_path):
+def test_snapshots_of_a_static_model_are_refused(tmp_path):
     still = tmp_path / "still.ply"
     moving_model().at(0.5).save(still)
     for out, asked in (("out.spz", {"time": 0.5}), ("out", {"frames": 3})):
@@ -126,7 +126,7 @@ def test_moments_of_a_model_that_stands_still_are_refused(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["still.ply"]
 
 
-def test_a_series_is_whole_or_not_there(tmp_path):
+def test_series_is_complete_or_absent(tmp_path):
     """Late in it all Gaussians are gone."""
     model = moving_model()
     motion = model.motion.copy()
@@ -140,7 +140,7 @@ def test_a_series_is_whole_or_not_there(tmp_path):
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_a_disk_that_fills_leaves_no_part_of_a_series(before, tmp_path, monkeypatch):
+def test_full_disk_leaves_no_partial_series(before, tmp_path, monkeypatch):
     model, out = moving_model(), tmp_path / "frames"
     replace(model, sky=Sky(np.full((64, 3), 0.5, np.float32))).save(tmp_path / "moving.ply")
     if before:
@@ -162,7 +162,7 @@ def full() -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_speeds_beyond_what_a_file_holds_are_refused_and_dropped(tmp_path):
+def test_too_large_speeds_are_refused_or_dropped(tmp_path):
     model = moving_model()
     motion = model.motion.copy()
     motion[3, 0], motion[3, 3:5] = 1e38, (1e38, 90)

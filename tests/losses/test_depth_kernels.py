@@ -26,11 +26,11 @@ def test_plane_and_gradients(device, rng):
     assert_within_bounds(inverse_depths(device, rng))
 
 
-def test_the_loss_and_its_gradient(device, rng):
+def test_loss_and_gradient(device, rng):
     assert_within_bounds(losses_of_depths(device, rng))
 
 
-def test_the_box_of_the_pixel(device, rng):
+def test_pixel_box_filter(device, rng):
     case = replace(safe_case(rng, 40, 33, 30, 1e-5, variance=0.0, pixel_box=1.0))
     assert_within_bounds(check_depth(device, case, rng.normal(size=(4, 30, 33)).astype(np.float32), "the pixel's box"))
 
@@ -45,7 +45,7 @@ def test_schedules_agree(device, rng):
             same_of_schedules(device, two, one)
 
 
-def test_reference_gradient_is_that_of_finite_differences(rng):
+def test_reference_gradient_matches_finite_differences(rng):
     """By parameters, so that depths move too."""
     case = random_case(rng, 5, 24, 20)
     gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
@@ -76,7 +76,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
             assert difference == pytest.approx(values[place], rel=1e-4, abs=1e-6 * np.abs(values).max())
 
 
-def test_the_gradient_of_the_loss_is_that_of_finite_differences(rng):
+def test_loss_gradient_matches_finite_differences(rng):
     plane, targets, weights = rng.uniform(size=(6, 7)), rng.uniform(size=9), rng.uniform(size=9)
     places = np.unravel_index(rng.permutation(42)[:9], plane.shape)
     _, gradient = ref.inverse_depth_loss(plane, places, targets, weights)
@@ -89,7 +89,7 @@ def test_the_gradient_of_the_loss_is_that_of_finite_differences(rng):
         assert (ends[0] - ends[1]) / 2e-7 == pytest.approx(gradient[place], abs=1e-6)
 
 
-def test_nearest_point_of_a_pixel_wins_and_outside_is_ignored(device, rng):
+def test_nearest_point_per_pixel_counts_and_outside_none(device, rng):
     camera = random_case(rng, 1, 40, 30).device_camera(device)
     pose = camera.values["world_to_camera"].reshape(3, 4).astype(np.float64)
     fx, fy, cx, cy = (float(camera.values[name]) for name in ("fx", "fy", "cx", "cy"))
@@ -113,7 +113,7 @@ def known(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
 
 
 @on_one_setting
-def test_points_that_more_photographs_show_weigh_more(device, rng):
+def test_points_with_more_observations_weigh_more(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
     found = known(device, trainer, photograph)
     camera = replace(photograph.camera, view=0)
@@ -126,7 +126,7 @@ def test_points_that_more_photographs_show_weigh_more(device, rng):
 
 
 @on_one_setting
-def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
+def test_training_with_the_loss_approaches_known_depths(device, rng):
     """Of Gaussians that were moved along their rays; without weight the bits are those of a training without it."""
     values = []
     for weight in (0.0, 0.3):
@@ -142,7 +142,7 @@ def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
 
 
 @on_one_setting
-def test_two_fourth_planes_are_refused(device, rng):
+def test_second_fourth_plane_is_refused(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
     with pytest.raises(ConfigError, match="read entropy and inverse_depth of an image, but only one of them"):
         trainer.step(photograph, 1)

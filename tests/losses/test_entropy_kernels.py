@@ -58,7 +58,7 @@ def oracle(case: Case, weights: np.ndarray) -> dict[str, np.ndarray]:
     return {"opacity": grad.opacity * splats.opacity, "conic": grad.conic, "color": grad.color}
 
 
-def test_the_reference_is_the_entropy_of_shares_of_a_pixel():
+def test_reference_is_the_entropy_of_pixel_weights():
     """Two splats over one pixel, by hand."""
     case = random_case(np.random.default_rng(0), 2, 1, 1)
     splats = case.project(ref.SMOOTH)
@@ -68,7 +68,7 @@ def test_the_reference_is_the_entropy_of_shares_of_a_pixel():
     assert found[0, 0] == pytest.approx(-(shares * np.log(shares)).sum(), rel=1e-12)
 
 
-def test_reference_gradient_is_that_of_finite_differences(rng):
+def test_reference_gradient_matches_finite_differences(rng):
     case = random_case(rng, 6, 24, 20)
     splats, weights = case.project(ref.SMOOTH), rng.normal(size=(4, 20, 24))
     found = ref.blend_backward(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
@@ -92,7 +92,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
 
 
 @on_devices("count, width, height", [(0, 16, 16), (40, 40, 30), (30, 5, 3)])
-def test_the_plane_and_its_gradient(device, rng, count, width, height):
+def test_plane_and_gradient(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, 1e-5)
     expected = ref.weight_entropy(case.project(), width, height)
     np.testing.assert_allclose(entropy_of(device, case), expected, atol=2e-5)
@@ -114,7 +114,7 @@ def test_long_tiles_dim_and_finished_pixels(device, rng):
             assert relative_error(found[name], value) < 5 * GRADIENT, name
 
 
-def test_schedules_sorts_and_bands_give_the_same(device, rng):
+def test_schedules_sorts_and_bands_agree(device, rng):
     case = random_case(rng, 150, 50, 70)
     weights = rng.normal(size=(4, 70, 50)).astype(np.float32)
     entropy, sums = entropy_of(device, case), pixel_sums_of(device, case, weights)
@@ -125,7 +125,7 @@ def test_schedules_sorts_and_bands_give_the_same(device, rng):
     assert relative_error(pixel_sums_of(other, case, weights), sums) < 1e-5
 
 
-def test_without_entropy_weight_sums_are_those_of_plain_steps(device, rng):
+def test_zero_entropy_weight_gives_the_sums_of_plain_steps(device, rng):
     case, weights = random_case(rng, 80), rng.normal(size=(4, 30, 40)).astype(np.float32)
     weights[3] = 0
     rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
@@ -147,7 +147,7 @@ def with_entropy(device: Device, rng, width: int, height: int) -> tuple[Comparis
 
 
 @on_devices("width, height", SIZES[3:9])
-def test_value_and_gradient_of_the_loss(device, rng, width, height):
+def test_loss_value_and_gradient(device, rng, width, height):
     comparison, entropy = with_entropy(device, rng, width, height)
     value = WeightEntropy(weight=[[0, 0.5], [10, 1.5]]).add(replace(comparison, step=5))
     assert value.name == "weight_entropy"
@@ -172,7 +172,7 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
 
 
 @on_devices("first, colors", product([True, False], [L1(), HostLoss(mean_difference)]))
-def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colors, first):
+def test_trainer_adds_entropy_to_losses_in_any_order(device, rng, colors, first):
     """With a mask, whose pixels count in no plane."""
     entropy = WeightEntropy(weight=0.3)
     losses = [entropy, colors, entropy] if first else [colors, entropy, entropy]
@@ -190,7 +190,7 @@ def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colors, f
 
 
 @on_one_setting
-def test_steps_with_the_loss_alone_make_pixels_clearer(device, rng):
+def test_steps_with_only_this_loss_lower_the_entropy(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(weight=0.0), WeightEntropy(weight=1.0)])
     values = [trainer.step(photograph, step).loss for step in range(1, 40)]
     assert values[-1] < 0.8 * values[0]

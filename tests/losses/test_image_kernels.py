@@ -48,7 +48,7 @@ def test_losses_add_up(device, rng):
 
 
 @on_one_setting
-def test_equal_images_have_no_loss(device, rng):
+def test_equal_images_have_zero_loss(device, rng):
     x, _ = images(rng, 40, 30)
     for loss in (kind for kind in variants(ImageLoss).values() if kind.reads_photograph):
         comparison = comparison_of(device, x, x)
@@ -66,7 +66,7 @@ def test_flat_images(device):
 
 
 @on_devices("width, height", SIZES[3:9])
-def test_pixels_are_unpacked_times_a_factor(device, rng, width, height):
+def test_pixels_are_unpacked_and_scaled(device, rng, width, height):
     pixels = rng.integers(0, 256, (4, height, width)).astype(np.uint8)
     camera = camera_of(device, width, height)
     workspace = Workspace(device)
@@ -93,7 +93,7 @@ def test_ssim_against_scikit_image(device, rng):
 
 
 @on_devices("width, height", SIZES[3:9])
-def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
+def test_mask_blackens_excluded_pixels(device, rng, width, height):
     camera = camera_of(device, width, height)
     colors = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
     mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)

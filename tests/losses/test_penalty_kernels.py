@@ -64,7 +64,7 @@ def test_covariance_trace_in_pixels(device, rng, count):
 
 
 @on_one_setting
-def test_two_bounds_keep_their_own_values(device, rng):
+def test_two_penalties_keep_separate_values(device, rng):
     inputs, log_scales = inputs_of(device, rng, 50)
     losses = [CovarianceTrace(above=above).add(inputs) for above in (0.02, 1e6)]
     value, _ = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
@@ -115,7 +115,7 @@ def test_oracle_against_finite_differences(rng, penalty):
         assert slope == pytest.approx(gradient[n, axis], rel=1e-6, abs=1e-9)
 
 
-def test_not_a_number_stays_where_it_is(device, rng):
+def test_nan_affects_only_its_gaussian(device, rng):
     inputs, log_scales = inputs_of(device, rng, 40)
     log_scales[5] = np.nan
     inputs.gaussians.set("log_scales", log_scales)

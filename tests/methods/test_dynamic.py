@@ -55,7 +55,7 @@ def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_bits_are_the_same_after_a_stop(finished, scene, tmp_path):
+def test_resumed_run_has_the_same_bits(finished, scene, tmp_path):
     stopped = tmp_path / "stopped"
     shutil.copytree(finished, stopped)
     *_, last = sorted((stopped / "checkpoints").iterdir())
@@ -66,7 +66,7 @@ def test_the_bits_are_the_same_after_a_stop(finished, scene, tmp_path):
     assert train(short("dynamic_7k", scene), stopped, resume=True) == digest(finished)
 
 
-def test_the_bits_are_the_same_with_one_thread(finished, scene, tmp_path):
+def test_single_threaded_run_has_the_same_bits(finished, scene, tmp_path):
     command = [sys.executable, "-c", ALONE, scene, tmp_path / "alone"]
     done = subprocess.run(
         command, cwd=Path(__file__).parents[2], env={**os.environ, **ONE_THREAD}, capture_output=True, text=True
@@ -75,7 +75,7 @@ def test_the_bits_are_the_same_with_one_thread(finished, scene, tmp_path):
     assert digest(tmp_path / "alone") == digest(finished)
 
 
-def test_the_motion_and_its_moments_are_trained_and_kept(finished):
+def test_motion_and_its_adam_moments_are_trained_and_saved(finished):
     state, tables = checkpoint.load(checkpoint.saved(finished)[-1])
     motion = tables[f"gaussians/{MOTION}"]
     assert state.updates[MOTION] > STEPS / 2
@@ -84,7 +84,7 @@ def test_the_motion_and_its_moments_are_trained_and_kept(finished):
     np.testing.assert_array_equal(load(finished).motion, motion)
 
 
-def test_a_renderer_draws_the_moment_of_a_view(finished, scene):
+def test_renderer_uses_the_time_of_the_view(finished, scene):
     model, view = load(finished), clsplat.read_scene(scene).split("test")[0]
     renderer = Renderer(model)
     pictures = {time: renderer.render(replace(view, time=time)) for time in (0.0, 1.0)}
@@ -97,7 +97,7 @@ def test_a_renderer_draws_the_moment_of_a_view(finished, scene):
     assert np.abs(gradients.motion).max() > 0
 
 
-def test_view_without_a_time_shows_the_first_moment_and_says_so(finished, scene, caplog):
+def test_view_without_a_time_shows_time_0_with_a_warning(finished, scene, caplog):
     from clsplat.render import motion
 
     motion._warn_of_first_timestamp.cache_clear()
@@ -109,17 +109,17 @@ def test_view_without_a_time_shows_the_first_moment_and_says_so(finished, scene,
     assert "first timestamp" in caplog.text
 
 
-def test_a_scene_that_stands_still_is_refused(tiny_scene, tmp_path):
+def test_static_scene_is_refused(tiny_scene, tmp_path):
     with pytest.raises(DataError, match=r"its views have no timestamps, which `model\.time`"):
         train_overridden(tiny_scene, tmp_path / "run", pipeline="dynamic_7k")
 
 
-def test_a_static_recipe_trains_on_a_scene_that_moves(scene, tmp_path):
+def test_static_recipe_trains_on_a_moving_scene(scene, tmp_path):
     train_overridden(scene, tmp_path / "run", "optimize.steps=3", "init.source='points'")
     assert load(tmp_path / "run").motion is None
 
 
-def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene, tmp_path):
+def test_moving_model_initializes_only_the_same_motion(finished, scene, tmp_path):
     start = ("init.source='model'", f"init.file='{finished}'", "optimize.steps=2")
     bound = "optimize.rates={motion: {min_duration: 0.9}}"
     run = train_overridden(scene, tmp_path / "again", *start, "model.time={degree: 1}", bound, *GUARDED)
@@ -137,18 +137,18 @@ def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene,
         train_overridden(scene, tmp_path / "static", *start)
 
 
-def test_penalties_and_rules_of_motion_need_one(tiny_scene, tmp_path):
+def test_motion_penalties_and_rules_need_motion(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match=r"'motion_l2' needs Gaussians that move"):
         train_overridden(tiny_scene, tmp_path / "run", "optimize.losses=[l1, motion_l2]", "optimize.steps=2")
 
 
-def test_the_plan_of_memory_counts_the_motion(info):
+def test_memory_plan_includes_motion(info):
     static, moves = first_tables(1), first_tables(1, 5)
     more = plan(info, moves, 0, 100).gaussian - plan(info, static, 0, 100).gaussian
     assert more == 4 * (3 * 5 + 5 + 3 + 4 + 1)  # table and moments, gradient, means, quaternions and logits
 
 
-def test_points_among_those_of_all_times_begin_at_rest(rng):
+def test_points_without_a_time_start_at_rest(rng):
     times = rng.uniform(0, 1, 400)
     positions = rng.normal(0, 0.1, (400, 3))
     positions[200:] += np.array([10, 0, 0]) + 40 * times[200:, None]

@@ -35,7 +35,7 @@ def statistics_of(gaussians: Gaussians, gradients: np.ndarray) -> SplatStats:
 
 
 @on_one_setting
-def test_what_travels_far_is_two_on_the_same_path(device, rng):
+def test_far_moving_gaussian_splits_along_its_path(device, rng):
     case = moving_case(rng, 65, WIDTH)
     case.parameters[MOTION][:, :3] *= 5
     case.parameters["log_scales"][:] = np.log(0.2)
@@ -79,7 +79,7 @@ def _since(motion: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 @on_one_setting
-def test_what_no_view_shows_is_removed(device, rng):
+def test_gaussians_invisible_at_all_times_are_pruned(device, rng):
     case = moving_case(rng, 65)
     motion = case.parameters[MOTION]
     motion[:, 3], motion[:, 4] = rng.uniform(0, 1, 65), -1
@@ -96,7 +96,7 @@ def test_what_no_view_shows_is_removed(device, rng):
 
 @on_one_setting
 @pytest.mark.parametrize("rule", [SplitInTime(), PruneInvisible()])
-def test_rules_of_motion_need_one(device, rng, rule):
+def test_motion_rules_need_motion(device, rng, rule):
     gaussians = random_case(rng, 17).model(device).gaussians
     edit = Edit(gaussians, statistics_of(gaussians, np.zeros(17)), SceneScale(2.0), step=700, seed=4)
     with pytest.raises(ConfigError, match=r"model\.time"):

@@ -25,7 +25,7 @@ COLUMNS = ("screen_grad", "gain")
 
 
 @on_devices("width, height", SIZES)
-def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
+def test_view_error_equals_the_loss(device, rng, width, height):
     """L1 itself, and twice L2: the gradient by the image times what is missing to the photograph."""
     x, y = image_pair(rng, width, height)
     for loss, value, factor in ((L1(weight=0.7), ref.l1, 1), (L2(weight=0.7), ref.l2, 2)):
@@ -36,7 +36,7 @@ def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
 
 
 @on_one_setting
-def test_equal_pictures_have_no_error(device, rng):
+def test_equal_images_have_zero_error(device, rng):
     x, _ = image_pair(rng, 40, 30)
     assert view_error(comparison_of(device, x, x)).get() == 0
 
@@ -70,7 +70,7 @@ def rows_of(stats: SplatStats, statistic: str, gradient_above: float) -> list[in
 
 @on_one_setting
 @pytest.mark.parametrize("exposure", [0.5, 0.25])
-def test_half_the_exposure_gives_the_same_choice(device, exposure):
+def test_half_the_exposure_gives_the_same_selection(device, exposure):
     """That of the gradient itself is another one: it is half as large."""
     bright, dim = (stats_of(device, 60, factor, [L1()]) for factor in (1.0, exposure))
     np.testing.assert_allclose(dim.mean("gain"), bright.mean("gain"), rtol=2e-3, atol=1e-6)
@@ -85,7 +85,7 @@ def test_half_the_exposure_gives_the_same_choice(device, exposure):
 
 
 @on_one_setting
-def test_a_loss_of_another_weight_gives_the_same(device):
+def test_loss_weight_does_not_change_the_gain(device):
     """Any sum of losses, as it is the loss's own gradient that measures the error."""
     once, thrice = (
         stats_of(device, 60, 1.0, [L1(weight=0.8 * factor), Dssim(weight=0.2 * factor)]) for factor in (1, 3)
@@ -94,7 +94,7 @@ def test_a_loss_of_another_weight_gives_the_same(device):
 
 
 @on_one_setting
-def test_it_is_a_sum_by_the_sum_of_the_errors(device):
+def test_gain_is_relative_to_the_summed_errors(device):
     """Over all views, also those that do not see it, times their number: twice as many photographs promise twice."""
     mask = np.arange(32 * 48).reshape(32, 48) % 5 > 0
     stats = stats_of(device, 60, 1.0, [L1(weight=0.8), Dssim(weight=0.2)], mask, views=3)
@@ -114,7 +114,7 @@ def test_it_is_a_sum_by_the_sum_of_the_errors(device):
 
 
 @on_devices("count", [1, 63, 64, 65])
-def test_it_is_the_largest_change_over_all_directions(device, rng, count):
+def test_gain_is_the_largest_change_over_all_directions(device, rng, count):
     """A shift by one standard deviation of the splat, in a thousand directions; in pixels of the image."""
     case = random_case(rng, count, 48, 32)
     model, camera = case.model(device), case.device_camera(device)
@@ -135,7 +135,7 @@ def test_it_is_the_largest_change_over_all_directions(device, rng, count):
 
 
 @on_one_setting
-def test_gaussians_that_no_view_saw_do_not_grow(device):
+def test_invisible_gaussians_do_not_grow(device):
     stats = stats_of(device, 60, 1.0, [L1()])
     seen = stats.gaussians.get("stats/seen")[:, 0] > 0
     chosen = np.array(rows_of(stats, "gain", 1e-30)) > 1
@@ -150,7 +150,7 @@ def test_few_gaussians(device, count):
     assert rows_of(stats, "gain", 1e-30) == [1, 2][:count]  # the first one is behind the camera
 
 
-def test_a_threshold_for_another_unit_is_not_taken():
+def test_threshold_in_another_unit_is_refused():
     """The default belongs to the gradient: with it, everything would grow."""
     for keys in ({"statistic": "gain"}, {"statistic": "screen_grad", "as_many_as": "gain"}):
         with pytest.raises(ValidationError, match="'gain' has another unit than the default of 'gradient_above'"):

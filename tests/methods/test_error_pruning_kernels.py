@@ -69,7 +69,7 @@ def pruned(survey: Survey, rule: PruneRedundant) -> np.ndarray:
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
-def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
+def test_views_limit_the_number_of_pruned_gaussians(device, rng, count, width, height):
     """Those with the least weight; one more would raise the error of the reference's images above the limit."""
     case = safe_case(rng, count, width, height, MARGIN)
     masks = [None, rng.random((height, width)) < 0.7]
@@ -90,7 +90,7 @@ def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
 
 
 @on_one_setting
-def test_half_the_exposure_gives_the_same_choice(device, rng):
+def test_half_the_exposure_gives_the_same_selection(device, rng):
     case = safe_case(rng, 40, 32, 24, MARGIN)
     photographs = photographs_like(rng, case, 2)
     dim = replace(case, parameters={name: table.copy() for name, table in case.parameters.items()})
@@ -106,7 +106,7 @@ def test_half_the_exposure_gives_the_same_choice(device, rng):
 
 
 @on_one_setting
-def test_a_picture_without_error_keeps_what_is_seen(device, rng):
+def test_zero_error_keeps_visible_gaussians(device, rng):
     """Where nothing may be lost, those without weight go and no others."""
     case = safe_case(rng, 20, 24, 24, MARGIN)
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -118,7 +118,7 @@ def test_a_picture_without_error_keeps_what_is_seen(device, rng):
 
 
 @pytest.mark.parametrize(("count", "limit"), [(0, 0), (1, 0), (1, 1), (7, 3), (255, 255), (1000, 600), (10**6, 123456)])
-def test_the_number_is_found_to_one_part_in_256(count, limit):
+def test_pruned_number_is_accurate_to_one_part_in_256(count, limit):
     asked = []
     found = largest_allowed(lambda number: asked.append(number) or number <= limit, count)
     assert found <= limit

@@ -82,7 +82,7 @@ def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, mas
 
 
 @on_one_setting
-def test_no_gaussians_and_no_errors_are_no_wrong_pixels(device, rng):
+def test_no_gaussians_or_errors_give_no_wrong_pixels(device, rng):
     case = random_case(rng, 0)
     found = wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
     assert found.pixels.shape == found.score.shape == (0,)
@@ -93,7 +93,7 @@ def test_no_gaussians_and_no_errors_are_no_wrong_pixels(device, rng):
 
 
 @on_one_setting
-def test_only_so_many_views_are_rendered(device, rng):
+def test_number_of_rendered_views_is_limited(device, rng):
     case, asked = random_case(rng, 5), []
     survey = surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)] * 12)
     held = survey._photographs.get
@@ -102,7 +102,7 @@ def test_only_so_many_views_are_rendered(device, rng):
     assert asked == survey.sample_views(7)
 
 
-def test_draws_are_of_candidates_and_of_none_twice(rng):
+def test_draws_pick_candidates_without_replacement(rng):
     candidates = np.array([True, False, True, True, False, True, True])
     order = sampling_order(candidates, np.array([1, np.inf, 0.0, 1, 5, 2, np.inf]), rng)
     assert sorted(order) == [0, 2, 3, 5, 6]
@@ -154,7 +154,7 @@ def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
 
 
 @on_devices("faint", [0, 1, 7, 20])
-def test_so_many_of_the_faint_and_large_are_removed(device, rng, faint):
+def test_fraction_of_faint_and_large_gaussians_is_pruned(device, rng, faint):
     opacity = np.where(np.arange(40) < faint, 0.001, 0.5)
     sizes = np.where(np.arange(40) >= 35, 0.2, 0.01)  # five large ones
     edit = edit_of(device, rng, 40, WrongPixels(np.zeros(40, int), rng.random(40)), sizes, opacity)
@@ -170,7 +170,7 @@ def test_so_many_of_the_faint_and_large_are_removed(device, rng, faint):
 
 
 @on_one_setting
-def test_those_with_wrong_pixels_are_removed_sooner(device, rng):
+def test_gaussians_with_wrong_pixels_are_pruned_first(device, rng):
     """Of two, one goes: weights 1 and 4, and the one with the largest score always."""
     counts = np.zeros(2)
     for seed in range(400):
@@ -186,14 +186,14 @@ def test_those_with_wrong_pixels_are_removed_sooner(device, rng):
 
 
 @on_one_setting
-def test_a_large_score_is_removed_late(device, rng):
+def test_gaussians_with_large_scores_are_pruned_late(device, rng):
     edit = edit_of(device, rng, 4, WrongPixels(np.zeros(4, int), np.array([0.0, 0.9, 0.91, 1.0])))
     PruneInaccurate(score_above=0.9).mark(edit)
     assert edit.rows().tolist() == [1, 1, 0, 0]
 
 
 @on_devices("rule", [RevertGrowth(), PruneSampled(), PruneInaccurate()])
-def test_rules_without_photographs_say_so(device, rng, rule: Rule):
+def test_rules_without_images_raise_an_error(device, rng, rule: Rule):
     gaussians = random_case(rng, 4).model(device).gaussians
     with pytest.raises(ConfigError, match="needs training photographs, and there are none"):
         rule.mark(Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3))

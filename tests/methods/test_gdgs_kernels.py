@@ -85,7 +85,7 @@ def test_gaussians_in_the_fullest_cells_are_copied_and_moved(device, rng, count)
 
 
 @on_one_setting
-def test_it_acts_from_its_ratio_on(device, rng):
+def test_rule_acts_above_its_ratio(device, rng):
     gaussians = crowded(device, rng, 600)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     chosen, ratio = expected(before, 3, 5)
@@ -99,7 +99,7 @@ def test_it_acts_from_its_ratio_on(device, rng):
 
 
 @on_one_setting
-def test_moves_depend_on_the_step_alone(device, rng):
+def test_moves_depend_only_on_the_step(device, rng):
     state, found = rng.bit_generator.state, []
     for step in (700, 700, 800):
         rng.bit_generator.state = state

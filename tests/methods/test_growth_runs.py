@@ -19,7 +19,7 @@ SPARE = "{type: prune_redundant, error_rise: 0.1, views: 3}"
 ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
 
 
-def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
+def test_run_resumes_and_repeats_bit_for_bit(tiny_scene, tmp_path):
     """With what no recipe has; test_recipes.py has the others."""
     settings = (ENTROPY, f"densify.rules=[{GAINFUL}, {SPARE}]", "optimize.checkpoint.keep=9", "optimize.log_every=5")
     first = train(tiny_scene, tmp_path / "first", *settings)
@@ -50,7 +50,7 @@ def test_entropy_sharpens_opacities_and_weight_0_changes_little(tiny_scene, tmp_
     assert middling["heavy"] < 0.8 * middling["none"]
 
 
-def test_parabolic_growth_ends_at_the_number_and_not_above(tiny_scene, tmp_path):
+def test_parabolic_growth_ends_exactly_at_its_target(tiny_scene, tmp_path):
     """Every Gaussian may grow at each of the five edits, 10 to 30, of which the draws take as many as the curve has."""
     settings = [
         *(
@@ -99,7 +99,7 @@ def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
     assert found[1] == pytest.approx(found[0], abs=0.02)
 
 
-def test_growth_stops_at_so_many_gaussians_for_each_pixel(tiny_scene, tmp_path):
+def test_growth_stops_at_a_number_of_gaussians_per_pixel(tiny_scene, tmp_path):
     """Of a photograph of 40 x 40 px: at 160, where growth alone would go on."""
     grown = []
     for limit in ("null", "0.1"):

@@ -46,13 +46,13 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
 
 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
-def test_photograph_and_derivatives_are_the_oracles(device, rng, width, height, share):
+def test_image_and_derivatives_match_the_reference(device, rng, width, height, share):
     for taps in ((0.0, 0.0), HAAR, (0.3, 0.9)):
         assert_within_bounds(check_haar(device, rng, width, height, share, np.array(taps)))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.37, 1.0, 1.2])
-def test_the_oracle_is_the_closed_form(rng, share):
+def test_reference_matches_the_closed_form(rng, share):
     """Per block [a b; c d], with means m, h, v, g of its four patterns."""
     image = rng.uniform(0, 1, (3, 6, 8))
     a, b, c, d = image[:, ::2, ::2], image[:, ::2, 1::2], image[:, 1::2, ::2], image[:, 1::2, 1::2]
@@ -65,7 +65,7 @@ def test_the_oracle_is_the_closed_form(rng, share):
 
 
 @on_devices("masked", [False, True])
-def test_without_a_filter_squares_are_means_and_haar_is_identity(device, rng, masked):
+def test_unfiltered_haar_is_the_identity(device, rng, masked):
     image = rng.uniform(0, 1, (3, 10, 22)).astype(np.float32)
     mask = rng.random((10, 22)) < 0.6 if masked else np.ones((10, 22), bool)
     squares = np.where(mask, image, np.nan).reshape(3, 5, 2, 11, 2)
@@ -78,7 +78,7 @@ def test_without_a_filter_squares_are_means_and_haar_is_identity(device, rng, ma
     )
 
 
-def test_what_is_not_finite_stays_in_its_square(device, rng):
+def test_nonfinite_values_stay_in_their_square(device, rng):
     image = rng.uniform(0, 1, (3, 20, 30)).astype(np.float32)
     image[1, 7, 12] = np.nan
     bad = np.zeros(image.shape, bool)
@@ -97,7 +97,7 @@ def course_of(haar: Haar, steps: int) -> list[float]:
 
 
 @pytest.mark.parametrize("learn", ["filter", "scale"])
-def test_the_filter_takes_the_published_course_by_its_own_loss(learn):
+def test_filter_follows_the_published_course(learn):
     """Adam decides it, whatever the weight."""
     for weight in (0.05, 7.0):
         course = course_of(Haar(learn=learn, weight=weight), 15000)
@@ -105,7 +105,7 @@ def test_the_filter_takes_the_published_course_by_its_own_loss(learn):
 
 
 @pytest.mark.parametrize("learn", ["filter", "scale"])
-def test_the_loss_of_the_filter_and_its_derivatives(learn):
+def test_filter_loss_and_derivatives(learn):
     haar = Haar(learn=learn, weight=0.3)
     at = dict(zip(NAMES[learn], (0.2, -0.5), strict=False))
     value, derivatives = haar.penalty(at, step=1)
@@ -130,7 +130,7 @@ def trainer_of(device, rng, losses, masked: bool = True, **settings) -> tuple[St
 
 
 @on_devices("learn, masked", product(["filter", "scale"], [False, True]))
-def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked):
+def test_gradient_is_the_sum_over_all_losses(device, rng, learn, masked):
     """Finite differences of the float64 losses of the rendered image, by each number."""
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
     trainer, haar, photograph = trainer_of(device, rng, losses, masked, learn=learn, weight=0.01)
@@ -162,7 +162,7 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
 
 
 @on_devices("masked", [False, True])
-def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, masked):
+def test_filter_pass_does_not_change_losses_and_gradients(device, rng, masked):
     """Bit for bit those of the changed photograph alone."""
     trainer, _, photograph = trainer_of(device, rng, [L1(weight=0.8), L2(), Dssim(weight=0.2)], masked)
     view = trainer.differentiate(photograph, 1)
@@ -176,7 +176,7 @@ def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, mask
 
 
 @on_one_setting
-def test_differentiating_changes_no_number(device, rng):
+def test_differentiating_records_no_scalars(device, rng):
     trainer, haar, photograph = trainer_of(device, rng, [L1()])
     trainer.differentiate(photograph, 1)
     assert haar.scalars == {}
@@ -185,7 +185,7 @@ def test_differentiating_changes_no_number(device, rng):
 
 
 @on_devices("masked", [False, True])
-def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
+def test_loss_without_an_image_combines_with_the_filter(device, rng, masked):
     """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
     of_colors, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
     for losses in (of_colors, [WeightEntropy(weight=0.3), *of_colors]):
@@ -203,7 +203,7 @@ def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
 
 
 @on_one_setting
-def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
+def test_asymmetric_loss_is_refused(device, rng):
     def brightness(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
         return float(image.mean()), np.full(image.shape, 1 / image.size)
 
@@ -214,7 +214,7 @@ def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
 
 
 @on_one_setting
-def test_a_copy_that_was_begun_is_of_what_was_there(device):
+def test_deferred_copy_holds_the_values_at_its_start(device):
     array = device.upload(np.arange(40, dtype=np.float32))
     copied = array.get_later()
     array.fill(3)
@@ -225,7 +225,7 @@ def test_a_copy_that_was_begun_is_of_what_was_there(device):
 # ---- in a run
 
 
-def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
+def test_asymmetric_loss_is_refused_before_a_run():
     training = load("smoke", ["optimize.modules=[haar]"]).settings.training
     training.check()
     other = HostLoss(lambda image, photograph: (0.0, image))
@@ -233,7 +233,7 @@ def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
         training.model_copy(update={"losses": [*training.losses, other]}).check()
 
 
-def test_the_filter_has_the_same_course_in_fewer_steps():
+def test_filter_follows_the_same_course_in_fewer_steps():
     """By its own loss: from the mean of squares to the photograph, long before the end."""
     training = load("auto_opti3dgs_7k").settings.training
     course = course_of(training.modules[0], training.steps)

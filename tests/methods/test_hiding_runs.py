@@ -46,7 +46,7 @@ def bits(path) -> np.ndarray:
     return checkpoint.load(path)[1][f"gaussians/{HIDDEN}"][:, 0].astype(int)
 
 
-def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, finished):
+def test_resumed_run_has_the_same_bits(tiny_scene, tmp_path, pipeline, finished):
     whole = finished.out
     of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(whole)}
     assert not bits(of_step[5]).any(), "an edit follows its step"
@@ -63,7 +63,7 @@ def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, finished):
     assert (again / "point_cloud.ply").read_bytes() == expected
 
 
-def test_what_is_new_is_hidden_where_its_source_was(finished):
+def test_children_inherit_hidden_views(finished):
     of_step = checkpoint.saved(finished.out)
     before, after = (next(path for path in of_step if path.stem.endswith(f"_{step:06d}")) for step in (14, 15))
     assert len(bits(after)) > len(bits(before))
@@ -71,7 +71,7 @@ def test_what_is_new_is_hidden_where_its_source_was(finished):
     assert np.bincount(bits(after) > 0)[1] > np.bincount(bits(before) > 0)[1]
 
 
-def test_a_step_changes_nothing_that_its_view_leaves_out(tiny_scene, tmp_path, pipeline):
+def test_hidden_gaussians_do_not_change(tiny_scene, tmp_path, pipeline):
     """With `update: seen`; what other views leave out changes with the rest."""
     out = train(tiny_scene, tmp_path / "run", "optimize.densify.every=999", pipeline=pipeline).out
     saved = {int(path.stem.removeprefix("step_")): checkpoint.load(path)[1] for path in checkpoint.saved(out)}
@@ -84,7 +84,7 @@ def test_a_step_changes_nothing_that_its_view_leaves_out(tiny_scene, tmp_path, p
     assert moved[~everywhere].any()
 
 
-def test_all_are_drawn_behind_the_training(finished):
+def test_all_gaussians_are_drawn_after_training(finished):
     run = finished
     assert HIDDEN not in run.model.gaussians.tables
     assert len(read_ply(run.out / "point_cloud.ply").parameters["means"]) == run.model.gaussians.count

@@ -58,7 +58,7 @@ def shrinkage(opacity: float, new: float, copies: int) -> float:
 
 
 @on_devices("opacity", [0.3, 0.9, 1.0])
-def test_sources_get_the_opacity_and_the_scales_of_the_paper(device, rng, opacity):
+def test_sources_get_the_papers_opacity_and_scales(device, rng, opacity):
     """One opaque Gaussian, from which all copies come; the paper's formula holds to 50."""
     for copies in range(1, 52):
         count = max(2, copies)
@@ -77,7 +77,7 @@ def test_sources_get_the_opacity_and_the_scales_of_the_paper(device, rng, opacit
 
 
 @on_devices("limit", [None, 1000, 155, 150, 140, 101, 100, 60])
-def test_relocation_keeps_the_optical_depth_whatever_the_limit(device, rng, limit):
+def test_relocation_keeps_optical_depth_at_any_limit(device, rng, limit):
     """-ln(1 - opacity), summed over a source and its copies, is that of the source; no source fades without copies."""
     gaussians = some_gaussians(device, rng, 150, faint=50)
     depth = -np.log1p(-opacities(gaussians))
@@ -97,7 +97,7 @@ class Alone(Rule):
 
 
 @on_one_setting
-def test_a_source_that_a_later_rule_leaves_alone_stays_as_it_is(device, rng):
+def test_source_isolated_by_a_later_rule_does_not_change(device, rng):
     gaussians = some_gaussians(device, rng, 60, faint=30)
     before = {name: gaussians.get(name) for name in ("logit_opacity", "log_scales")}
     source = relocated(gaussians, after=[Alone()])
@@ -123,7 +123,7 @@ def test_sources_and_copies_start_without_moments(device, rng):
 
 @on_one_setting
 @pytest.mark.parametrize("limit", [None, 130])
-def test_gaussians_that_an_earlier_rule_took_are_no_sources(device, rng, limit):
+def test_gaussians_selected_earlier_are_no_sources(device, rng, limit):
     class Take(Rule):
         def mark(self, edit: Edit) -> None:
             third = np.arange(100) // 20
@@ -150,7 +150,7 @@ def test_without_an_opaque_gaussian_nothing_changes(device, rng):
 
 
 @on_devices("count, rate, below", each_once(SIZES, [(200.0, 0.005), (750.0, 0.3)]))
-def test_the_noise_is_that_of_the_formula(device, rng, count, rate, below):
+def test_noise_follows_the_formula(device, rng, count, rate, below):
     """Opacities on both sides of the gate, and above its reach; the same normal numbers in float64."""
     gaussians = some_gaussians(device, rng, count, faint=count // 2, opacity=(0.001, 0.6))
     before = {name: gaussians.get(name).astype(np.float64) for name in PARAMETERS}
@@ -171,7 +171,7 @@ def test_the_noise_is_that_of_the_formula(device, rng, count, rate, below):
 
 
 @pytest.mark.parametrize("recipe", ["mcmc", "mcmc_7k"])
-def test_the_noise_follows_the_rate_of_the_means(recipe):
+def test_noise_scales_with_the_rate_of_the_means(recipe):
     training = load(recipe).settings.training
     noise = next(stage for stage in training.during if stage.stage == "add_noise")
     for step in (1, 3000, 6000):
@@ -179,7 +179,7 @@ def test_the_noise_follows_the_rate_of_the_means(recipe):
 
 
 @pytest.mark.parametrize(("draws", "count"), each_once([0, 1, 2, 7, 100, 1000], [1, 2, 63, 150]))
-def test_systematic_draws_are_those_of_equal_distances(rng, count, draws):
+def test_systematic_draws_are_equally_spaced(rng, count, draws):
     """Against places on the line of weights one by one, in Python's whole numbers."""
     weights = rng.integers(0, 2**24, count).astype(np.uint64)
     weights[0], weights[-1] = 2**24, 1
@@ -198,7 +198,7 @@ def test_systematic_draws_are_those_of_equal_distances(rng, count, draws):
     assert (np.abs(found - share) < 1 + 1e-9).all()
 
 
-def test_places_of_many_draws_do_not_overflow():
+def test_positions_of_many_draws_do_not_overflow():
     """A hundred million weights of 2^24: their products are beyond 64 bits."""
     weights = np.full(3, 2**24 * 33_333_333, np.uint64)
     found = systematic(weights, 2_000_003, np.random.default_rng(1))
@@ -206,7 +206,7 @@ def test_places_of_many_draws_do_not_overflow():
 
 
 @pytest.mark.parametrize(("opacity", "rows"), each_once([0.05, 0.3, 0.73, 0.95, 0.999], [1, 2, 50, 20, 5]))
-def test_rows_in_one_place_keep_the_center_and_the_integral(opacity, rows):
+def test_coincident_rows_keep_the_center_and_the_integral(opacity, rows):
     """Equations 8 and 9: o at the center, and 1 - (1 - o' G(x / factor))^n has the integral of o G(x) over a line."""
     (new,), (factor,) = divide(np.array([opacity]), np.array([rows]), 1e-9)
     assert 1 - (1 - new) ** rows == pytest.approx(opacity, rel=1e-6)

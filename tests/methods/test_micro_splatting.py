@@ -32,7 +32,7 @@ def finished(tiny_scene, tmp_path_factory):
     return train(tiny_scene, out, *SETTINGS)
 
 
-def test_every_rule_and_penalty_acts(finished):
+def test_every_rule_and_penalty_has_an_effect(finished):
     lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
     edits = [line for line in lines if line["kind"] == "densify"]
     growing, thinning = ("clone", "split_textured", "split_oversized"), ("merge_neighbors", "prune_unimportant")
@@ -59,7 +59,7 @@ def test_legends_stay_below_the_title_and_break_into_rows():
     assert "<tspan" not in curve("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
 
 
-def test_a_narrow_logarithmic_axis_has_numbers():
+def test_narrow_logarithmic_axis_has_tick_labels():
     chart = curve("anisotropy", [Line([(0.0, 1.05), (1.0, 1.7)])], logarithmic=True)
     assert re.findall(r'text-anchor="end">([\d.]+)<', chart) == ["1.2", "1.4", "1.6"]
 

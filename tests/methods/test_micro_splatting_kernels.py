@@ -69,7 +69,7 @@ def test_texture_splits_and_children_are_half_as_large(device, rng):
 
 
 @on_one_setting
-def test_strict_and_lowered(device, rng):
+def test_strict_and_relaxed_forms(device, rng):
     """The lowered form also needs some screen gradient; both forms ignore smooth places and tiny splats."""
     columns = {
         "texture": [0.3, 0.3, 0.3, 0.01],
@@ -83,7 +83,7 @@ def test_strict_and_lowered(device, rng):
 
 
 @on_one_setting
-def test_only_the_most_textured_share_splits(device, rng):
+def test_only_the_most_textured_fraction_splits(device, rng):
     texture = rng.permutation(np.linspace(0.2, 0.9, 100))
     case = Edited(device, rng, 100, texture=texture)
     change = case.apply(SplitTextured(texture_above=0.0, gradient_above=0.0, max_fraction=0.07))
@@ -107,7 +107,7 @@ def test_quantiles_are_of_pixels_or_of_gaussians(device, rng):
 
 
 @on_one_setting
-def test_quantiles_are_of_those_that_were_seen(device, rng):
+def test_quantiles_are_over_visible_gaussians(device, rng):
     texture = np.where(np.arange(50) < 10, np.linspace(0.01, 0.1, 50), 0.0)
     case = Edited(device, rng, 50, texture=texture)
     case.gaussians.set(SEEN, 2.0 * (texture > 0)[:, None])
@@ -119,7 +119,7 @@ def test_quantiles_are_of_those_that_were_seen(device, rng):
 
 
 @on_devices("rms_above, pixels", [(0.01, None), (0.01, 4.0), (Quantile(quantile=0.8), None)])
-def test_oversized_ones_split(device, rng, rms_above, pixels):
+def test_oversized_gaussians_split(device, rng, rms_above, pixels):
     case = Edited(device, rng, 60)
     log_scales = rng.normal(np.log(0.02), 0.5, (60, 3)).astype(np.float32)
     interval = rng.uniform(0.002, 0.02, 60).astype(np.float32)
@@ -159,7 +159,7 @@ def test_growth_stops_at_the_limit_with_the_largest_gradients(device, rng):
 
 
 @on_one_setting
-def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
+def test_limit_ranks_by_gradient_with_any_statistic(device, rng):
     gradient = rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, 50, ("rendered_texture", "screen_grad", "screen_radius"))
     case.gaussians.set("stats/screen_grad", 2 * gradient[:, None])
@@ -171,7 +171,7 @@ def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
 
 
 @on_one_setting
-def test_least_important_ones_go(device, rng):
+def test_least_important_gaussians_are_pruned(device, rng):
     case = Edited(device, rng, 40)
     change = case.apply(PruneUnimportant(share=0.25))
     opacity = 1 / (1 + np.exp(-case.before["logit_opacity"][:, 0].astype(np.float64)))
@@ -181,7 +181,7 @@ def test_least_important_ones_go(device, rng):
 
 
 @on_one_setting
-def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
+def test_merged_neighbors_keep_mean_and_covariance(device, rng):
     """Twins merge; a stranger of another color and one far away stay."""
     case = Edited(device, rng, 4)
     means = np.array([[0, 0, 4], [0.01, 0, 4], [5, 0, 4], [5.01, 0, 4]], np.float32)
@@ -214,7 +214,7 @@ def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
 
 
 @on_one_setting
-def test_twins_in_one_place_merge(device, rng):
+def test_coincident_gaussians_merge(device, rng):
     case = Edited(device, rng, 40)
     for name in ("means", "sh_base"):
         case.gaussians.set(name, np.repeat(case.gaussians.get(name)[::2], 2, axis=0))

@@ -20,7 +20,7 @@ from tests.support.devices import on_devices, on_one_setting
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
-def test_weights_are_those_of_the_reference(device, rng, count, width, height):
+def test_weights_match_the_reference(device, rng, count, width, height):
     """Two views that differ by their masks; the useful ones by adding weights one after another."""
     case = safe_case(rng, count, width, height, MARGIN)
     masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
@@ -41,7 +41,7 @@ def test_weights_are_those_of_the_reference(device, rng, count, width, height):
 
 
 @on_one_setting
-def test_some_views_are_drawn(device, rng):
+def test_views_are_sampled(device, rng):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     held = [photograph_of(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
@@ -56,7 +56,7 @@ def test_some_views_are_drawn(device, rng):
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
-def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, width, height):
+def test_each_view_needs_its_heaviest_gaussians(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
     case.parameters["means"][::7] += 100.0  # out of sight
     masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
@@ -84,12 +84,12 @@ def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, widt
         ([], 0.99, []),
     ],
 )
-def test_the_fewest_that_make_a_share(weight, share, expected):
+def test_heaviest_gaussians_reach_the_fraction(weight, share, expected):
     assert heaviest(np.array(weight, float), share).tolist() == expected
 
 
 @on_one_setting
-def test_what_few_views_need_and_what_has_little_weight_goes(device, rng):
+def test_rarely_needed_and_light_gaussians_are_pruned(device, rng):
     gaussians = random_case(rng, 5).model(device).gaussians
     found = Weights(np.array([500.0, 300, 200, 0.5, 0.4]), np.array([3, 1, 2, 3, 4]))
     survey = SimpleNamespace(cached=lambda function, *arguments: found)

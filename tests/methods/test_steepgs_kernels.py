@@ -60,7 +60,7 @@ def softly(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.nd
     return case, splats, weights, ref.screen_splitting(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
 
 
-def test_mean_of_two_shifted_changes_the_loss_by_the_matrix(rng):
+def test_mean_of_two_shifts_changes_the_loss_by_the_matrix(rng):
     """ε²/2 vᵀ S v, and the error is of the fourth order."""
     _, splats, weights, matrices = softly(rng)
     alpha = alphas(splats, 24, 20)
@@ -77,7 +77,7 @@ def test_mean_of_two_shifted_changes_the_loss_by_the_matrix(rng):
         assert errors[1] == pytest.approx(errors[0] / 4, rel=0.1, abs=1e-9 * scale)
 
 
-def test_two_of_half_opacity_are_such_a_mean_to_second_order(rng):
+def test_two_half_opacities_equal_the_mean_to_second_order(rng):
     """Against the two in one place; the relative error falls with the opacity."""
     errors = []
     for opacity in (0.02, 0.01):
@@ -144,7 +144,7 @@ def added_up(device: Device, case: Case, weights: np.ndarray, views: int = 1) ->
 
 
 @on_devices("count", [0, 16, 63, 64])
-def test_the_column_is_the_matrix_of_the_reference(device, rng, count):
+def test_column_matches_the_reference_matrix(device, rng, count):
     """Some Gaussians lie behind the camera and some beside the picture: nothing is added to them."""
     case = safe_case(rng, count, 33, 31, change=lambda p: p["means"].__setitem__(slice(2, None, 7), [0, 0, -9]))
     weights = rng.normal(size=(3, 31, 33)).astype(np.float32)
@@ -158,7 +158,7 @@ def test_the_column_is_the_matrix_of_the_reference(device, rng, count):
     assert not stats.means("splitting").any()
 
 
-def test_one_that_is_not_finite_adds_nothing(device, rng):
+def test_nonfinite_gaussian_adds_nothing(device, rng):
     case = random_case(rng, 20)
     for name, row, value in (("means", 3, np.nan), ("quats", 5, np.nan), ("log_scales", 7, np.inf)):
         case.parameters[name][row] = value
@@ -175,7 +175,7 @@ def test_the_schedules_agree(device, rng):
     assert relative_error(found, again) < 1e-4
 
 
-def test_least_axes_are_those_of_each_matrix(rng):
+def test_smallest_axes_belong_to_each_matrix(rng):
     columns = rng.normal(size=(200, 6)) * 10.0 ** rng.integers(-9, 9, (200, 1))
     columns[0], columns[1], columns[2, 4], columns[3, 0] = 0, [1, 0, 0, 1, 0, 1], np.nan, -np.inf
     values, axes = least_axes(columns)
@@ -191,7 +191,7 @@ def test_least_axes_are_those_of_each_matrix(rng):
             assert v @ matrix @ v / (v @ v) >= values[n] - 1e-12 * size
 
 
-def test_opacities_of_two_from_that_of_one():
+def test_opacities_of_two_children_follow_from_the_parents():
     logits = np.array([[-200.0], [-30.0], [-2.0], [0.0], [3.0], [40.0], [300.0]])
     opacity = 1 / (1 + np.exp(-logits[1:5]))
     halves, shared = (divided_logits(logits, kind) for kind in ("halved", "shared"))
@@ -236,7 +236,7 @@ def diagonal(values) -> np.ndarray:
 
 
 @on_one_setting
-def test_children_lie_along_the_axis_and_share_the_opacity(device, rng):
+def test_children_are_along_the_axis_and_share_opacity(device, rng):
     least = np.array([-2e-6, -5e-7, 3e-6, -1.0, -2e-6] * 13)
     matrices = rng.permuted(np.stack([least, np.full(65, 4e-6), np.full(65, 5e-6)], axis=1), axis=1)
     axis = np.eye(3)[(matrices == least[:, None]).argmax(axis=1)]
@@ -268,12 +268,12 @@ def test_children_lie_along_the_axis_and_share_the_opacity(device, rng):
 
 
 @on_one_setting
-def test_without_gaussians_nothing_happens(device, rng):
+def test_empty_model_does_not_change(device, rng):
     assert Edited(device, rng, np.zeros((0, 6))).apply(SplitSteepest()).after == 0
 
 
 @on_one_setting
-def test_candidates_reach_the_gradient_and_are_not_yet_taken(device, rng):
+def test_candidates_exceed_the_gradient_and_are_unselected(device, rng):
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)), screen_grad=np.tile([1e-4, 3e-4], 20))
     case.apply(SplitSteepest(gradient_above=2e-4))
     assert [len(case.rows_of(n)) for n in range(40)] == [1, 2] * 20
@@ -284,7 +284,7 @@ def test_candidates_reach_the_gradient_and_are_not_yet_taken(device, rng):
 
 
 @on_one_setting
-def test_the_lowest_eigenvalues_come_first_below_the_limit(device, rng):
+def test_lowest_eigenvalues_split_first_under_a_limit(device, rng):
     least = -rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, diagonal(least[:, None] * [1, 0.1, 0]))
     assert case.apply(SplitSteepest(), limit=57).after == 57
@@ -296,7 +296,7 @@ def test_the_lowest_eigenvalues_come_first_below_the_limit(device, rng):
 
 
 @on_one_setting
-def test_undone_or_pruned_split_leaves_the_others_as_they_are(device, rng):
+def test_undone_or_pruned_split_leaves_other_gaussians(device, rng):
     """A later rule grows too, beyond the limit: what is undone keeps opacity and place."""
     count = 40
     columns = diagonal((np.where(np.arange(count) % 2, -1.0, 1.0) * (1 + np.arange(count)))[:, None] * np.ones(3))
@@ -323,14 +323,14 @@ class Double(Rule):
 
 
 @on_one_setting
-def test_growth_is_undone_where_no_column_is_a_single_number(device, rng):
+def test_growth_is_undone_without_a_scalar_column(device, rng):
     case = Edited(device, rng, diagonal(np.zeros((50, 3))))
     case.stats = SplatStats(case.gaussians, {"splitting"})
     assert case.apply(Double(), limit=57).after == 57
 
 
 @on_one_setting
-def test_values_of_children_are_checked(device, rng):
+def test_child_settings_are_validated(device, rng):
     case = Edited(device, rng, diagonal(np.zeros((9, 3))))
     edit = Edit(case.gaussians, case.stats, SceneScale(EXTENT), step=700, seed=4)
     for rows, values, words in (
@@ -344,7 +344,7 @@ def test_values_of_children_are_checked(device, rng):
             edit.set_children("means", np.array(rows), values)
 
 
-def test_rules_that_compare_a_number_do_not_take_the_matrix():
+def test_scalar_rules_refuse_the_matrix_statistic():
     with pytest.raises(ValueError, match="screen_grad_abs"):
         Clone(statistic="splitting")
 

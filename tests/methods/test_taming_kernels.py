@@ -28,7 +28,7 @@ def shares(values: np.ndarray) -> np.ndarray:
     return (values - values.min()) / (values.max() - values.min())
 
 
-def test_scores_are_those_of_the_formula(device, rng):
+def test_scores_follow_the_formula(device, rng):
     """Two photographs from one camera; the terms one by one from the reference."""
     case = safe_case(rng, 30, 33, 17, MARGIN)
     case.parameters["means"][4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -63,7 +63,7 @@ def test_scores_are_those_of_the_formula(device, rng):
     np.testing.assert_allclose(terms, expected, rtol=1e-3)
 
 
-def test_values_over_their_median():
+def test_values_are_divided_by_their_median():
     assert by_median(np.array([0.0, 1, 2, 4])).tolist() == [0, 0.5, 1, 2]
     assert by_median(np.zeros(3)).tolist() == [0, 0, 0]
     assert by_median(np.zeros(0)).tolist() == []
@@ -84,7 +84,7 @@ def edit_of(device, rng, sizes, opacity=0.5, losses=1.0, gradient=1.0) -> Edit:
 
 
 @on_devices("limit", [None, 400, 200, 150, 131, 101, 100, 99, 40])
-def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
+def test_growth_respects_budget_and_shares(device, rng, limit):
     """60 to clone and 30 to split in two: the room is divided two to one."""
     edit = edit_of(device, rng, np.repeat([0.005, 0.05, 0.005], [60, 30, 10]), gradient=np.repeat([1.0, 0.0], [90, 10]))
     rules = [Clone(size_below=0.01), SplitLarge(size_above=0.01), GrowScored()]
@@ -96,7 +96,7 @@ def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
 
 
 @on_devices("limit", [200, 99, 40])
-def test_where_nothing_grows_nothing_is_drawn(device, rng, limit):
+def test_no_growth_draws_nothing(device, rng, limit):
     edit = edit_of(device, rng, np.full(100, 0.005), gradient=0.0)
     rules = [Clone(size_below=0.01), GrowScored()]
     assert densify(edit, rules, Rasterizer(device, "radix").tiler, limit).after == 100
@@ -119,7 +119,7 @@ def test_growth_is_drawn_by_score(device, rng):
 
 
 @on_one_setting
-def test_a_low_score_is_removed_sooner(device, rng):
+def test_low_scores_are_pruned_first(device, rng):
     """Of two faint ones with scores 1 and 4, one goes: the first four times of five."""
     counts = np.zeros(2)
     for seed in range(300):
@@ -138,7 +138,7 @@ def limit(most: int, count: int, edits: int) -> int:
 
 
 @pytest.mark.parametrize(("first", "most", "edits"), [(100, 1500, 28), (1000, 1001, 5), (10, 10**6, 1), (7, 8, 100)])
-def test_the_budget_is_the_parabola_of_the_paper(first, most, edits):
+def test_budget_is_the_papers_parabola(first, most, edits):
     count = first
     for x in range(1, edits + 1):
         count = limit(most, count, edits - x + 1)

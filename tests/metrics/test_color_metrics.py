@@ -43,7 +43,7 @@ def test_equal_images_stay_equal(image):
         assert color_figures(photograph / np.float32(255), photograph, None, model)["psnr_color"] == MAX_PSNR
 
 
-def test_no_pixel_is_measured_in_colors_that_were_fitted_to_it(image):
+def test_colors_are_fitted_on_other_pixels_than_measured(image):
     """What is true of one half alone does not help there."""
     photograph = to_8_bits(image)
     photograph[:, :15] = to_8_bits(image[:, :15] * 0.5)
@@ -52,7 +52,7 @@ def test_no_pixel_is_measured_in_colors_that_were_fitted_to_it(image):
     assert changed[:, 15:] == pytest.approx(0.5 * image[:, 15:], abs=0.01)
 
 
-def test_white_black_and_masked_pixels_say_nothing_of_colors(image, rng):
+def test_white_black_and_masked_pixels_are_not_fitted(image, rng):
     truth = np.minimum(image * 1.5, 1)
     photograph, counted = to_8_bits(truth), rng.random(image.shape[:2]) < 0.8
     assert (photograph == 255).any()
@@ -63,7 +63,7 @@ def test_white_black_and_masked_pixels_say_nothing_of_colors(image, rng):
 
 @pytest.mark.parametrize(("model", "numbers"), [(Gain(), 1), (Affine(), 4)])
 @pytest.mark.parametrize("half", [np.s_[:, :15], np.s_[:, 15:]])
-def test_half_with_too_few_pixels_gives_no_color_figure(image, model, numbers, half):
+def test_half_with_too_few_pixels_has_no_color_metric(image, model, numbers, half):
     photograph, counted = to_8_bits(image), everywhere(image)
     counted[half] = False
     rows, columns = np.nonzero(~counted)
@@ -75,7 +75,7 @@ def test_half_with_too_few_pixels_gives_no_color_figure(image, model, numbers, h
 
 
 @pytest.mark.parametrize("model", [Gain(), Affine()])
-def test_which_views_have_the_figure_is_independent_of_the_model(image, model):
+def test_views_with_the_metric_do_not_depend_on_the_model(image, model):
     """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colors."""
     photograph = to_8_bits(0.5 * image)
     for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
@@ -92,7 +92,7 @@ def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
     assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
 
 
-def test_a_mean_says_of_how_many_views_it_is():
+def test_mean_reports_its_number_of_views():
     both, one = {"psnr_color": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
     assert mean_figures([both, both]) == both
     assert mean_figures([{}, {}]) == {}
@@ -106,7 +106,7 @@ def test_a_mean_says_of_how_many_views_it_is():
     assert (none["psnr_color"], none["psnr_color_views"]) == (None, 0)
 
 
-def test_the_log_says_of_how_many_views_the_mean_is(caplog):
+def test_log_reports_the_number_of_averaged_views(caplog):
     caplog.set_level("INFO", "clsplat")
     whole = {"psnr": 20.0, "psnr_color": 24.0}
     log_color_figures({"psnr": 20.0})
@@ -125,14 +125,14 @@ def test_the_log_says_of_how_many_views_the_mean_is(caplog):
         assert re.search(said, message)
 
 
-def test_best_model_is_chosen_by_psnr_where_no_view_has_colors():
+def test_best_model_is_chosen_by_psnr_without_color_metrics():
     fitted, bare = {"psnr": 20.0, "psnr_color": 24.0}, {"psnr": 21.0, "psnr_color": None}
     assert compared([fitted, fitted]) == [24.0, 24.0]
     assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
     assert compared([fitted, {}]) == [20.0, None]
 
 
-def test_steps_compare_by_psnr_where_some_views_lack_colors():
+def test_steps_are_compared_by_psnr_if_views_lack_colors():
     """30 dB of one view is no better than 31 and 22 dB of two."""
     first = {"psnr": 20.0, **mean_figures([{"psnr_color": 30.0}, {"psnr_affine": 20.0}])}
     second = {"psnr": 21.0, **mean_figures([{"psnr_color": 31.0}, {"psnr_color": 22.0}])}
@@ -143,7 +143,7 @@ def test_steps_compare_by_psnr_where_some_views_lack_colors():
     assert compared([whole, second]) == [29.0, 26.5]
 
 
-def test_the_regression_is_of_the_image_on_the_photograph(rng):
+def test_render_is_regressed_on_the_photograph(rng):
     """With noise in the image its slope is too small by nothing, with noise in the photograph by 1 / (1 + noise)."""
     truth = rng.uniform(0.2, 0.8, (60, 60, 3))
     image = 0.5 * truth + 0.1

@@ -27,7 +27,7 @@ def images(rng, height: int, width: int, noise: float = 30.0) -> tuple[np.ndarra
     ("height", "width", "scales"),
     [(11, 30, 1), (21, 40, 1), (22, 23, 2), (43, 60, 2), (45, 44, 3), (91, 100, 4), (176, 177, 5), (201, 190, 5)],
 )
-def test_ms_ssim_is_the_oracles(rng, height, width, scales):
+def test_ms_ssim_matches_the_reference(rng, height, width, scales):
     image, photograph = images(rng, height, width)
     assert ms_ssim_scales(image) == scales
     x, y = (pixels.astype(np.float64).transpose(2, 0, 1) / 255 for pixels in (image, photograph))
@@ -35,7 +35,7 @@ def test_ms_ssim_is_the_oracles(rng, height, width, scales):
     assert 0 < ms_ssim(image, photograph) < 1
 
 
-def test_one_scale_is_the_ssim_of_scikit_image(rng):
+def test_single_scale_matches_scikit_image(rng):
     metrics = pytest.importorskip("skimage.metrics")
     image, photograph = images(rng, 21, 40)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
@@ -52,7 +52,7 @@ def test_ms_ssim_of_equal_opposite_and_tiny_images(rng):
     assert ms_ssim(more, photograph) < ms_ssim(image, photograph)
 
 
-def test_averages_say_why_a_figure_is_missing(rng):
+def test_averages_explain_a_missing_metric(rng):
     perceptual = Perceptual(("ms_ssim",))
     small = [perceptual.measure(*images(rng, 9, 40)) for _ in range(2)]
     averages = perceptual.mean(small)
@@ -65,7 +65,7 @@ def test_averages_say_why_a_figure_is_missing(rng):
     assert "ms_ssim_reason" not in both
 
 
-def test_flip_is_zero_for_equal_images_and_that_of_its_package(rng):
+def test_flip_matches_its_package_and_is_zero_for_equal_images(rng):
     package = pytest.importorskip("flip_evaluator")
     image, photograph = images(rng, 40, 60)
     assert flip(photograph, photograph) == 0
@@ -109,7 +109,7 @@ def test_lpips_runs_the_network_on_the_stated_range(rng, network):
         assert Lpips(path, "-1..1").distance(image, photograph) == pytest.approx(4 * expected, rel=1e-5)
 
 
-def test_lpips_says_where_it_comes_from(rng, network):
+def test_lpips_reports_its_source(rng, network):
     perceptual = Perceptual.open(["psnr", "ssim"], network(), "0..1")
     averages = perceptual.mean([perceptual.measure(*images(rng, 20, 20)) for _ in range(3)])
     assert averages["lpips"] > 0

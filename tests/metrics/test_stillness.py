@@ -39,7 +39,7 @@ def gathered(views, renders, photographs, counted=None):
     return rows, found.figures()
 
 
-def test_flicker_is_the_deviation_over_the_moments_of_one_camera(rng, static):
+def test_flicker_is_the_deviation_over_time_of_one_camera(rng, static):
     renders, photographs = stacks(rng)
     views = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     rows, figures = gathered(views, renders, photographs)
@@ -51,7 +51,7 @@ def test_flicker_is_the_deviation_over_the_moments_of_one_camera(rng, static):
     assert [row["psnr_static"] for row in rows] == pytest.approx(10 * np.log10(255**2 / error), rel=1e-12)
 
 
-def test_order_of_moments_and_other_cameras_do_not_matter(rng, static):
+def test_order_of_times_and_other_cameras_do_not_matter(rng, static):
     renders, photographs = stacks(rng)
     views = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     other = [moment(f"o{i}", i / (MOMENTS - 1), x=1.0, static_path=static) for i in range(MOMENTS)]
@@ -62,7 +62,7 @@ def test_order_of_moments_and_other_cameras_do_not_matter(rng, static):
     assert {name: again[name] for name in figures} == figures
 
 
-def test_without_a_file_static_is_what_photographs_leave_alone(rng):
+def test_static_mask_defaults_to_unchanged_pixels(rng):
     renders, photographs = stacks(rng)
     photographs[:] = photographs[0]
     photographs[2, :, 5:] ^= 128  # something passes
@@ -76,7 +76,7 @@ def test_without_a_file_static_is_what_photographs_leave_alone(rng):
     assert rows == [{}] * MOMENTS, "no file says which pixels are static"
 
 
-def test_pixels_that_a_mask_leaves_out_do_not_count(rng, static):
+def test_masked_pixels_do_not_count(rng, static):
     renders, photographs = stacks(rng)
     counted = np.ones((HEIGHT, WIDTH), bool)
     counted[:3] = False
@@ -85,13 +85,13 @@ def test_pixels_that_a_mask_leaves_out_do_not_count(rng, static):
     assert figures["0"]["flicker"] == pytest.approx(renders[:, 3:, :4].astype(np.float64).std(axis=0).mean())
 
 
-def test_a_scene_that_does_not_move_has_no_such_figures(rng):
+def test_static_scene_has_no_stillness_metrics(rng):
     renders, photographs = stacks(rng)
     assert gathered([moment("a", None)], renders[:1], photographs[:1]) == ([{}], {})
     assert gathered([moment("a", 0.5)], renders[:1], photographs[:1]) == ([{}], {}), "one moment"
 
 
-def test_camera_with_one_moment_takes_no_row_and_no_memory(rng, static):
+def test_camera_with_one_time_needs_no_row_and_no_memory(rng, static):
     renders, photographs = stacks(rng)
     moving = [moment(f"m{i}", i / 19, x=1.0 + i, static_path=static) for i in range(20)]
     assert Stillness(moving).held == 0
@@ -102,7 +102,7 @@ def test_camera_with_one_moment_takes_no_row_and_no_memory(rng, static):
     assert figures == gathered(fixed, renders, photographs)[1] != {}
 
 
-def test_moments_that_no_view_in_training_has_are_measured_apart():
+def test_held_out_times_are_measured_separately():
     views = [moment(f"{i}", time) for i, time in enumerate((0, 0.5, 1))]
     psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
     moments = by_moment(psnr, views, [views[0], views[2]])
@@ -113,5 +113,5 @@ def test_moments_that_no_view_in_training_has_are_measured_apart():
         assert not by_moment(psnr, views, trained)
 
 
-def test_means_are_over_the_views_that_have_a_figure():
+def test_means_are_over_views_with_the_metric():
     assert means([{"a": 1.0}, {"a": 3.0, "b": 5.0}, {}]) == {"a": 2.0, "b": 5.0}

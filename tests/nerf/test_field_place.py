@@ -29,7 +29,7 @@ def is_seen(scene: Scene, corner, side: float) -> bool:
     return True
 
 
-def test_a_cube_is_seen_where_samples_of_a_view_lie_in_it(tmp_path):
+def test_cube_is_seen_if_a_view_samples_it(tmp_path):
     """Beside samples of all pixels: what has some is seen, and what is seen has some, but for the narrowest touch."""
     rng, seen = np.random.default_rng(0), 0
     view = View.looking_at([2.0, -1.0, 0.5], [0.0, 0.2, 0.0], [0.0, 0.0, 1.0], CAMERA)
@@ -48,7 +48,7 @@ def test_a_cube_is_seen_where_samples_of_a_view_lie_in_it(tmp_path):
     assert 15 < seen < 100
 
 
-def test_one_view_is_enough_and_points_count_where_present(tmp_path):
+def test_cube_needs_one_view_and_a_point_if_there_are_any(tmp_path):
     ahead = View.looking_at([0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], CAMERA, "ahead")
     away = View.looking_at([0.0, 0.0, -2.0], [0.0, 0.0, -9.0], [0.0, 1.0, 0.0], CAMERA, "away")
     assert is_seen(scene_of(tmp_path, away, ahead), [-0.5] * 3, 1.0)
@@ -58,7 +58,7 @@ def test_one_view_is_enough_and_points_count_where_present(tmp_path):
     assert not is_seen(scene_of(tmp_path, ahead, points=points), [-0.5] * 3, 0.8)
 
 
-def test_the_message_says_where_the_scene_is(tmp_path):
+def test_message_reports_the_scene_position(tmp_path):
     views = [
         View.looking_at([x, y, -2.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0], CAMERA, f"{x}") for x, y in ((0, 0), (3, 1))
     ]

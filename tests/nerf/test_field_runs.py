@@ -52,7 +52,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
     return out
 
 
-def test_a_run_of_a_field_leaves_what_one_of_gaussians_does(finished):
+def test_field_run_writes_the_usual_outputs(finished):
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["gaussians"] is None
     assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, color_width=16).learned
@@ -67,7 +67,7 @@ def test_a_run_of_a_field_leaves_what_one_of_gaussians_does(finished):
     assert {"train", "evaluate", "view"} == set(kinds)
 
 
-def test_the_field_is_what_its_renders_show(finished, tiny_scene, pipeline):
+def test_renders_match_the_field(finished, tiny_scene, pipeline):
     """A checkpoint alone gives the picture, to the bit."""
     run = train(tiny_scene, finished, pipeline=pipeline, resume=True)
     view = run.scene.downscaled(1).split("test")[0]
@@ -76,7 +76,7 @@ def test_the_field_is_what_its_renders_show(finished, tiny_scene, pipeline):
     np.testing.assert_array_equal(read_image(png), np.rint(255 * planes.clip(0, 1)).astype(np.uint8).transpose(1, 2, 0))
 
 
-def test_a_field_is_trained_longer_by_its_steps(finished, tmp_path):
+def test_field_trains_longer_with_more_steps(finished, tmp_path):
     assert RunState.read(finished).steps_key == "train_field.steps"
     assert RunState.read(tmp_path).steps_key == "optimize.steps"
     told = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
@@ -84,14 +84,14 @@ def test_a_field_is_trained_longer_by_its_steps(finished, tmp_path):
     assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))
 
 
-def test_training_makes_the_loss_smaller(tiny_scene, tmp_path, pipeline):
+def test_training_lowers_the_loss(tiny_scene, tmp_path, pipeline):
     train(tiny_scene, tmp_path / "run", "train_field.steps=40", "train_field.log_every=1", pipeline=pipeline)
     lines = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     losses = [line["loss"] for line in lines if line["kind"] == "train"]
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
 
 
-def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
+def test_images_of_all_sizes_count_equally(finished, tiny_scene, pipeline):
     """A ray of a small photograph stands for more area, and as many rays come from each."""
     run = train(tiny_scene, finished, pipeline=pipeline, resume=True)
     (stage, *_) = load(pipeline).stages
@@ -102,7 +102,7 @@ def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
     assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
 
 
-def test_killed_run_ends_with_the_bits_of_an_unkilled_one(finished, tiny_scene, tmp_path, pipeline):
+def test_killed_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path, pipeline):
     assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
@@ -110,21 +110,21 @@ def test_one_thread_gives_the_bits_of_several(finished, tiny_scene, tmp_path, pi
     assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
-def test_a_field_stands_beside_gaussians_in_a_comparison(finished, few_steps, tmp_path):
+def test_comparison_accepts_fields_and_gaussians(finished, few_steps, tmp_path):
     assert write_comparison([finished, few_steps], tmp_path / "compare.html") == 2
     page = (tmp_path / "compare.html").read_text()
     assert "parameters" in page
     assert "Gaussians" in page
 
 
-def test_the_files_of_a_run_of_a_field_are_checked(finished):
+def test_files_of_a_field_run_are_verified(finished):
     found = verify(RunState.read(finished))
     assert found["whole"]
     details = [one["detail"] for one in found["objects"]]
     assert [text for text in details if text.startswith("step 12, ") and text.endswith(" parameters")]
 
 
-def test_commands_on_models_say_that_a_run_has_none(finished):
+def test_model_commands_refuse_field_runs(finished):
     for path in (finished, finished / "field.npz"):
         with pytest.raises(DataError, match=r"is a field, a network instead of Gaussians; expected Gaussians; .*ren"):
             require_model(path)
@@ -144,12 +144,12 @@ def test_field_file_gives_the_metrics_and_images_of_its_run(finished, tmp_path):
         assert next((tmp_path / "images").rglob(path.name)).read_bytes() == path.read_bytes()
 
 
-def test_a_description_of_a_run_tells_how_long_its_steps_take(tiny_scene, tmp_path, pipeline):
+def test_dry_run_estimates_the_training_time(tiny_scene, tmp_path, pipeline):
     told = clsplat.describe_run(pipeline, tiny_scene, tmp_path / "run")
     assert re.search(r"expected: 0\.1 min, .*\n  train_field +0\.1 min: 12 steps of .* ms, of 128 rays", told)
 
 
-def test_a_field_is_trained_in_the_steps_that_fit_into_a_time(tiny_scene, tmp_path, pipeline, monkeypatch):
+def test_field_trains_for_a_time_budget(tiny_scene, tmp_path, pipeline, monkeypatch):
     """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
     found = Rehearsal(12, [0.01], during=0.0, after=0.0)
     monkeypatch.setattr("clsplat.runs.time_budget.rehearse_enough", lambda *given: found)
@@ -162,12 +162,12 @@ def test_a_field_is_trained_in_the_steps_that_fit_into_a_time(tiny_scene, tmp_pa
     assert (again / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
 
 
-def test_a_field_is_filmed(finished, tmp_path):
+def test_video_of_a_field(finished, tmp_path):
     made = clsplat.render_path(finished, video=tmp_path / "a.webm", frames=2, size="16x16", path="orbit")
     assert (made["frames"], made["size"]) == (2, [16, 16])
 
 
-def test_stages_of_films_show_a_field(tiny_scene, tmp_path):
+def test_video_stage_renders_a_field(tiny_scene, tmp_path):
     film = "  - timelapse\n  - video: {frames: 2, size: 16x16}\n"
     snapshot = '        - snapshot: {every: 2, size: "16x16"}\n'
     training, *_ = PIPELINE.split("        - evaluate")
@@ -177,7 +177,7 @@ def test_stages_of_films_show_a_field(tiny_scene, tmp_path):
     assert (out / "video.webm").stat().st_size > 0
 
 
-def test_a_field_renders_from_python(finished, tiny_scene, device):
+def test_field_renders_from_python(finished, tiny_scene, device):
     view = clsplat.read_scene(tiny_scene).split("test")[0]
     field = clsplat.load_field(finished)
     picture = clsplat.FieldRenderer(field, device).render(view, depth=True)
@@ -187,7 +187,7 @@ def test_a_field_renders_from_python(finished, tiny_scene, device):
     assert field.shape.near <= covered.min() <= covered.max() <= field.shape.far
 
 
-def test_field_on_another_background_is_lighter_where_uncovered(finished, tiny_scene, device):
+def test_field_background_shows_where_uncovered(finished, tiny_scene, device):
     """Coverage and picture belong together: 1 - alpha of the background shows."""
     view = clsplat.read_scene(tiny_scene).split("test")[0]
     field = clsplat.load_field(finished)
@@ -208,7 +208,7 @@ def test_field_on_another_background_is_lighter_where_uncovered(finished, tiny_s
         ({"shape": {"width": 63}}, r"metadata shape\.width: .*multiple of 4"),
     ],
 )
-def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_path, change, complaint):
+def test_invalid_field_file_is_refused_in_one_line(finished, tmp_path, change, complaint):
     notes, arrays = archive.read(finished / "field.npz")
     changed = {key: {**notes[key], **value} if isinstance(value, dict) else value for key, value in change.items()}
     with (tmp_path / "field.npz").open("wb") as file:
@@ -227,7 +227,7 @@ def test_missing_or_nonfinite_field_file_is_refused(finished, tmp_path):
         clsplat.load_field(tmp_path / "field.npz")
 
 
-def test_nonfinite_field_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):
+def test_nonfinite_field_stops_the_run_and_is_quarantined(tiny_scene, tmp_path, pipeline):
     with pytest.raises(NotFiniteError, match=r"not finite: .*train_field\.rate="):
         train(tiny_scene, tmp_path / "run", "train_field.rate=1e30", pipeline=pipeline)
     assert [path.name for path in (tmp_path / "run/checkpoints").glob("failed_*")]
@@ -264,7 +264,7 @@ def test_stages_of_gaussians_are_refused_after_a_field(tmp_path, stage):
         ({"coarse_samples": 20}, "multiple of 16"),
     ],
 )
-def test_a_shape_that_cannot_be_is_refused(keys, complaint):
+def test_invalid_shape_is_refused(keys, complaint):
     with pytest.raises(ValidationError, match=complaint):
         FieldShape(**keys)
 
@@ -298,7 +298,7 @@ def small_field() -> Field:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (64, 1), (65, 1), (97, 11)])
-def test_pictures_of_all_sizes_are_whole(small_field, size):
+def test_images_of_all_sizes_render_completely(small_field, size):
     """Around tiles of samples, and around the rays that are rendered at a time; a pixel has its own ray."""
     camera = Camera(*size, 50.0, 50.0, size[0] / 2, size[1] / 2)
     view = View.looking_at([0, -4, 1], [0, 0, 0], [0, 0, 1], camera)
@@ -309,14 +309,14 @@ def test_pictures_of_all_sizes_are_whole(small_field, size):
     np.testing.assert_array_equal(paint(small_field, right)[:, 0, 0], image[:, 0, -1])
 
 
-def test_no_rays_are_no_picture(small_field):
+def test_zero_rays_give_no_pixels(small_field):
     camera = upload_camera(small_field.workspace.device, View("v", Camera(4, 4, 9.0, 9.0, 2.0, 2.0), np.eye(3, 4)))
     rays = small_field.levels.cast(camera, small_field.workspace.device.upload(np.zeros(0, np.uint32)))
     levels = list(small_field.levels.render(small_field.parameters, rays))
     assert [level.colors.shape for level in levels] == [(0, 3), (0, 3)]
 
 
-def test_a_parameter_that_is_not_a_number_is_seen_in_the_picture(small_field):
+def test_nan_parameter_shows_in_the_render(small_field):
     """A ReLU hides none, and neither does a limit: the run that trains it stops."""
     for layer in small_field.shape.layers:
         parameters = small_field.parameters.get()
@@ -327,13 +327,13 @@ def test_a_parameter_that_is_not_a_number_is_seen_in_the_picture(small_field):
         assert np.isnan(paint(broken, view)).any(), layer.name
 
 
-def test_space_that_is_far_away_is_encoded_as_nothing(small_field):
+def test_distant_space_is_encoded_as_zero(small_field):
     """Distances of a million: the features vanish, and the picture stays finite."""
     view = View.looking_at([1e6, 0, 0], [0, 0, 0], [0, 0, 1], Camera(5, 3, 9.0, 9.0, 2.5, 1.5))
     assert np.isfinite(paint(small_field, view)).all()
 
 
-def test_a_field_that_is_trained_on_goes_on_with_its_moments(tiny_scene, tmp_path, pipeline):
+def test_continued_training_keeps_adam_moments(tiny_scene, tmp_path, pipeline):
     """Two stages of one shape are one training; one of another shape begins anew, in a run that goes on too."""
     two = tmp_path / "two.yaml"
     (stage, *_) = PIPELINE.split("  - evaluate: {split: test, downscales")

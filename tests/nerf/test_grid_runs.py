@@ -37,7 +37,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
     return out
 
 
-def test_the_numbers_of_a_grid_are_trained(finished):
+def test_grid_parameters_are_trained(finished):
     field = clsplat.load_field(finished)
     own = slice(field.shape.network_parameters, field.shape.network_parameters + field.shape.grid.learned)
     moved = np.abs(field.parameters - field.shape.initial_parameters(0))[own]
@@ -45,15 +45,15 @@ def test_the_numbers_of_a_grid_are_trained(finished):
     assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.learned
 
 
-def test_killed_grid_run_ends_with_the_bits_of_an_unkilled_one(finished, tiny_scene, tmp_path, pipeline):
+def test_killed_grid_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path, pipeline):
     assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
-def test_a_grid_has_the_bits_of_several_threads_with_one(finished, tiny_scene, tmp_path, pipeline):
+def test_grid_bits_do_not_depend_on_the_thread_count(finished, tiny_scene, tmp_path, pipeline):
     assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
-def test_the_file_of_a_grid_gives_the_figures_of_its_run(finished):
+def test_grid_file_gives_the_metrics_of_its_run(finished):
     recorded = json.loads((finished / "metrics.json").read_text())
     found = clsplat.evaluate(finished / "field.npz", downscales=[2])
     assert found["test"]["2"] == recorded["test"]["2"]
@@ -80,7 +80,7 @@ def test_a_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missin
         clsplat.load_field(tmp_path / "field.npz")
 
 
-def test_the_recipe_reads_a_grid_in_the_place_of_sines():
+def test_recipe_uses_a_grid_instead_of_sines():
     (stage, *_) = load("mip_grid").stages
     assert isinstance(stage, TrainField)
     assert stage.field.grid is not None
@@ -89,7 +89,7 @@ def test_the_recipe_reads_a_grid_in_the_place_of_sines():
     assert FieldShape.model_validate(stage.field.model_dump()) == stage.field
 
 
-def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipeline):
+def test_too_large_field_is_refused_before_allocation(tiny_scene, pipeline):
     large = {"levels": 16, "coarsest": 2048, "finest": 4096, "entries": 1 << 22}
     changes = [f"train_field.field.grid.{name}={value}" for name, value in large.items()]
     limits = SimpleNamespace(memory=4 << 30, allocation=4 << 30)
@@ -118,7 +118,7 @@ def test_cube_no_photograph_shows_is_refused_before_allocation(tiny_scene, pipel
             stage.check_run(SimpleNamespace(scene=scene))
 
 
-def test_the_plan_of_a_field_is_near_what_it_takes(finished):
+def test_memory_plan_of_a_field_is_accurate(finished):
     """Pictures of the evaluation are not in it."""
     field = clsplat.load_field(finished).shape
     taken = json.loads((finished / "metrics.json").read_text())["device_memory"]

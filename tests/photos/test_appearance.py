@@ -14,7 +14,7 @@ MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: 
 
 
 @MODELS
-def test_derivatives_by_numbers_are_those_of_the_matrix(rng, model):
+def test_parameter_derivatives_match_those_of_the_matrix(rng, model):
     row, grad_matrix, step = rng.normal(0, 0.2, len(model.columns)), rng.normal(size=(3, 4)), 1e-5
     values = [
         ((grad_matrix * (model.matrix(row + change) - model.matrix(row - change))).sum() / (2 * step))
@@ -28,14 +28,14 @@ def test_derivatives_by_numbers_are_those_of_the_matrix(rng, model):
     assert model.penalty(row)[1] == pytest.approx(np.array(penalties), rel=1e-6, abs=1e-9)
 
 
-def test_the_gain_is_that_of_the_reference(rng):
+def test_gain_matches_the_reference(rng):
     row, grad_matrix = rng.normal(0, 0.3, 3), rng.normal(size=(3, 4))
     assert Gain().matrix(row) == pytest.approx(ref.gain_matrix(*row))
     assert Gain().gradient(row, grad_matrix) == pytest.approx(ref.gain_gradient(*row, grad_matrix))
 
 
 @MODELS
-def test_numbers_of_gains_make_these_gains_and_zeros_no_change(rng, model):
+def test_gain_parameters_round_trip_and_zeros_are_identity(rng, model):
     gains = rng.normal(0, 0.3, 3)
     assert np.diag(model.matrix(model.from_gains(gains))) == pytest.approx(np.exp(gains))
     assert (model.matrix(np.zeros(len(model.columns))) == IDENTITY).all()
@@ -43,7 +43,7 @@ def test_numbers_of_gains_make_these_gains_and_zeros_no_change(rng, model):
 
 
 @MODELS
-def test_the_fitted_matrix_is_the_one_that_made_a_photograph(rng, model):
+def test_fit_recovers_the_matrix_of_an_image(rng, model):
     image, made = rng.uniform(0, 0.6, (500, 3)), model.from_gains(np.array([0.2, -0.1, 0.3]))
     matrix = model.matrix(made)
     photograph = image @ matrix[:, :3].T + matrix[:, 3]
@@ -92,12 +92,12 @@ def test_rates_follow_how_often_a_photograph_is_visited():
 
 
 @pytest.mark.parametrize("rate", ["1000", "{initial: 0.1, final: 2, over: 9}", "-1"])
-def test_a_rate_that_ends_in_no_numbers_is_refused(rate):
+def test_rate_out_of_range_is_refused(rate):
     with pytest.raises(ConfigError, match=r"expected values (of at most 0\.5|at least 0)"):
         load("smoke", [f"optimize.modules.exposure={{rate: {rate}}}"])
 
 
-def test_the_key_takes_names_and_mappings():
+def test_key_accepts_names_and_mappings():
     def modules(setting: str):
         return load("smoke", [f"optimize.modules.exposure={setting}"]).settings.training.modules
 

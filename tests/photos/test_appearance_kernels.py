@@ -31,7 +31,7 @@ def test_image_and_derivatives(device, rng, width, height):
 
 
 @on_one_setting
-def test_no_change_cuts_white_alone(device, rng):
+def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera = camera_of(device, 33, 18)
     found = transform_colors(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
@@ -62,7 +62,7 @@ class Case:
 
 
 @on_devices("colors, share", product([Gain(), Affine(weight=0.3)], [None, 0.7]))
-def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colors, share):
+def test_step_gradient_is_that_of_its_losses(device, rng, monkeypatch, colors, share):
     """By finite differences of the loss; l2 is smooth."""
     case, found = Case(device, rng, colors, share=share), []
     table, step = case.trainer.modules[0].table, 2e-3
@@ -88,7 +88,7 @@ def gradients_of(device, rng, colors, losses) -> dict[str, np.ndarray]:
 
 @on_one_setting
 @pytest.mark.parametrize("losses", [(L1(weight=0.8), Dssim(weight=0.2)), (L2(), WeightEntropy(weight=0.1))])
-def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatch, losses):
+def test_identity_parameters_leave_the_gradients(device, rng, monkeypatch, losses):
     """The entropy of the fourth plane passes as it is."""
     monkeypatch.setattr(Gain, "from_gains", lambda self, gains: np.zeros(3))
     state = rng.bit_generator.state

@@ -18,14 +18,14 @@ SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2),
 
 
 @on_devices("width, height, sigma, share", each_once(SIZES, product([0.3, 1.0, 2.5, 200.0], [None, 0.7, 0.05])))
-def test_the_blur_is_the_oracles(device, rng, width, height, sigma, share):
+def test_blur_matches_the_reference(device, rng, width, height, sigma, share):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     mask = None if share is None else rng.random((height, width)) < share
     found = colors_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
     np.testing.assert_allclose(found, blurred(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
 
 
-def test_a_pixel_keeps_its_value_where_nothing_near_it_counts(device, rng):
+def test_pixel_without_counted_neighbors_is_unchanged(device, rng):
     image = rng.uniform(0, 1, (3, 20, 40)).astype(np.float32)
     mask = np.zeros((20, 40), bool)
     mask[10, 5] = True
@@ -46,7 +46,7 @@ def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
     np.testing.assert_allclose(found, 0.75, rtol=1e-6)
 
 
-def test_without_a_sigma_the_photograph_stays(device, rng):
+def test_zero_sigma_leaves_the_image(device, rng):
     image = rng.uniform(0, 1, (3, 5, 9)).astype(np.float32)
     blur = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
     np.testing.assert_array_equal(colors_of(blur.apply(planes_of(device, image), step=9)), image)
@@ -58,7 +58,7 @@ def test_without_a_sigma_the_photograph_stays(device, rng):
     "share, reach, masked",
     each_once([(0.0, 0), (0.09, 0), (0.1, 1), (0.24, 2), (0.25, 2), (0.5, 5), (3.0, 30)], [False, True]),
 )
-def test_the_mean_filter_is_the_oracles(device, rng, share, reach, masked):
+def test_mean_filter_matches_the_reference(device, rng, share, reach, masked):
     image = rng.uniform(0, 1, (3, 17, 20)).astype(np.float32)
     mask = rng.random((17, 20)) < 0.5 if masked else None
     found = colors_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))

@@ -52,7 +52,7 @@ def test_map_has_the_inverse_depths_of_the_points_in_any_unit(tmp_path, rng, bit
     np.testing.assert_allclose(found[2], inverse[found[0], found[1]], atol=2e-4 if bits == 16 else 1e-2)
 
 
-def test_maps_that_show_other_depths_are_left_out_and_named(tmp_path, rng, caplog):
+def test_inconsistent_depth_maps_are_dropped_and_named(tmp_path, rng, caplog):
     """Those where dark is near, plain ones, and those of photographs with few points."""
     inverse = rng.uniform(0.1, 1.5, (30, 40))
     rows, columns = rng.integers(0, 30, 50), rng.integers(0, 40, 50)
@@ -68,7 +68,7 @@ def test_maps_that_show_other_depths_are_left_out_and_named(tmp_path, rng, caplo
     assert DepthMaps(tmp_path).at("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None
 
 
-def test_of_a_large_map_an_even_grid_is_compared(tmp_path):
+def test_large_map_is_compared_on_an_even_grid(tmp_path):
     inverse = np.linspace(0.1, 1.5, 400 * 300).reshape(300, 400)
     write_map(tmp_path / "a.png", inverse)
     rows, columns = np.arange(300), np.arange(300)
@@ -78,7 +78,7 @@ def test_of_a_large_map_an_even_grid_is_compared(tmp_path):
     assert set(np.diff(np.unique(found[0]))) == set(np.diff(np.unique(found[1]))) == {2}
 
 
-def test_a_map_that_is_missing_or_damaged_is_named(tmp_path):
+def test_missing_or_damaged_map_is_named(tmp_path):
     with pytest.raises(DataError, match=r"a\.png: the depth map of a\.jpg is missing"):
         DepthMaps(tmp_path).read("a.jpg", 4, 3)
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n")
@@ -86,7 +86,7 @@ def test_a_map_that_is_missing_or_damaged_is_named(tmp_path):
         DepthMaps(tmp_path).read("a.jpg", 4, 3)
 
 
-def test_depths_are_those_of_the_ground(device, yard, tmp_path):
+def test_depths_match_the_ground_truth(device, yard, tmp_path):
     tracks = type("T", (), {"positions": yard.points.positions, "seen": {}})
     tracks.seen = {view.name: np.arange(len(yard.points)) for view in yard.views}
     names = [view.name for view in yard.views]
@@ -103,7 +103,7 @@ def test_depths_are_those_of_the_ground(device, yard, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_training_takes_them_and_notices_that_they_changed(yard, tmp_path):
+def test_training_uses_depth_maps_and_detects_changes(yard, tmp_path):
     losses = "[{type: l1, weight: 0.8}, {type: inverse_depth, weight: 0.3%s}]"
     folder = f", folder: '{tmp_path / 'maps'}'"
     scene = tmp_path / "scene"

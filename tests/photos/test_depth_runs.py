@@ -15,7 +15,7 @@ DEPTH = "{type: inverse_depth, weight: [[0, 0.5], [20, 0.0]]}"
 LOSSES = f"optimize.losses=[{{type: l1, weight: 0.8}}, {{type: dssim, weight: 0.2}}, {DEPTH}]"
 
 
-def test_runs_resume_and_repeat_to_the_bit(rng, tmp_path):
+def test_runs_resume_and_repeat_bit_for_bit(rng, tmp_path):
     """While the loss has weight, and after."""
     scene = Yard(rng).write(tmp_path / "scene")
     first = train(scene, tmp_path / "first", *TWO_DOZEN, LOSSES)
@@ -32,12 +32,12 @@ def test_runs_resume_and_repeat_to_the_bit(rng, tmp_path):
     assert digest(train(scene, tmp_path / "again", *TWO_DOZEN, LOSSES, resume=True).out) == digest(first.out)
 
 
-def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
+def test_scene_without_observations_is_refused(tiny_scene, tmp_path):
     with pytest.raises(DataError, match="the loss 'inverse_depth' needs points with tracks"):
         train(tiny_scene, tmp_path / "run", *TWO_DOZEN, LOSSES)
 
 
-def test_poses_are_not_learned_beside_it(rng, tmp_path):
+def test_depth_loss_refuses_pose_optimization(rng, tmp_path):
     with pytest.raises(ConfigError, match="'camera_optimizer' cannot be combined with inverse_depth"):
         train(
             Yard(rng).write(tmp_path / "scene"),
@@ -48,7 +48,7 @@ def test_poses_are_not_learned_beside_it(rng, tmp_path):
         )
 
 
-def test_photographs_showing_points_elsewhere_give_no_depths(rng, tmp_path):
+def test_images_with_large_reprojection_errors_give_no_depths(rng, tmp_path):
     """The bits are those without the loss."""
     scene = missing(tmp_path / "scene", np.array([1.2, -0.9]), rng)
     with_loss, plain = train(scene, tmp_path / "loss", *TWO_DOZEN, LOSSES), train(scene, tmp_path / "plain", *TWO_DOZEN)

@@ -37,7 +37,7 @@ def test_a_natural_spectrum_begins_with_a_sixteenth():
     )
 
 
-def test_largest_divisor_is_of_the_most_detailed_and_limited():
+def test_largest_divisor_follows_the_most_detailed_image():
     assert knots([NATURAL, NOISE], 6000, 8)[1][0] == pytest.approx(2, rel=2e-3)
     assert knots([NATURAL], 6000, 3)[1][0] == 3
 
@@ -49,7 +49,7 @@ def test_without_detail_the_size_is_full_from_the_start():
 
 
 @pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20)])
-def test_a_spectrum_sums_what_the_centered_window_holds(size):
+def test_spectrum_sums_over_the_centered_window(size):
     image = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
     amplitudes = np.abs(np.fft.fft2(image.astype(np.float64), axes=(0, 1))).sum(axis=2)
     spectrum = Spectrum.of(image)
@@ -61,7 +61,7 @@ def test_a_spectrum_sums_what_the_centered_window_holds(size):
         assert below * (1 - 1e-5) <= amplitudes[inside].sum() <= above * (1 + 1e-5)
 
 
-def test_size_changes_by_integers_after_edits_to_full_at_the_end():
+def test_size_grows_in_integer_steps_to_full():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
     smooth = np.repeat(np.repeat(image[::4, ::4], 4, axis=0), 4, axis=1)
@@ -130,7 +130,7 @@ def test_momentum_follows_its_formulas():
     assert budget.limit(edit_of(7400, 0), BudgetContext(0.95, 1, 1.0), numbers) == 7400  # pruned ones are replaced
 
 
-def test_momentum_with_a_number_of_its_own_ends_there():
+def test_momentum_ends_at_its_setting():
     budget, numbers = Momentum(gaussians=2000), {}
     for share in (0.2, 0.5, 0.8):
         assert budget.limit(edit_of(1950, 1900), BudgetContext(share, 5, 1.0), numbers) == 2000

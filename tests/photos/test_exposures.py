@@ -22,7 +22,7 @@ def table(exposures: Exposures) -> np.ndarray:
     return np.array(list(exposures.log_gains.values()))
 
 
-def test_gains_are_found_again(rng):
+def test_gains_are_recovered(rng):
     wall = Wall(rng)
     found = wall.measured()
     assert table(found) == pytest.approx(wall.log_gains, abs=2e-3)
@@ -63,7 +63,7 @@ class Photograph:
         return None
 
 
-def test_a_run_begins_with_both(rng, tmp_path):
+def test_run_starts_from_tracks_and_exif(rng, tmp_path):
     wall = Wall(rng)
     wall.tracks = replace(wall.tracks, seen={**wall.tracks.seen, "2.png": np.arange(19)})
     wall.write(tmp_path)
@@ -81,7 +81,7 @@ def test_a_run_begins_with_both(rng, tmp_path):
     assert found.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
 
 
-def test_tracks_stand_alone_where_nothing_can_be_added(rng):
+def test_unusable_exif_leaves_the_gains_of_tracks(rng):
     shown = Wall(rng).measured()
     apart = Exposures({"other.png": np.zeros(3)}, "as noted")
     for told in (UNKNOWN, Exposures(dict(shown.log_gains), "as noted"), apart):
@@ -90,7 +90,7 @@ def test_tracks_stand_alone_where_nothing_can_be_added(rng):
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.25])
-def test_photographs_that_agree_but_for_their_gains_are_no_fault(rng, spread):
+def test_images_that_differ_only_by_gains_are_accepted(rng, spread):
     """Nothing is left then but rounding, which says nothing."""
     wall = Wall(rng)
     log_gains = wall.log_gains[:, 0] * (spread / 0.25)
@@ -99,7 +99,7 @@ def test_photographs_that_agree_but_for_their_gains_are_no_fault(rng, spread):
     assert _fitted(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
 
 
-def test_photographs_sharing_points_only_in_a_chain_are_compared(rng):
+def test_images_linked_by_a_chain_of_points_are_compared(rng):
     wall = Wall(rng, photographs=20, overlap=60)
     assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.01)
 
@@ -117,7 +117,7 @@ def test_a_third_of_the_points_may_be_hidden(rng):
     assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.06)
 
 
-def test_light_that_changes_with_view_direction_is_no_exposure(rng):
+def test_view_dependent_light_is_not_exposure(rng):
     """Each photograph of a point differs for itself."""
     wall = Wall(rng)
     wall.log_gains[:] = 0
@@ -133,7 +133,7 @@ def test_light_that_changes_with_view_direction_is_no_exposure(rng):
     assert found.spread < 0.05
 
 
-def test_what_cannot_be_known_is_left_out(rng):
+def test_undetermined_gains_are_omitted(rng):
     wall = Wall(rng)
     seen = {**wall.tracks.seen, "3.png": np.empty(0, np.int64)}
     wall.tracks = replace(wall.tracks, seen=seen)
@@ -143,7 +143,7 @@ def test_what_cannot_be_known_is_left_out(rng):
     assert nothing.spread == 0
 
 
-def test_points_count_where_a_photograph_shows_them(rng):
+def test_points_count_at_their_observations(rng):
     wall, view = Wall(rng), Wall(rng).views[0]
     image, mask = wall.photograph(wall.views[0]), np.zeros((SIZE, SIZE), bool)
     rows, values = samples(wall.tracks, view, image, None)
@@ -170,14 +170,14 @@ def test_tracks_are_written_and_read(rng, tmp_path):
     assert tracks_of(read_images(tmp_path), read_point_table(tmp_path)) is None
 
 
-def test_tracks_of_text_are_those_of_its_ids(tmp_path):
+def test_text_tracks_follow_point_ids(tmp_path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n1 1 7 2 2 -1 3 3 5 4 4 5 9 9 77\n")
     (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 2\n")
     tracks = tracks_of(read_images(tmp_path), read_point_table(tmp_path))
     assert tracks.seen["a.png"].tolist() == [1, 0], "by id; 77 is no point"
 
 
-def test_tracks_stay_with_undistorted_photographs(rng, tmp_path):
+def test_undistorted_scenes_keep_tracks(rng, tmp_path):
     wall = Wall(rng, photographs=3)
     wall.write(tmp_path / "scene")
     assert undistort_scene(tmp_path / "scene", tmp_path / "out", long_side=32) == 3

@@ -20,7 +20,7 @@ def any_device(info: DeviceInfo) -> Device:
     return Device(info)
 
 
-def test_buffers_are_counted_while_they_live(device):
+def test_live_buffers_are_counted(device):
     gc.collect()
     before = device.allocated
     one, two = device.empty(1000), device.zeros((3, 500), np.uint32)
@@ -33,7 +33,7 @@ def test_buffers_are_counted_while_they_live(device):
 
 
 @pytest.mark.parametrize("kept", [0, 3, 100])
-def test_photographs_keep_to_the_budget(any_device, tiny_scene, kept):
+def test_images_stay_within_the_budget(any_device, tiny_scene, kept):
     views = read_scene(tiny_scene).split("train")
     size = 3 * views[0].camera.width * views[0].camera.height
     tight, plenty = Photographs(any_device, "white", budget=kept * size), Photographs(any_device, "white")
@@ -59,7 +59,7 @@ def test_photograph_has_the_camera_of_the_requested_view(any_device, tiny_scene,
             np.testing.assert_array_equal(camera.array.get(), expected.array.get())
 
 
-def test_damaged_photograph_read_ahead_is_reported_on_request(any_device, tiny_scene, tmp_path):
+def test_prefetched_damaged_image_is_reported_on_request(any_device, tiny_scene, tmp_path):
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)

@@ -62,7 +62,7 @@ def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, 
     assert digest(out) == digest(tmp_path / "whole")
 
 
-def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, few_steps, tmp_path):
+def test_view_settings_change_training_except_defaults(tiny_scene, few_steps, tmp_path):
     """The default settings, written out, give the bits of a file without them."""
     same = "{order: {type: uniform}, resolution: 1.0, transforms: [{type: blur, sigma: 0.0}]}"
     train(tiny_scene, tmp_path / "same", *FEW, f"optimize.views={same}")

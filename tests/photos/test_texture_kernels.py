@@ -45,7 +45,7 @@ def test_image_gradient(device, rng, width, height):
 
 
 @on_devices("width, height", SIZES)
-def test_what_is_masked_has_no_texture(device, rng, width, height):
+def test_masked_pixels_have_no_texture(device, rng, width, height):
     """Nor have its neighbors, and neither the texture nor its quantiles depend on what is hidden."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     mask = rng.random((height, width)) < 0.9

@@ -49,7 +49,7 @@ def decided(name: str, *overrides: str, count: int = 9, error: float | None = No
     ("photographs", "sky", "most"),
     [(4, None, 0.6), (11, 0.24, 0.6), (12, 0.25, 0.3), (25, 0.49, 0.3), (25, 0.5, 0.1), (39, 1, 0.1), (40, 1, None)],
 )
-def test_photos_decides_by_their_count_and_the_sky(photographs, sky, most):
+def test_photos_recipe_adapts_to_image_count_and_sky(photographs, sky, most):
     settings = decided("photos", count=photographs, sky=sky).settings
     few, training, init = photographs < 40, settings.optimize, settings.stages[0]
     modules = {one.type: one for one in training.modules}
@@ -67,7 +67,7 @@ def test_photos_decides_by_their_count_and_the_sky(photographs, sky, most):
         assert (alike, settings.model) == (fast.stages, fast.model), "nothing is lost where there are many"
 
 
-def test_photos_in_fewer_steps_ends_its_schedules_earlier():
+def test_photos_recipe_shortens_schedules_with_steps():
     asked = load("photos")
     short = replace(asked, settings=in_steps(asked.settings, 1700))
     modules = {one.type: one for one in adapted(short, Measures(9, 2.0)).settings.optimize.modules}
@@ -84,7 +84,7 @@ def test_photos_in_fewer_steps_ends_its_schedules_earlier():
         ("optimize.steps=7", []),
     ],
 )
-def test_a_key_that_is_set_is_kept(override, kept, tmp_path):
+def test_set_key_is_not_adapted(override, kept, tmp_path):
     """Around a key of a decision or inside of it; also where a run has decided."""
     found = decided("smoke", ADAPT, override)
     assert found.settings.adapt.keep == kept
@@ -97,12 +97,12 @@ def test_a_key_that_is_set_is_kept(override, kept, tmp_path):
 
 
 @pytest.mark.parametrize("override", ["adapt.keep=[model.near]", "adapt.decisions=[{key: seed, value: 3, reason: x}]"])
-def test_a_key_that_is_not_decided_is_refused(override):
+def test_key_without_a_decision_is_refused(override):
     with pytest.raises(ConfigError, match=r"does not decide '(model.near|seed)'; there are"):
         load("photos", [override])
 
 
-def test_other_photographs_are_decided_by_again(tmp_path):
+def test_decisions_are_repeated_for_other_photographs(tmp_path):
     file = tmp_path / "run.yaml"
     file.write_text(decided("smoke", ADAPT, "model.background={type: auto, chosen: on, reason: blue}").text())
     assert adapted(load(str(file)), Measures(3)).settings.model.sh_degree == 1, "what a run decided stays"
@@ -132,7 +132,7 @@ def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     assert state.is_whole(load("smoke", [*asked, "model.sh_degree=1"]))
 
 
-def test_before_preparation_it_says_what_is_undecided():
+def test_undecided_keys_are_listed_before_preparation():
     found = clsplat.check("photos")
     assert found["adapts"][:2] == ["init.transparent", "init.count"]
     assert clsplat.check("fast")["adapts"] == []
@@ -151,13 +151,13 @@ def test_before_preparation_it_says_what_is_undecided():
         ("{type: photos, decisions: [{key: a, value: 1}]}", "'reason' is missing"),
     ],
 )
-def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
+def test_impossible_decision_is_refused_in_one_sentence(adapt, complaint):
     with pytest.raises(ConfigError, match=complaint):
         decided("smoke", f"adapt={adapt}", count=2)
 
 
 @pytest.mark.parametrize(("count", "clear", "sky"), [(12, True, "100%"), (12, False, "0%"), (41, True, None)])
-def test_a_run_looks_for_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, count, clear, sky):
+def test_run_detects_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
         monkeypatch.setattr("clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky"))
@@ -168,7 +168,7 @@ def test_a_run_looks_for_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, 
     assert sky is None or f"{sky} of them with sky" in text
 
 
-def test_transparent_photos_have_reasons_of_their_own(tiny_scene, tmp_path):
+def test_transparent_photos_have_separate_reasons(tiny_scene, tmp_path):
     text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
     assert "8 training photos: at most 0.6 Gaussians per pixel" in text
     assert "random colors behind transparent pixels" in text

@@ -75,7 +75,7 @@ def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
 
 
 @pytest.mark.parametrize("steps", [1, 200])
-def test_an_average_begins_after_growth_in_the_fewest_steps_too(steps):
+def test_averaging_starts_after_growth_even_in_few_steps(steps):
     """It began before in 200 steps: 40 cadences of 2.9 steps, each cut to 2, end sooner than 2 of 47."""
     training = in_steps(load("fast").settings, steps).training
     last = [max([0, *(n for n in range(1, steps) if stage.due(n))]) for stage in training.during]

@@ -58,7 +58,7 @@ def test_steps_need_a_stage_that_trains(write):
         load_experiment(write(text))
 
 
-def test_cells_do_not_see_each_others_values(write):
+def test_cells_do_not_share_values(write):
     """Values inside nested lists and dicts of the file are not shared."""
     text = (
         "name: s\nmatrix: {set: {optimize.losses.0.weight: [0.1, 0.2], optimize.rates.quats: [0.5, 0.25]}}\n" + STAGES
@@ -73,7 +73,7 @@ def test_cells_do_not_see_each_others_values(write):
     ]
 
 
-def test_short_keys_are_told_apart(write):
+def test_ambiguous_short_keys_are_distinguished(write):
     text = (
         "name: s\nmatrix: {set: {optimize.checkpoint.every: [2], optimize.log_every: [2], init.count: [9]}}\n" + STAGES
     )
@@ -146,7 +146,7 @@ def test_an_option_cannot_contradict_the_matrix(write):
         load_experiment(write(SMALL), ["optimize.steps=3"])
 
 
-def test_the_same_name_twice_is_refused(write, tmp_path):
+def test_duplicate_name_is_refused(write, tmp_path):
     (tmp_path / "sub").mkdir()
     paths = [write("name: p\n" + STAGES, "p.yaml"), write("name: p\n" + STAGES, "sub/p.yaml")]
     with pytest.raises(ConfigError, match="two cells of the matrix would be named 'p'"):

@@ -22,7 +22,7 @@ PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
         (PIXELS, "stages[1].optimize.losses[1]: 'covariance_trace'"),
     ],
 )
-def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
+def test_settings_with_static_positions_refuse_motion(override, what):
     with pytest.raises(ConfigError, match=f"{re.escape(what)} cannot be combined with .* \\(model.time\\): it reads"):
         load("dynamic_7k", [override])
     load("splat_7k", [override])
@@ -35,7 +35,7 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
         ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it reads"),
     ],
 )
-def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):
+def test_static_only_stages_are_refused_on_loading(tmp_path, stage, words):
     path = tmp_path / "x.yaml"
     text = f"name: x\nmodel: {{time: {{}}}}\nstages:\n  - init\n  - {stage}\n  - export\n"
     path.write_text(text)
@@ -57,7 +57,7 @@ def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):
         ("mip_nerf", "train_field.field.near=1e-300", "at least"),
     ],
 )
-def test_numbers_that_no_training_survives_are_refused(pipeline, override, bound):
+def test_extreme_motion_settings_are_refused(pipeline, override, bound):
     with pytest.raises(ConfigError, match=bound):
         load(pipeline, [override])
 
@@ -66,7 +66,7 @@ def test_filters_and_rules_that_read_no_positions_allow_motion():
     load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_steepest, prune_unimportant]"])
 
 
-def test_a_class_of_a_plugin_declares_a_conflict_in_its_stage(tmp_path, without_plugins):
+def test_plugin_class_declares_a_conflict_in_its_stage(tmp_path, without_plugins):
     class Wave(Penalty):
         conflicts: ClassVar[Mapping[str, str]] = {"l2": "both are smooth", "sky": "it has no size; leave one out"}
         type: Literal["wave"] = "wave"

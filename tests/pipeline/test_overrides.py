@@ -88,7 +88,7 @@ def test_outputs_stay_inside_the_run_folder(place):
 
 
 @pytest.mark.parametrize("override", REFUSED)
-def test_an_error_of_set_blames_set_alone(override):
+def test_error_in_set_names_only_set(override):
     with pytest.raises(OverrideError) as error:
         load("smoke", ["optimize.log_every=5", override, "init.count=9"])
     message = str(error.value)
@@ -98,7 +98,7 @@ def test_an_error_of_set_blames_set_alone(override):
     assert "\n" not in message
 
 
-def test_a_place_has_no_thousand_parts():
+def test_too_deep_key_is_refused():
     with pytest.raises(OverrideError, match=r"expected KEY=VALUE"):
         load("smoke", ["optimize." + "x." * 1000 + "y=1"])
 
@@ -110,7 +110,7 @@ def test_long_values_are_shortened():
         assert len(str(error.value)) < 1000
 
 
-def test_stages_of_one_name_are_told_apart_by_number():
+def test_stages_of_equal_name_are_numbered():
     with pytest.raises(
         OverrideError, match=r"3 stages are named 'densify'; use stages\.1\.during\.1 or stages\.1"
     ) as error:
@@ -120,7 +120,7 @@ def test_stages_of_one_name_are_told_apart_by_number():
         load("micro_splatting_v2", [f"{place}.every=3"])
 
 
-def test_a_fault_of_the_file_is_the_files_whatever_is_set(tmp_path):
+def test_error_in_the_file_names_the_file_despite_set(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init: {cuont: 3}\n")
     with pytest.raises(ConfigError, match=r"x.yaml:3: stages\[0\].init.cuont: unknown key 'cuont'"):
@@ -145,7 +145,7 @@ def test_bare_names_in_a_file_can_be_changed_below(tmp_path):
     assert load(str(path), ["optimize.views.order.type=shuffle"]).settings.training.views.order.type == "shuffle"
 
 
-def test_a_value_may_have_the_notation_of_files():
+def test_value_may_use_file_notation():
     during = load("smoke", ["optimize.during=[{checkpoint: {every: 3}}, raise_sh]", "raise_sh.every=4"])
     assert [(stage.stage, stage.every) for stage in during.settings.training.during] == [
         ("checkpoint", 3),

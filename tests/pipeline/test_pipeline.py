@@ -88,7 +88,7 @@ def kinds_of(node: object) -> set[str]:
     return named.union({str(node["stage"])} if "stage" in node else set(), *map(kinds_of, node.values()))
 
 
-def test_the_recipes_that_stand_for_all_have_all_kinds():
+def test_representative_recipes_cover_all_kinds():
     kinds = {name: kinds_of(shipped(name).settings.model_dump(mode="json")) for name in SHIPPED}
     trained = [found for found in kinds.values() if "optimize" in found]
     assert set().union(*trained) - set().union(*(kinds[name] for name in KINDS)) == set()
@@ -262,7 +262,7 @@ DIFFERENCES = {
 }
 
 
-def test_recipes_differ_only_where_their_headers_say():
+def test_recipes_differ_only_as_their_headers_state():
     found = {pair: changes(*pair) for pair in DIFFERENCES}
     faults = [
         f"{base}-{recipe}: {sorted(places ^ DIFFERENCES[base, recipe])}"
@@ -282,7 +282,7 @@ short:
 """
 
 
-def test_a_short_pipeline_is_its_file_with_the_values_of_short(write, tmp_path):
+def test_short_pipeline_applies_the_short_values(write, tmp_path):
     (tmp_path / "small.yaml").write_text(f"# Small.\n{SMALL}{SHORT}")
     short = str(tmp_path / "small_7k.yaml")
     values = ("steps=5", "losses.1.weight=0.1", "during.0.every=2", "during.1.every=3")
@@ -303,13 +303,13 @@ def test_a_short_pipeline_is_its_file_with_the_values_of_short(write, tmp_path):
         ("short: [1]\n", r"expected a map 'short', with values of small_7k.yaml"),
     ],
 )
-def test_a_short_pipeline_is_refused_with_its_place(tmp_path, short, words):
+def test_invalid_short_value_is_refused_with_its_location(tmp_path, short, words):
     (tmp_path / "small.yaml").write_text(SMALL + short)
     with pytest.raises(ConfigError, match=words):
         load(str(tmp_path / "small_7k.yaml"))
 
 
-def test_values_of_short_are_at_the_places_of_set():
+def test_short_keys_are_set_keys():
     full = {name: read_yaml(path).data.get("short") for name, path in files.shipped().items()}
     for name, values in full.items():
         given = [f"{place}={json.dumps(value)}" for place, value in (values or {}).items()]
@@ -433,14 +433,14 @@ def test_overrides(write):
     assert pipeline.settings.seed == 3
 
 
-def test_unknown_pipelines_name_the_nearest():
+def test_unknown_pipeline_suggests_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'splat'"):
         load("splatt")
     with pytest.raises(ConfigError, match="no such pipeline file"):
         load("nowhere.yaml")
 
 
-def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
+def test_folder_does_not_hide_a_pipeline(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "splat").mkdir()
     assert load("splat").settings.name == "splat"
@@ -452,7 +452,7 @@ def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "\udcff"])
-def test_names_that_no_file_can_have_are_refused(name):
+def test_impossible_file_names_are_refused(name):
     with pytest.raises(ConfigError):
         load(name)
 

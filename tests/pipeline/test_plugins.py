@@ -82,14 +82,14 @@ def test_shipped_pipelines_name_no_plugin():
     assert "plugins" not in load("splat").resolved()
 
 
-def test_the_schema_knows_plugins(tmp_path):
+def test_schema_includes_plugins(tmp_path):
     from clsplat.pipeline.recipes import json_schema
 
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "Nothing" in json_schema()["$defs"]
 
 
-def test_the_hash_covers_kernels_and_the_headers_that_they_name(tmp_path):
+def test_hash_covers_kernels_and_their_headers(tmp_path):
     path = write(tmp_path, "mine", "KERNELS = 'other.cl'\n")
     (tmp_path / "other.cl").write_text('#include "own.h"\n')
     (tmp_path / "own.h").write_text("#define A 1\n")
@@ -110,7 +110,7 @@ def test_the_hash_covers_kernels_and_the_headers_that_they_name(tmp_path):
         (RULE.format(name="clone"), r"two variants of \w+ have the name 'clone'"),
     ],
 )
-def test_a_plugin_that_fails_is_one_line_and_leaves_nothing(tmp_path, text, message):
+def test_failing_plugin_is_one_line_and_registers_nothing(tmp_path, text, message):
     before = list(Settings.defined)
     with pytest.raises(ConfigError, match=message) as error:
         plugins.load_file(write(tmp_path, "bad", text))
@@ -128,7 +128,7 @@ def test_a_plugin_that_fails_is_one_line_and_leaves_nothing(tmp_path, text, mess
         ("type: Literal['mine'] = 'mine'", "class Mine: lacks mark"),
     ],
 )
-def test_a_class_that_no_pipeline_can_name_is_refused(tmp_path, body, fault):
+def test_unnameable_class_is_refused(tmp_path, body, fault):
     head = "from typing import Literal\nfrom clsplat.density.edit import Rule\nclass Mine(Rule):\n    "
     with pytest.raises(ConfigError, match=fault):
         plugins.load_file(write(tmp_path, "mine", head + body + "\n"))
@@ -148,13 +148,13 @@ def test_an_exception_of_a_plugin_names_its_file_and_line(tmp_path):
     assert found.exit_code == 2
 
 
-def test_what_a_plugin_prints_is_no_result(tmp_path, capsys):
+def test_plugin_output_does_not_reach_stdout(tmp_path, capsys):
     plugins.load_file(write(tmp_path, "printer", "print('hello')\n"))
     out, err = capsys.readouterr()
     assert (out, err) == ("", "hello\n")
 
 
-def test_a_missing_file_and_a_taken_name_are_refused(tmp_path):
+def test_missing_file_and_duplicate_name_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         plugins.load_file(tmp_path / "nothing.py")
     (tmp_path / "a").mkdir()
@@ -255,7 +255,7 @@ def test_an_installed_reader_is_recorded_always(install):
 
 
 @pytest.mark.parametrize(("text", "reason"), [("\n1 / 0", "ZeroDivisionError"), ("\nx = (", "SyntaxError")])
-def test_the_failure_of_an_installed_plugin_names_file_and_line(install, text, reason):
+def test_installed_plugin_error_names_file_and_line(install, text, reason):
     install({"my/__init__.py": "", "my/register.py": "import my.rules", "my/rules.py": text}, first="my.register")
     with pytest.raises(ConfigError, match=rf"/my/rules\.py:2: importing the plug-in failed: {reason}: "):
         plugins.load_installed()
@@ -301,7 +301,7 @@ def test_the_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monke
         (READER.format(name="COLMAP"), r"bad\.py: two readers have the name 'COLMAP'"),
     ],
 )
-def test_a_plugin_that_fails_leaves_no_reader_and_no_module(tmp_path, text, message):
+def test_failing_plugin_leaves_no_reader_and_no_module(tmp_path, text, message):
     before = [type(reader) for reader in readers()]
     with pytest.raises(ConfigError, match=message):
         plugins.load_file(write(tmp_path, "bad", text))
@@ -309,7 +309,7 @@ def test_a_plugin_that_fails_leaves_no_reader_and_no_module(tmp_path, text, mess
     assert "clsplat_plugin_bad" not in sys.modules
 
 
-def test_a_taken_name_is_found_in_the_first_call_of_a_process(tmp_path):
+def test_duplicate_name_is_detected_in_the_first_call(tmp_path):
     file = write(tmp_path, "bad", RULE.format(name="clone"))
     code = f"""
 import clsplat
@@ -351,7 +351,7 @@ def with_imports_of_the_package(text: str) -> str:
     return text.replace(found[0], "".join(lines))
 
 
-def test_the_bits_are_those_of_the_same_code_inside_the_package(tiny_scene, tmp_path):
+def test_plugin_gives_the_bits_of_built_in_code(tiny_scene, tmp_path):
     """A copy of the package with the examples among its modules runs in a process of its own; the plug-ins here."""
     inside = tmp_path / "inside"
     shutil.copytree(EXAMPLES.parent / "clsplat", inside / "clsplat", ignore=shutil.ignore_patterns("__pycache__"))
@@ -377,7 +377,7 @@ def test_the_bits_are_those_of_the_same_code_inside_the_package(tiny_scene, tmp_
         assert (without.out / "point_cloud.ply").read_bytes() != within, f"{name} changes nothing"
 
 
-def test_a_run_with_a_plugin_is_used_only_with_it(tiny_scene, tmp_path):
+def test_run_with_a_plugin_needs_the_plugin(tiny_scene, tmp_path):
     plugin, out = EXAMPLES / "opacity_entropy.py", tmp_path / "run"
     sets = ["--set", "optimize.losses=[l1, opacity_entropy]", "optimize.steps=4"]
     clsplat("--plugin", plugin, "run", "smoke", "--scene", tiny_scene, "--out", out, *sets)
@@ -389,7 +389,7 @@ def test_a_run_with_a_plugin_is_used_only_with_it(tiny_scene, tmp_path):
         assert status["state"] == "done", "a refused command leaves the run as it was"
 
 
-def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
+def test_comparison_lists_missing_plugins(tiny_scene, tmp_path, caplog):
     from clsplat.sweeps.compare.page import write_comparison
 
     plugins.load_file(EXAMPLES / "opacity_entropy.py")
@@ -431,7 +431,7 @@ def test_examples_and_docs_import_only_the_public_module():
     assert (faults, dotted) == ({}, set())
 
 
-def test_the_public_module_lists_all_that_it_imports():
+def test_public_module_exports_all_imports():
     from clsplat import plugin
 
     node = ast.parse(Path(plugin.__file__).read_text("utf-8"))

@@ -96,7 +96,7 @@ MICRO = [
 
 
 @pytest.mark.parametrize("name", [*FAMILIES, "auto", "steep"])
-def test_each_takes_the_filters_and_the_losses_of_others(name):
+def test_recipes_accept_filters_and_losses_of_others(name):
     """Each pair is checked as a whole; the pixel's box has no conic, which some rules read."""
     for settings in (EWA, MIP, MICRO):
         load(name, settings)
@@ -112,7 +112,7 @@ def test_each_takes_the_filters_and_the_losses_of_others(name):
     [("mcmc_7k", EWA, 0.3), ("steep_7k", MIP, 0.1), ("mini_7k", MICRO, 0.3)],
     ids=["mcmc with ewa", "steep with mip", "mini with micro"],
 )
-def test_three_of_them_train(name, settings, variance, tiny_scene, tmp_path, with_one_thread):
+def test_three_recipes_train(name, settings, variance, tiny_scene, tmp_path, with_one_thread):
     own = digest(with_one_thread / name)
     assert train(short(name, tiny_scene, *settings), tmp_path / "both") != own
     rendering = load_model(tmp_path / "both").rendering

@@ -26,7 +26,7 @@ def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
     return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
 
 
-def test_the_long_recipe_in_fewer_steps_is_the_short_one():
+def test_stretched_long_recipe_equals_the_short_one():
     """But for the cadence and the end of growth, which splat_7k chooses."""
     new = stretched(load("splat").settings, 7000 / 30000).training
     assert (new.steps, new.rates.means.over) == (7000, 7000)
@@ -61,7 +61,7 @@ def test_only_steps_change_and_all_of_them(name):
     ("name", "factor"),
     list(zip(SCHEDULED[1:], cycle((0.0371, 0.617, 1.9)), strict=False)),  # without smoke, which has few steps as it is
 )
-def test_what_ends_acts_as_often(name, factor):
+def test_stages_that_end_act_equally_often(name, factor):
     settings = load(name).settings
     old, new = settings.training, stretched(settings, factor).training
     for before, after in zip(old.during, new.during, strict=True):
@@ -74,14 +74,14 @@ def test_what_ends_acts_as_often(name, factor):
         assert counts[0] == counts[1], before
 
 
-def test_per_step_acts_end_at_the_same_share_of_training():
+def test_per_step_stages_end_at_the_same_fraction():
     new = in_steps(load("mcmc_7k").settings, 2000).training
     (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
     assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
 
 
 @pytest.mark.parametrize(("name", "steps"), [("fast", 1), ("blocks", 2000), ("splat", 7001)])
-def test_a_recipe_has_the_steps_that_were_asked_for(name, steps):
+def test_recipe_has_the_requested_steps(name, steps):
     assert in_steps(load(name).settings, steps).training.steps == steps
 
 
@@ -101,7 +101,7 @@ def checked_again(name: str, settings: PipelineFile, folder: Path) -> Pipeline:
 
 
 @pytest.mark.parametrize("steps", [340, 5000])
-def test_stretched_average_begins_at_the_same_share_of_training(tmp_path, steps):
+def test_stretched_average_starts_at_the_same_fraction(tmp_path, steps):
     settings = load("fast").settings
     new = checked_again("fast", in_steps(settings, steps), tmp_path).settings.training
     assert new == in_steps(settings, steps).training
@@ -117,7 +117,7 @@ def test_stretched_average_begins_at_the_same_share_of_training(tmp_path, steps)
         *(("splat_7k", 1700, 2), ("splat_7k", 2500, 50), ("splat_7k", 900, 900), ("splat_7k", 2500, 9000)),
     ],
 )
-def test_corrected_step_count_keeps_what_comes_later(tmp_path, name, done, left):
+def test_corrected_step_count_keeps_later_stages(tmp_path, name, done, left):
     """And what was done: a stage that had begun acts at the same steps."""
     settings = load(name).settings
     new = checked_again(name, with_steps(settings, done + left, done), tmp_path).settings.training
@@ -139,11 +139,11 @@ def test_corrected_count_is_after_growth_and_small_photographs(name):
     assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
 
 
-def test_training_by_detail_is_not_cut_before_the_full_size():
+def test_detail_schedule_is_not_cut_before_full_size():
     assert last_edit(load("dash_7k").settings.training) == 6300
 
 
-def test_rate_of_what_learns_in_n_updates_falls_as_much():
+def test_rate_of_modules_scales_with_their_updates():
     (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.modules
     (short,) = load("auto_opti3dgs_7k").settings.training.modules
     assert haar.rate == pytest.approx(1e-4 * 30 / 7)
@@ -152,13 +152,13 @@ def test_rate_of_what_learns_in_n_updates_falls_as_much():
     assert points.rate == [[0, 2e-3], [50, 2e-4]]
 
 
-def test_never_stays_a_number_that_a_file_holds():
+def test_never_is_a_number_that_yaml_can_store():
     never = load("splat_7k", [f"densify.stop={2**63 - 1}"]).settings
     assert stretched(never, 3.0).training.during[1].stop == 2**63 - 1
     assert stretched(load("splat_7k", ["densify.every=9e18"]).settings, 3.0).training.during[1].every == 2**63 - 1
 
 
-def test_points_that_fall_together_become_one():
+def test_coinciding_schedule_points_merge():
     class Holder(Settings):
         values: list[list[float]]
 

@@ -45,7 +45,7 @@ REFUSED = {  # text: (line, words)
 
 
 @pytest.mark.parametrize("text", REFUSED, ids=[text[:30] for text in REFUSED])
-def test_what_is_no_plain_data_is_refused_with_its_line(text, tmp_path):
+def test_non_plain_data_is_refused_with_its_line(text, tmp_path):
     line, words = REFUSED[text]
     path = tmp_path / "x.yaml"
     path.write_text(text)
@@ -58,7 +58,7 @@ def test_what_is_no_plain_data_is_refused_with_its_line(text, tmp_path):
     assert len(message) < len(str(path)) + 300
 
 
-def test_bytes_that_are_no_text_are_refused_with_their_line(tmp_path):
+def test_invalid_utf8_is_refused_with_its_line(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes(b"name: x\nscene: {path: caf\xe9}\n")
     with pytest.raises(ConfigError, match=r"x.yaml:2: expected UTF-8 text, found the byte 0xe9"):
@@ -81,12 +81,12 @@ def test_anchors_aliases_and_merge_keys_are_plain_data(tmp_path):
     assert document.line(("b", "x")) == 4
 
 
-def test_an_anchor_that_is_used_twice_is_no_warning(recwarn):
+def test_reused_anchor_gives_no_warning(recwarn):
     assert parse_value("[&a 1, &a 2, *a]") == [1, 2, 2]
     assert not recwarn.list
 
 
-def test_what_is_nested_is_given_up_before_the_rest_is_read(monkeypatch):
+def test_deep_nesting_is_refused_early(monkeypatch):
     """The time of the parser grows with the square of the depth."""
     composed = []
     monkeypatch.setattr(Composer, "compose_node", counted(Composer.compose_node, composed))
@@ -103,7 +103,7 @@ def counted(function: Callable[..., object], calls: list[int]) -> Callable[..., 
     return call
 
 
-def test_dates_and_standard_tags_are_what_they_say():
+def test_dates_and_standard_tags_are_parsed():
     values = {"2024-01-01": "2024-01-01", "!!str 5": "5", "!!float 5": 5.0, "=": "=", "": None, "12:30": "12:30"}
     for text, value in values.items():
         assert parse_value(text) == value
@@ -120,7 +120,7 @@ def complaint(read: Callable[[str], object], text: str) -> str:
 
 
 @given(st.text(alphabet="ab1: -[]{},#&*!|>'\"%@`?~<=.\n\t\0é\ud800", max_size=60))
-def test_any_text_is_data_or_one_sentence(text):
+def test_any_text_is_data_or_one_error_sentence(text):
     assert "\n" not in complaint(parse_value, text)
 
 
@@ -131,7 +131,7 @@ SMOKE = resource_dir("pipelines").joinpath("smoke.yaml").read_text()
     st.integers(0, len(SMOKE)),
     st.sampled_from(["!!set ", "&a ", "*a", "? ", ": ", "[", "}", "- ", "\0", "1: 2\n", "<<: "]),
 )
-def test_a_pipeline_with_something_put_in_is_valid_or_refused(tmp_path_factory, place, what):
+def test_pipeline_with_an_insertion_is_valid_or_refused(tmp_path_factory, place, what):
     path = tmp_path_factory.getbasetemp() / "fuzzed.yaml"
     path.write_text(SMOKE[:place] + what + SMOKE[place:])
     message = complaint(load, str(path))

@@ -41,7 +41,7 @@ def results(device, case, weights, budget=None, sort="radix", rasterizer=None):
         ["radix", "bitonic"],
     ),
 )
-def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands, sort):
+def test_bands_give_the_same_image_and_pixel_sums(device, rng, budget, bands, sort):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5  # some over many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
@@ -56,7 +56,7 @@ def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands
 
 
 @on_one_setting
-def test_nothing_in_a_band(device, rng):
+def test_empty_band(device, rng):
     case = random_case(rng, 0, 40, 64)
     image, _, _ = results(device, case, 0.0, RenderLimits(1, 2))
     np.testing.assert_allclose(image[:, :64, :40], np.broadcast_to([[[0.2]], [[0.5]], [[0.9]]], (3, 64, 40)), rtol=1e-6)
@@ -95,7 +95,7 @@ def test_records_may_fill_the_largest_buffer(device, rng):
 
 
 @on_devices("refused", ["pair_sums", "pair_tile", "tile_pairs", "tile_values0"])
-def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monkeypatch, refused):
+def test_refused_memory_leads_to_bands_with_the_same_bits(device, rng, monkeypatch, refused):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
@@ -118,7 +118,7 @@ def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monke
 
 
 @on_one_setting
-def test_memory_that_a_runtime_refuses_at_a_copy_leads_to_bands(device, rng, monkeypatch):
+def test_memory_refused_at_a_copy_leads_to_bands(device, rng, monkeypatch):
     """Some take it at the first use."""
     case, copy, refused = random_case(rng, 300, 60, 70), cl.enqueue_copy, []
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
@@ -139,7 +139,7 @@ def test_memory_that_a_runtime_refuses_at_a_copy_leads_to_bands(device, rng, mon
 
 
 @on_one_setting
-def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):
+def test_memory_below_one_row_of_tiles_is_refused(device, rng):
     small = limited(device, 300 * 64)
     with pytest.raises(MemoryLimitError):
         results(small, random_case(rng, 301, 60, 70), 0.0)
@@ -149,7 +149,7 @@ def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):
     "counts, sort",
     each_once([[2**31, 2**31, 5], [2**31, 5, 2**31], [MAX_PAIRS + 1], [2**24] * 300], ["radix", "bitonic"]),
 )
-def test_more_pairs_than_32_bits_count_are_too_many(device, sort, counts):
+def test_pair_count_beyond_32_bits_is_refused(device, sort, counts):
     counts = np.array(counts, np.uint32)
     nothing = np.zeros_like(counts)
     footprints = Footprints(device.upload(nothing), device.upload(counts), *map(device.upload, (nothing, nothing)))

@@ -36,7 +36,7 @@ def test_few_splats(device, rng, count):
     compare(device, random_case(rng, count))
 
 
-def test_no_splat_shows_the_background(device, rng):
+def test_empty_frame_shows_the_background(device, rng):
     image, transmittance = render(device, random_case(rng, 0))
     assert (image == BACKGROUND[:, None, None]).all()
     assert (transmittance == 1).all()

@@ -30,7 +30,7 @@ def boxed(rng: np.random.Generator, count: int = 50) -> Model:
     return Model(**splats(rng, count).parameters, rendering=Rendering(0.05, 1 / 12, 1.0, "white", pixel_box=1.0))
 
 
-def test_it_has_no_number_that_could_be_changed():
+def test_box_filter_has_no_settings():
     settings = load_pipeline("splat_7k", [BOX]).settings.model
     assert settings.screen_filter.pixel_box
     assert settings.screen_filter.variance == 1 / 12
@@ -38,7 +38,7 @@ def test_it_has_no_number_that_could_be_changed():
         load_pipeline("splat_7k", ["model.screen_filter.type=box"])
 
 
-def test_the_resolved_file_says_it_again(tmp_path):
+def test_resolved_file_names_the_box_filter(tmp_path):
     pipeline = load_pipeline("box_7k")
     (tmp_path / "again.yaml").write_text(pipeline.text())
     assert load_pipeline(tmp_path / "again.yaml").settings.model == pipeline.settings.model
@@ -51,7 +51,7 @@ def test_a_rule_that_reads_conics_is_refused(name, rule):
         load_pipeline(name, [BOX])
 
 
-def test_every_statistic_whose_kernel_reads_conics_says_so():
+def test_statistics_declare_that_they_read_conics():
     reading = {
         name
         for path in resource_dir("cl_kernels").glob("*.cl")
@@ -65,7 +65,7 @@ def test_every_statistic_whose_kernel_reads_conics_says_so():
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.sog", "a.glb"])
-def test_files_with_numbers_keep_it(name, rng, tmp_path, caplog):
+def test_formats_with_settings_keep_the_box_filter(name, rng, tmp_path, caplog):
     boxed(rng).save(tmp_path / name)
     found = load(tmp_path / name).rendering
     assert (found.pixel_box, found.compensate, found.screen_variance) == (1.0, 1.0, 1 / 12)
@@ -74,17 +74,17 @@ def test_files_with_numbers_keep_it(name, rng, tmp_path, caplog):
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.usda"])
-def test_other_files_say_that_it_is_lost(name, rng, tmp_path, caplog):
+def test_other_formats_report_the_lost_box_filter(name, rng, tmp_path, caplog):
     boxed(rng).save(tmp_path / name)
     assert "pixel_box = 1.0" in caplog.text
 
 
-def test_files_of_other_models_do_not_name_it(rng, tmp_path):
+def test_files_of_other_models_do_not_name_the_box_filter(rng, tmp_path):
     replace(boxed(rng), rendering=Rendering(0.05, 0.1, 1.0)).save(tmp_path / "a.ply")
     assert b"pixel_box" not in (tmp_path / "a.ply").read_bytes()[:2000]
 
 
-def test_a_wrong_number_in_a_file_is_refused(rng, tmp_path):
+def test_invalid_filter_in_a_file_is_refused(rng, tmp_path):
     numbers = {"near": 0.2, "pixel_box": -1}
     write(tmp_path / "a.ply", replace(splats(rng, 5), rendering={"near": 0.2}))
     data = (tmp_path / "a.ply").read_bytes().replace(b'{"near": 0.2}', json.dumps(numbers).encode())
@@ -93,14 +93,14 @@ def test_a_wrong_number_in_a_file_is_refused(rng, tmp_path):
         load(tmp_path / "a.ply")
 
 
-def test_it_is_not_merged_with_another(rng, tmp_path):
+def test_box_model_is_not_merged_with_another(rng, tmp_path):
     boxed(rng).save(tmp_path / "a.ply")
     replace(boxed(rng), rendering=Rendering(0.05, 0.1, 1.0)).save(tmp_path / "b.ply")
     with pytest.raises(DataError, match=r"is a mip model, but .*a.ply is a model with a pixel box filter; merge"):
         clsplat.convert([tmp_path / "a.ply", tmp_path / "b.ply"], tmp_path / "c.ply")
 
 
-def test_check_and_the_page_of_the_viewer_name_it(rng, tmp_path):
+def test_check_and_viewer_page_name_the_box_filter(rng, tmp_path):
     boxed(rng).save(tmp_path / "a.ply")
     assert examine(tmp_path / "a.ply")["mode"] == "box"
     header = pack(boxed(rng)).header
@@ -111,7 +111,7 @@ def test_check_and_the_page_of_the_viewer_name_it(rng, tmp_path):
     assert "pixel box, drawn here as a blur of 0.0833333 px², normalized" in text
 
 
-def test_a_model_that_is_read_again_draws_as_the_run_did(tiny_scene, tmp_path):
+def test_reloaded_model_renders_like_the_run(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", "optimize.steps=12", pipeline="box_7k")
     told = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]["1"]["psnr"]
     again = clsplat.evaluate(tmp_path / "run" / "point_cloud.ply", scene=tiny_scene)

@@ -53,7 +53,7 @@ def finished(tiny_scene: Path, pipeline: str, tmp_path_factory: pytest.TempPathF
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "mip", *MIP, *LEVELS, pipeline=pipeline)
 
 
-def test_the_filter_follows_and_then_stays(finished):
+def test_filter_is_refreshed_and_then_frozen(finished):
     """At the end it is what the last refresh, before step 47, made of the means of then."""
     gaussians = finished.model.gaussians
     frozen = gaussians.get("filter_variance")
@@ -65,7 +65,7 @@ def test_the_filter_follows_and_then_stays(finished):
     np.testing.assert_allclose(now, frozen, rtol=0.05)
 
 
-def test_the_same_bits_and_the_same_after_an_interruption(finished, tiny_scene, pipeline, tmp_path):
+def test_run_repeats_and_resumes_bit_for_bit(finished, tiny_scene, pipeline, tmp_path):
     """Stopped just after a density edit and just after a refresh."""
     checked = load(pipeline, [f"scene.path='{tiny_scene}'", *MIP, *LEVELS])
     stops = [21, 33]
@@ -98,7 +98,7 @@ def test_metrics_of_every_scale(finished):
         assert np.mean(list(views.values())) == pytest.approx(metrics["test"][downscale]["psnr"])
 
 
-def test_training_saw_every_level(finished):
+def test_training_uses_every_level(finished):
     assert finished.scene.downscales == (1, 2, 4)
     sampler = Sampler(finished.scene.split("train"), ViewSettings(order=StackOrder()), finished.seed)
     assert {sampler.at(step).view.downscale for step in range(1, 51)} == {1, 2, 4}
@@ -113,7 +113,7 @@ def test_zooming_in(tiny_scene, tmp_path):
     assert default.metrics["test"] == {"4": run.metrics["test"]["4"]}
 
 
-def test_both_files_are_marked(finished):
+def test_both_files_have_the_mip_mark(finished):
     raw, fused = (read_ply(finished.out / name) for name in (RAW, "point_cloud.ply"))
     assert raw.mode == fused.mode == "mip"
     assert b"\ncomment SplatRenderMode: mip\n" in (finished.out / "point_cloud.ply").read_bytes()[:2000]
@@ -127,7 +127,7 @@ def test_both_files_are_marked(finished):
 
 
 @pytest.mark.parametrize("name", [RAW, "point_cloud.ply"])
-def test_files_render_as_the_run_does(finished, tiny_scene, name):
+def test_files_render_like_the_run(finished, tiny_scene, name):
     """To rounding: floats differ by less than 2e-5, but for a pixel now and then that rounding moves across 1/255."""
     opened = ModelFile(finished.out / name, tiny_scene, None)
     for view in finished.scene.downscaled(1).split("test"):
@@ -177,7 +177,7 @@ def test_baking_is_the_filter(rng):
     np.testing.assert_array_equal(fused["log_scales"][0], parameters["log_scales"][0])
 
 
-def test_without_a_world_filter_there_is_one_file(tiny_scene, tmp_path):
+def test_run_without_a_world_filter_writes_one_file(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path, "optimize.steps=3", "model.screen_filter.type=ewa")
     assert not (tmp_path / RAW).exists()
     assert read_ply(tmp_path / "point_cloud.ply").mode == "mip", "opacities keep the energy of the screen filter"

@@ -66,7 +66,7 @@ def test_a_shared_focal_length_makes_both_definitions_equal(device, rng):
     assert len(np.unique(of_each)) > 20
 
 
-def test_who_is_not_seen_takes_the_largest(device, rng):
+def test_invisible_gaussians_get_the_largest_variance(device, rng):
     case = random_case(rng, 40)
     means = case.parameters["means"]
     means[3] = -50 * case.view.world_to_camera[2, :3]  # behind the camera

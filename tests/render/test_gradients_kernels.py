@@ -64,7 +64,7 @@ def _faint(parameters: dict[str, np.ndarray]) -> None:
 
 
 @on_devices("count", [255, 256, 257, 512, 513])
-def test_tiles_whose_lists_end_where_a_batch_does(device, rng, count):
+def test_tile_lists_that_end_at_a_batch_boundary(device, rng, count):
     case = safe_case(rng, count, 14, 14, change=_faint)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
     values, frame, _ = gradients_of(device, case, weights)
@@ -170,7 +170,7 @@ def test_schedules_agree(device, rng):
 
 
 @on_one_setting
-def test_the_same_bits_twice(device, rng):
+def test_gradients_are_reproducible(device, rng):
     case = random_case(rng, 300, 70, 50)
     weights = rng.normal(size=(3, 50, 70)).astype(np.float32)
     first, *_ = gradients_of(device, case, weights)

@@ -29,7 +29,7 @@ def test_sizes_around_the_groups(device, rng, count):
 
 
 @on_one_setting
-def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
+def test_host_and_device_snapshots_render_alike(device, rng):
     case = moving_case(rng, 65, motion_width(3, True))
     model = Model(**case.parameters)
     camera, rasterizer = case.device_camera(device), Rasterizer(device, "radix")
@@ -42,7 +42,7 @@ def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
     np.testing.assert_allclose(drawn.image.get(), moving, atol=2e-5)
 
 
-def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
+def test_image_gradients_reach_the_motion(device, rng):
     """Those of a static model of the moment, carried back in float64, are what the rasterizer returns."""
     case, width = moving_case(rng, 65, motion_width(2, True)), motion_width(2, True)
     camera, rasterizer, p = case.device_camera(device), Rasterizer(device, "radix"), case.parameters
@@ -69,7 +69,7 @@ def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
         np.testing.assert_array_equal(found[name], static[name])
 
 
-def test_what_stands_still_for_ever_has_the_bits_of_none(device, rng):
+def test_static_motion_has_the_bits_of_no_motion(device, rng):
     case = random_case(rng, 65)
     still = np.zeros((65, 5), np.float32)
     still[:, 3], still[:, 4] = rng.uniform(0, 1, 65), STATIC_LOG_DURATION
@@ -87,7 +87,7 @@ def test_what_stands_still_for_ever_has_the_bits_of_none(device, rng):
 
 
 @on_one_setting
-def test_what_is_not_there_counts_as_not_seen(device, rng):
+def test_absent_gaussians_are_invisible(device, rng):
     case = moving_case(rng, 65)
     frame = Rasterizer(device, "radix").forward(case.model(device), case.device_camera(device), device.zeros(3))
     absent = np.zeros(65, bool)
@@ -96,7 +96,7 @@ def test_what_is_not_there_counts_as_not_seen(device, rng):
     assert (frame.radius.get()[:65][~absent] > 0).mean() > 0.5
 
 
-def test_splitting_matrices_are_those_of_the_moment(device, rng):
+def test_splitting_matrices_belong_to_the_time_of_the_view(device, rng):
     case = moving_case(rng, 65, motion_width(3, True))
     camera, background = case.device_camera(device), device.zeros(3)
     weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))

@@ -41,7 +41,7 @@ def test_large_values_that_fit_are_shown(work, rng, tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("work", WORK)
-def test_a_model_that_is_not_finite_is_no_data(work, rng, tiny_scene, tmp_path):
+def test_nonfinite_model_is_a_data_error(work, rng, tiny_scene, tmp_path):
     file = save(tmp_path / "m.ply", rng, float("nan"))
     with pytest.raises(DataError, match=r"sh_base, sh_rest have values that are not finite"):
         WORK[work](file, tiny_scene, tmp_path / "out")

@@ -65,7 +65,7 @@ BOUNDS = {  # (ratio, degrees) -> error by the norm of the integral, at smaller 
 
 
 @pytest.mark.parametrize(("ratio", "degrees"), BOUNDS)
-def test_the_formula_is_the_integral(rng, ratio, degrees):
+def test_formula_matches_the_integral(rng, ratio, degrees):
     for sigma, bound in zip((0.1, 0.2, 0.3, 0.5, 1.0, 3.0), BOUNDS[ratio, degrees], strict=True):
         v = covariance(sigma, ratio, degrees)
         dx, dy = pixels_around(v, rng)
@@ -75,7 +75,7 @@ def test_the_formula_is_the_integral(rng, ratio, degrees):
         assert np.abs(error).max() <= {0.1: 0.03, 0.2: 0.015, 0.3: 0.006}.get(sigma, 0.004), f"{sigma} px"
 
 
-def test_a_blur_of_a_tenth_is_further_from_the_integral(rng):
+def test_blur_of_a_tenth_is_less_accurate(rng):
     """What the filter is for: Mip-Splatting's blur is off by several percent where splats are small."""
     v = covariance(0.3, 4, 22.5)
     dx, dy = pixels_around(v, rng)
@@ -89,7 +89,7 @@ def test_a_blur_of_a_tenth_is_further_from_the_integral(rng):
 
 
 @pytest.mark.parametrize(("degrees", "sigma"), each_once([0, 20, 70, 110, 160], [0.15, 0.5, 2.0]))
-def test_derivatives_of_the_reference_are_those_of_the_integral(rng, sigma, degrees):
+def test_reference_derivatives_match_the_integral(rng, sigma, degrees):
     """Finite differences of the formula against finite differences of the integral, which the formula only nears."""
     v, step = covariance(sigma, 2.5, degrees), 1e-3 * sigma
     dx, dy = pixels_around(v, rng)
@@ -99,7 +99,7 @@ def test_derivatives_of_the_reference_are_those_of_the_integral(rng, sigma, degr
         assert np.linalg.norm(found - truth) < 0.04 * np.linalg.norm(truth)
 
 
-def test_both_sides_agree_where_the_axes_change_places(rng):
+def test_formula_is_continuous_where_the_axes_swap(rng):
     v = covariance(0.4, 4, 45)
     dx, dy = pixels_around(v, rng)
     by = 1e-9 * np.array([1, 0, -1])
@@ -107,7 +107,7 @@ def test_both_sides_agree_where_the_axes_change_places(rng):
     assert 0 < np.linalg.norm(one - other) < 0.01 * np.linalg.norm(one)
 
 
-def test_gradients_of_the_reference_are_finite_differences(rng):
+def test_reference_gradients_match_finite_differences(rng):
     """Of the whole way from a parameter to the image, with nothing skipped."""
     case = random_case(rng, 3, 16, 12, **BOX)
     weights, black = rng.normal(size=(3, 12, 16)), np.zeros(3)
@@ -170,7 +170,7 @@ def at_45_degrees(rng: np.random.Generator) -> Case:
     return replace(case, parameters=p, view=view)
 
 
-def test_where_the_axes_change_places(device, rng):
+def test_splats_where_the_axes_swap(device, rng):
     """Rounding decides between two lines that agree to 0.5 %."""
     case = at_45_degrees(rng)
     truth = case.project().conic
@@ -179,7 +179,7 @@ def test_where_the_axes_change_places(device, rng):
     assert np.abs(render(device, case).image.get()[:, :32, :32] - expected).max() < 0.01
 
 
-def test_round_splats_at_the_change(device, rng):
+def test_round_splats_where_the_axes_swap(device, rng):
     case = random_case(rng, 40, **BOX)
     case.parameters["log_scales"][:] = case.parameters["log_scales"][:, :1]
     assert_within_bounds(check_record(device, case, "round Gaussians"))

@@ -38,12 +38,12 @@ def test_filters(device, rng, variance, compensate):
 
 
 @on_devices("count, views", each_once(COUNTS, [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1]))
-def test_a_view_leaves_out_what_is_hidden_in_it(device, rng, count, views):
+def test_view_omits_gaussians_hidden_in_it(device, rng, count, views):
     assert_within_bounds(check_hidden(device, random_case(rng, count), rng, views))
 
 
 @on_one_setting
-def test_other_pictures_leave_out_nothing(device, rng):
+def test_other_renders_omit_nothing(device, rng):
     case = random_case(rng, 40)
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device)
@@ -56,7 +56,7 @@ def test_other_pictures_leave_out_nothing(device, rng):
 
 
 @on_one_setting
-def test_bands_leave_out_the_same(device, rng):
+def test_bands_omit_the_same_gaussians(device, rng):
     """A frame in several bands is projected again by the backward pass."""
     case = random_case(rng, 60, 70, 50)
     model, camera = case.model(device), replace(case.device_camera(device), view=1)
@@ -80,7 +80,7 @@ def test_nothing_to_project(device, rng):
 
 
 @on_one_setting
-def test_what_cannot_be_drawn_is_culled(device, rng):
+def test_degenerate_gaussians_are_culled(device, rng):
     case = not_drawable(rng)
     records, keys, radius = splats_of(device, case)
     for n in (0, 1, 2, 3, 4, 5, 7, 8):

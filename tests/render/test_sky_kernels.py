@@ -29,7 +29,7 @@ def test_picture_and_derivatives(device, rng, width, height, side):
 
 
 @on_devices("width, height, side", SIZES)
-def test_what_covers_the_sky(device, rng, width, height, side):
+def test_cover_of_the_sky(device, rng, width, height, side):
     assert_within_bounds(check_cover(device, rng, width, height, side))
 
 
@@ -67,7 +67,7 @@ def numeric(scene: Scene, array, place: tuple[int, int], step: float) -> float:
 
 
 @on_devices("share", [None, 0.7])
-def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
+def test_sky_gradient_matches_the_losses(device, rng, share):
     scene = Scene(device, rng, EnvironmentMap(side=8, cover=0), share)
     view = scene.trainer.compare(scene.photograph, 1)
     view = scene.trainer.backward(view)
@@ -81,7 +81,7 @@ def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
 
 
 @on_one_setting
-def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
+def test_masked_pixels_need_not_show_the_sky(device, rng):
     scene = Scene(device, rng, EnvironmentMap(side=8, cover=0.5, difference=0.5), 0.7)
     view = scene.trainer.compare(scene.photograph, 1)
     behind, mask = view.step.transmittance_gradient.get(), view.comparison.mask.get()
@@ -90,7 +90,7 @@ def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
     assert np.abs(behind[mask == 0]).max() == 0
 
 
-def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
+def test_opacity_gradient_includes_the_cover(device, rng):
     """By finite differences, with the pixels that show the sky and those that do not left as they are."""
     scene = Scene(device, rng, EnvironmentMap(side=8, cover=0.5, difference=0.5))
     gaussians, rasterizer = scene.model.gaussians, scene.trainer.rasterizer
@@ -106,7 +106,7 @@ def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
 
 
 @on_one_setting
-def test_runs_of_pixels_are_kept_within_a_budget(device, rng):
+def test_pixel_runs_are_cached_within_a_budget(device, rng):
     scene = Scene(device, rng, EnvironmentMap(side=8))
     camera, workspace = scene.photograph.camera, scene.trainer.rasterizer.workspace
     skies = Skies(device, workspace, cache_size=1)

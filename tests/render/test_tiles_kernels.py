@@ -137,7 +137,7 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
 
 
 @on_devices("rounds", ["(touched[lane] && (row + column + lane) % 3 != 1)", "1"])
-def test_listing_may_find_other_tiles_than_counting(device, rng, monkeypatch, rounds):
+def test_listing_and_counting_may_disagree(device, rng, monkeypatch, rounds):
     """As where a compiler rounds differently there: every place has one writer, and a tile of its own in the image."""
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:8] += 2.5
@@ -160,7 +160,7 @@ def test_listing_may_find_other_tiles_than_counting(device, rng, monkeypatch, ro
 
 
 @on_devices("surplus, sort", product([-1, 1], ["radix", "bitonic"]))
-def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, monkeypatch, sort, surplus):
+def test_miscounted_large_splat_is_blended_once(device, rng, monkeypatch, sort, surplus):
     """It fills its rectangle at the left edge: the surplus place names a tile outside, where it adds nothing."""
     case = random_case(rng, 12, 400, 300)
     pose = case.view.world_to_camera
@@ -253,7 +253,7 @@ def test_scan(device, rng, count):
 
 
 @on_devices("before", [0, 3, 511, pytest.param(70_000, marks=pytest.mark.large)])
-def test_sums_of_a_scan_stay_at_the_largest_number(device, before):
+def test_scan_saturates_at_the_largest_number(device, before):
     """Where sums would wrap they end at 2^32 - 1: in an item, a group, and behind the sums of other groups."""
     values = np.ones(before + 4, np.uint32)
     values[[0, -2, -1]] = 2**31, 2**31 - 3, 5
@@ -269,7 +269,7 @@ def test_radix_is_a_stable_sort(device, rng, count, bits):
 
 
 @on_devices("keys", ["equal", "ascending", "descending"])
-def test_radix_with_orderly_keys(device, keys):
+def test_radix_with_sorted_keys(device, keys):
     count = 3000
     values = {"equal": np.full(count, 7), "descending": np.arange(count)[::-1], "ascending": np.arange(count)}[keys]
     assert_within_bounds(check_radix(device, values.astype(np.uint32), 12))

@@ -34,7 +34,7 @@ def window_mean(image: np.ndarray, reach: int) -> np.ndarray:
 @on_devices(
     "width, height, reach", each_once([(1, 1), (15, 4), (16, 16), (17, 5), (64, 2), (65, 7)], [0, 0.4, 2.6, 80])
 )
-def test_the_box_blur_is_the_mean_of_a_window(device, rng, width, height, reach):
+def test_box_blur_is_the_window_mean(device, rng, width, height, reach):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     transform = variants(PhotographTransform)["box_blur"](reach=reach)
     found = colors_of(transform.apply(planes_of(device, image), step=1))

@@ -36,7 +36,7 @@ def copied() -> list[str]:
     return [path for words in found for path in words[:-1]]
 
 
-def test_containerfile_copies_existing_files_the_wheel_needs():
+def test_containerfile_copies_existing_files_for_the_wheel():
     assert [path for path in copied() if not (ROOT / path).exists()] == []
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     folders = {name.split(".")[0] for name in project["tool"]["setuptools"]["packages"]}
@@ -44,7 +44,7 @@ def test_containerfile_copies_existing_files_the_wheel_needs():
     assert folders | {"pyproject.toml", project["project"]["readme"], "LICENSE"} == set(copied())
 
 
-def test_what_is_copied_is_not_ignored():
+def test_copied_files_are_not_ignored():
     rules = (FILE.parent / f"{FILE.name}.dockerignore").read_text("utf-8").split()
     assert rules[0] == "*"
     kept = [rule[1:] for rule in rules if rule.startswith("!")]
@@ -67,7 +67,7 @@ def test_the_container_runs_without_root_and_leaves_no_lists():
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_systemd_takes_the_service(tmp_path):
+def test_systemd_accepts_the_service(tmp_path):
     unit = tmp_path / "clsplat@lego.service"
     unit.write_text(UNIT.replace("/opt/clsplat/bin/clsplat", sys.executable))
     done = subprocess.run(
@@ -77,7 +77,7 @@ def test_systemd_takes_the_service(tmp_path):
     assert unit.name not in done.stderr
 
 
-def test_the_service_and_the_job_try_again_where_that_can_help():
+def test_service_and_job_retry_only_useful_exit_codes():
     codes = {ClsplatError.exit_code, *(kind.exit_code for kind in ClsplatError.__subclasses__())}
     assert set(NOT_AGAIN) < codes
     assert f"RestartPreventExitStatus={' '.join(map(str, NOT_AGAIN))}\n" in UNIT
@@ -93,7 +93,7 @@ def test_the_service_and_the_job_try_again_where_that_can_help():
         assert row[1].startswith("no") == (code in NOT_AGAIN)
 
 
-def test_the_job_is_a_job_of_this_image():
+def test_job_uses_this_image():
     pod = JOB["spec"]["template"]["spec"]
     (container,) = pod["containers"]
     assert (JOB["apiVersion"], JOB["kind"]) == ("batch/v1", "Job")
@@ -113,7 +113,7 @@ def test_the_job_is_a_job_of_this_image():
         assert "--resume" in arguments
 
 
-def test_the_probe_sees_a_heartbeat_and_its_end(tmp_path):
+def test_probe_detects_a_heartbeat_and_its_end(tmp_path):
     """The command of the job, on a file that was written now, and on one that is ten minutes old."""
     probe = JOB["spec"]["template"]["spec"]["containers"][0]["livenessProbe"]["exec"]["command"]
     file = tmp_path / "status.json"

@@ -81,7 +81,7 @@ def check_manual_and_example(pages, base, kind):
         assert kind.model_validate({"stage": tag(kind), **fields_of(item)}).model_dump(exclude_unset=True)
 
 
-def test_what_a_pipeline_names_has_a_manual_and_a_valid_example():
+def test_every_variant_has_a_manual_and_a_valid_example():
     pages, faults = list(reference_pages().values()), []
     for base, kind in NAMED:
         try:
@@ -91,13 +91,13 @@ def test_what_a_pipeline_names_has_a_manual_and_a_valid_example():
     assert not faults, "\n".join(faults)
 
 
-def test_a_table_of_keys_says_what_each_takes():
+def test_key_table_has_types_and_bounds():
     (split,) = [kind for _, kind in NAMED if tag(kind) == "split"]
     row = next(line for line in key_table(split).splitlines() if line.startswith("| `children` |"))
     assert row.startswith("| `children` | whole number ≥ 2 and ≤ 8 | `2` |")
 
 
-def test_a_table_of_keys_names_schedules_and_their_bounds():
+def test_key_table_has_schedules_and_their_bounds():
     (blur,) = [kind for _, kind in NAMED if tag(kind) == "blur"]
     assert "| `sigma` | [number or schedule](schedules.md) ≥ 0 | required |" in key_table(blur)
     (rule,) = [kind for _, kind in NAMED if tag(kind) == "prune_faint"]
@@ -142,7 +142,7 @@ def test_how_to_pages_are_short_and_have_no_measurements():
         assert not re.findall(r"^\|.*\d dB.*$", text, re.M), f"{name}: measurements belong in docs/results"
 
 
-def test_reasons_for_photos_left_out_are_those_of_the_program():
+def test_documented_skip_reasons_match_the_program():
     section = (
         text_of(ROOT / "docs" / "photographs.md").partition("## When photos are left out")[2].partition("\n## ")[0]
     )
@@ -164,7 +164,7 @@ def test_every_included_file_exists():
     assert [name for name in names if not (ROOT / name).is_file()] == []
 
 
-def test_the_test_of_a_kernel_that_the_pages_show_passes():
+def test_documented_kernel_test_passes():
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "examples/test_opacity_entropy.py"]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert found.returncode == 0, found.stdout
@@ -180,7 +180,7 @@ def test_paths_and_bases_on_pages_exist():
         assert hasattr(importlib.import_module(f"clsplat.{module}"), name), f"clsplat.{module}.{name}"
 
 
-def test_names_of_the_package_on_pages_exist():
+def test_documented_package_names_exist():
     code = [code for _, code in blocks("python")]
     tables = [line for page in PAGES for line in re.findall(r"^\|.*$", text_of(page), re.M)]
     names = {name for text in (*code, *tables) for name in re.findall(r"\bclsplat\.([A-Za-z_]\w*)\(", text)}
@@ -221,7 +221,7 @@ def options(command) -> set[str]:
     return {option for parameter in command.params for option in parameter.opts}
 
 
-def test_links_between_files_of_the_repository_hold():
+def test_links_between_repository_files_are_valid():
     generated = reference_pages() | other_pages()
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text_of(page)):
@@ -234,7 +234,7 @@ def test_the_front_page_is_short():
     assert len(text_of(ROOT / "README.md").splitlines()) < 130
 
 
-def test_the_map_of_folders_is_that_of_the_disk():
+def test_folder_map_matches_the_disk():
     shown = text_of(ROOT / "docs" / "inside.md").partition("```text")[2].partition("```")[0]
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
     files = [Path(name) for name in listed if not name.startswith(".")]
@@ -249,7 +249,7 @@ def test_the_map_of_folders_is_that_of_the_disk():
     assert missing == [], "modules that are not on the map"
 
 
-def test_the_glossary_is_in_order():
+def test_glossary_is_sorted():
     words = re.findall(r"^\*\*(.+?)\*\* —", text_of(ROOT / "docs" / "glossary.md"), re.M)
     assert len(words) >= 20
     assert words == sorted(words)
@@ -275,7 +275,7 @@ def test_names_in_the_glossary_exist(few_steps):
         assert set(entry) <= saved, row
 
 
-def test_all_files_name_the_same_version():
+def test_versions_agree_in_all_files():
     project = tomllib.loads(text_of(ROOT / "pyproject.toml"))["project"]
     citation = YAML(typ="safe").load(text_of(ROOT / "CITATION.cff"))
     assert project["version"] == clsplat.__version__ == str(citation["version"])
@@ -288,7 +288,7 @@ def test_the_changelog_is_short():
     assert len(text_of(ROOT / "CHANGELOG.md").splitlines()) <= 200
 
 
-def test_forms_are_complete():
+def test_issue_forms_are_complete():
     forms = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
     assert len(forms) >= 3
     for form in forms:
@@ -309,7 +309,7 @@ def test_forms_are_complete():
         ("win32", "AMD64", "3.14", True),
     ],
 )
-def test_pycolmap_comes_along_where_it_has_wheels(system, machine, python, wheels):
+def test_pycolmap_is_required_where_it_has_wheels(system, machine, python, wheels):
     project = tomllib.loads(text_of(ROOT / "pyproject.toml"))["project"]
     (needed,) = [one for one in map(Requirement, project["dependencies"]) if one.name == "pycolmap"]
     place = {"sys_platform": system, "platform_machine": machine, "python_version": python}

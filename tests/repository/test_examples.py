@@ -66,7 +66,7 @@ def test_every_example_has_a_test():
             assert path.stem in text, f"{path.name} has no test"
 
 
-def test_the_gradient_of_own_loss_is_that_of_its_value(rng):
+def test_own_loss_gradient_matches_differences(rng):
     edges = runpy.run_path(str(EXAMPLES / "own_loss.py"))["edges"]
     image, photograph, direction = rng.uniform(size=(3, 7, 5, 3))
     _, derivative = edges(image, photograph)
@@ -115,7 +115,7 @@ def test_render_service_answers_with_pictures(tiny_scene, folder):
             service.kill()
 
 
-def test_scene_to_picture_runs_and_shows_what_it_says(tiny_scene, folder):
+def test_scene_to_picture_notebook_runs(tiny_scene, folder):
     """Cells as a notebook takes them: the value of a last line is shown."""
     notebook = json.loads((EXAMPLES / "scene_to_picture.ipynb").read_text())
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
@@ -139,12 +139,12 @@ def test_scene_to_picture_runs_and_shows_what_it_says(tiny_scene, folder):
     assert Path("scene_to_picture.ply").is_file()
 
 
-def test_there_are_python_lines_on_both_pages():
+def test_both_pages_have_python_code():
     assert {page for page, _ in python_lines()} == set(PAGES)
 
 
 @pytest.mark.parametrize(("page", "code"), python_lines(), ids=lambda text: text.partition("\n")[0])
-def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
+def test_documented_python_code_runs(page, code, tiny_scene, folder):
     if "clsplat.torch" in code:
         pytest.importorskip("torch")
     code, scenes = re.subn(r'"data/\w+"', repr(str(tiny_scene)), code)
@@ -171,7 +171,7 @@ def test_growing_resolution_is_a_pipeline():
     assert [resolution.at(step) for step in (1, 499, 500, 999, 1000, 2000)] == [4, 4, 2, 2, 1, 1]
 
 
-def test_growing_resolution_trains_at_the_sizes_that_it_names(tiny_scene, tmp_path):
+def test_growing_resolution_trains_at_its_sizes(tiny_scene, tmp_path):
     """Up to step 500 the size is that of `resolution: 4`, and not the full one."""
     written = {}
     for name, setting in {"own": "", "quarter": "4.0", "full": "1.0"}.items():
@@ -191,13 +191,13 @@ def test_an_example_is_short(name, limit):
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= limit
 
 
-def test_a_blur_is_short_with_its_kernel():
+def test_blur_and_its_kernel_are_short():
     lines = [line.strip() for suffix in ("py", "cl") for line in (EXAMPLES / f"box_blur.{suffix}").open()]
     code = [line for line in lines if line and not line.startswith(('"""', "/*", "*"))]
     assert len(code) <= 40
 
 
-def test_the_verbs_of_an_edit_are_those_of_the_table():
+def test_documented_edit_methods_match_the_class():
     """Each `edit.name` of the page exists, and so do the arguments that the table gives to it."""
     gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), 1, 0, Survey(None, None, None, [], 0, 1))

@@ -95,7 +95,7 @@ def environment(place: Path, python: str) -> tuple[Path, Path]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("version", "way"), WAYS)
-def test_only_clsplat_appears_and_its_commands_run(version, way, built, checkout, backend, tmp_path):
+def test_wheel_installs_only_clsplat_and_its_commands_run(version, way, built, checkout, backend, tmp_path):
     python, site = environment(tmp_path / "env", pythons()[version])
     what = [next(built.glob("*.whl"))] if way == "wheel" else ["--no-build-isolation", "--editable", checkout]
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", "--no-index", "--no-compile"]
@@ -114,7 +114,7 @@ def test_only_clsplat_appears_and_its_commands_run(version, way, built, checkout
 
 
 @pytest.mark.slow
-def test_sdist_holds_docs_examples_and_the_changelog(built):
+def test_sdist_contains_docs_examples_and_the_changelog(built):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     for folder in ("docs", "examples", "data_tools", "cl_kernels", "pipelines"):
@@ -138,7 +138,7 @@ def test_the_version_names_the_commit_of_a_clean_checkout(tmp_path):
     assert _commit(tmp_path) == "", "a new module is a change"
 
 
-def test_the_version_of_other_code_is_another(monkeypatch):
+def test_version_of_changed_code_differs(monkeypatch):
     compute = full_version.__wrapped__
     monkeypatch.setattr("clsplat.core.resources._commit", lambda root: "")
     monkeypatch.setattr("clsplat.core.resources.__version__", "1.0.dev0")

@@ -45,7 +45,7 @@ def test_lines():
     assert not faults, "\n".join(faults)
 
 
-def test_header_says_what_it_computes():
+def test_header_describes_the_computation():
     texts = {path.name: path.read_text() for path in FILES}
     faults = [name for name, text in texts.items() if not text.startswith("/* ") or text.index("*/") <= 120]
     assert not faults, f"say what the files compute: {faults}"

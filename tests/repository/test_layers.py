@@ -42,7 +42,7 @@ def test_rooms_import_only_lower_rooms():
     assert not faults, "\n".join(sorted(faults))
 
 
-def test_no_modules_import_each_other():
+def test_modules_have_no_import_cycles():
     graph = defaultdict(set)
     for module, _, target in own_imports():
         if PATHS[target].name != "__init__.py":
@@ -75,7 +75,7 @@ def test_few_modules_import_from_the_home_files_of_an_idea():
         assert len(others) <= 12, f"{idea}: {', '.join(sorted(others))}"
 
 
-def test_rooms_are_few_and_say_their_reason():
+def test_rooms_are_few_and_have_a_reason():
     folders = {path.parent for path in FILES}
     rooms = {folder.name for folder in folders if folder.parent in (ROOT, ROOT / "clsplat")} - {"clsplat"}
     assert rooms == set(ROOMS)

@@ -50,7 +50,7 @@ def test_class_names_are_unique():
     assert not faults, "\n".join(faults)
 
 
-def test_the_wheel_holds_every_package():
+def test_wheel_contains_every_package():
     """What pyproject.toml lists is what lies on disk, and the folders that it maps exist."""
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     markers = [path.parent for folder in ("clsplat", "data_tools") for path in (ROOT / folder).rglob("__init__.py")]
@@ -63,7 +63,7 @@ def test_the_wheel_holds_every_package():
     assert not without_marker, "folders of Python files that are not packages"
 
 
-def test_files_beside_the_code_are_in_the_wheel():
+def test_data_files_are_in_the_wheel():
     """Whatever lies in a package and is not Python is named by package-data."""
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     folders = {package: ROOT / package.replace(".", "/") for package in setuptools["packages"]}

@@ -116,7 +116,7 @@ def test_every_test_module_is_imported(tmp_path):
     command(lacking(tmp_path, *SYSTEMS.values()), "every_test", "tests.conftest", *modules)
 
 
-def test_a_scene_is_made_trained_and_resumed(system, tmp_path):
+def test_synthetic_scene_is_written_trained_and_resumed(system, tmp_path):
     scene, out = tmp_path / "scene", tmp_path / "run"
     made = [0, "data", "synthetic", scene, "--size", "32", "--train", "4", "--test", "1"]
     small = ["--set", "optimize.steps=8", "optimize.log_every=2"]
@@ -134,14 +134,14 @@ CONSOLES = {
 
 
 @pytest.mark.parametrize("encoding", CONSOLES)
-def test_a_console_of_few_characters_shows_every_text(encoding):
+def test_limited_console_encoding_shows_every_text(encoding):
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}
     done = commands(environment, *CONSOLES[encoding], text=False)
     assert b"Traceback" not in done.stderr
     assert (done.stdout + done.stderr).decode(encoding)
 
 
-def test_a_run_on_a_console_of_few_characters_ends_well(tiny_scene, tmp_path):
+def test_run_finishes_with_a_limited_console_encoding(tiny_scene, tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C.UTF-8"}
     sets = ["--set", "optimize.steps=3"]
     done = command(environment, "clsplat", "run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "ü…", *sets)
@@ -177,7 +177,7 @@ def is_text_of_an_unknown_encoding(call: ast.Call) -> bool:
     return name == "open" and modes[:1] in (["'r'"], ["'w'"], ["'a'"], ["'x'"])  # of a path; others take a name first
 
 
-def test_text_of_an_unknown_encoding_is_found():
+def test_implicit_text_encoding_is_detected():
     found = "a.read_text()|a.write_text(b)|open(a)|open(a, 'w')|p.open('a')|subprocess.run(a, text=True)"
     fine = "a.read_text('utf-8')|write_text(a, b)|open(a, 'rb')|p.open('ab')|Job.open(a, b)|open(a, encoding='utf-8')"
     for code in found.split("|"):
@@ -204,7 +204,7 @@ def test_modules_of_some_systems_are_imported_where_used():
 
 
 @pytest.mark.parametrize(("system_name", "tries", "done"), [("nt", 2, True), ("nt", 99, False), ("posix", 1, False)])
-def test_a_file_that_somebody_reads_is_replaced_a_little_later(system_name, tries, done, tmp_path, monkeypatch):
+def test_file_open_elsewhere_is_replaced_after_a_retry(system_name, tries, done, tmp_path, monkeypatch):
     """On Windows alone: elsewhere a refusal has another reason."""
     path, refused, replace = tmp_path / "status.json", [], os.replace
     path.write_text("old")
@@ -228,7 +228,7 @@ def test_a_file_that_somebody_reads_is_replaced_a_little_later(system_name, trie
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_intels_runtime_of_windows_is_named_to_the_loader(tmp_path, monkeypatch):
+def test_intel_runtime_on_windows_is_passed_to_the_loader(tmp_path, monkeypatch):
     library = tmp_path / "Library" / "bin" / "intelocl64.dll"
     library.parent.mkdir(parents=True)
     library.touch()
@@ -241,7 +241,7 @@ def test_intels_runtime_of_windows_is_named_to_the_loader(tmp_path, monkeypatch)
     assert os.environ["OCL_ICD_FILENAMES"] == "own.dll"
 
 
-def test_a_cache_that_forbids_execution_is_named(monkeypatch, tmp_path):
+def test_noexec_cache_is_named(monkeypatch, tmp_path):
     """What PoCL says in a container whose cache is a tmpfs with noexec, as docker mounts it by default."""
     said = "dlopen(\"/cache/pocl/a.so\") failed with '/cache/pocl/a.so: failed to map segment from shared object'."
     ended = subprocess.CompletedProcess([], -6, "", said)

@@ -70,7 +70,7 @@ def planted(folder: Path, source: str) -> Build:
     return Build(path, "simt", ())
 
 
-def test_builds_have_the_options_that_a_device_would_get():
+def test_builds_use_the_options_of_the_device():
     wanted = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(tuning_of(GPU, "simt").items()))]
     assert [build.options for build in builds(["simt"], ["fill.cl"])] == [wanted]
     (wide,) = builds(["wide"], ["fill.cl"])
@@ -83,14 +83,14 @@ def test_every_kernel_is_built_in_both_schedules():
         assert names == {name for path in KERNELS.glob("*.cl") for name in parse_kernels(path.read_text())}
 
 
-def test_builds_that_differ_are_told_apart():
+def test_different_builds_are_distinguished():
     variants = [build.variant for build in builds(["simt"], ["blend_simt.cl"])]
     assert variants[0] == ""
     assert {"TILE 8", "PIXEL_SUMS 11", "PIXEL_SUMS 13", "PIXEL_SUMS 13, TILE 8"} <= set(variants)
     assert [build.variant for build in builds(["simt"], ["check.cl"])] == [""]
 
 
-def test_every_call_that_passes_more_defines_is_known():
+def test_every_call_with_extra_defines_is_listed():
     found = set()
     for text in map(Path.read_text, (ROOT / "clsplat").rglob("*.py")):
         for node in ast.walk(ast.parse(text)) if ".program" in text else ():
@@ -129,7 +129,7 @@ amdhsa.kernels:
 """
 
 
-def test_figures_are_read_from_assembly_for_amd():
+def test_statistics_are_read_from_amd_assembly():
     (of,) = amd.parse(AMD_SAMPLE, "gfx1030").values()
     assert (of.registers, of.spills, of.scratch, of.local, of.group, of.width) == (29, 3, 12, 4100, 64, 32)
     assert (of.waves, of.most_waves, of.occupancy) == (14, 16, 88)
@@ -174,7 +174,7 @@ __kernel __attribute__((reqd_work_group_size(64, 1, 1))) void other() {}
 """
 
 
-def test_figures_are_read_from_ptx_and_the_report_of_ptxas():
+def test_statistics_are_read_from_ptx_and_ptxas():
     found = nvidia.parse(TEXT_SAMPLE, PTX_SAMPLE, PTXAS_SAMPLE, "sm_86")
     of = found["scale"]
     assert (of.registers, of.spills, of.scratch, of.local, of.group) == (38, 8, 200, 16388, 256)
@@ -232,7 +232,7 @@ def binary(notes: str, kind: int = intel.ZE_INFO) -> bytes:
     return head + table + contents + b"what follows"
 
 
-def test_figures_are_read_from_notes_of_intels_compiler():
+def test_statistics_are_read_from_intel_compiler_notes():
     report = "\nwarning: kernel scale  compiled SIMD16 allocated 128 regs and spilled around 681\nBuild succeeded.\n"
     assert intel.parse(binary(ZE_INFO), report, "skl").keys() == {"scale"}
     of = intel.parse(binary(ZE_INFO), report, "skl")["scale"]
@@ -280,7 +280,7 @@ def test_the_schedule_of_cpus_may_spill_on_a_gpu():
     assert figures.faults({Place("gfx900", "wide", "scale"): Figures(**(vars(FINE) | {"spills": 3}))}) == []
 
 
-def test_figures_of_two_commits_are_compared(tmp_path):
+def test_statistics_of_two_commits_are_compared(tmp_path):
     before = {Place("gfx900", "simt", name): FINE for name in ("same", "changed", "gone")}
     changed = Figures(**(vars(FINE) | {"registers": 32, "counts": {"global loads": 4}}))
     after = {
@@ -298,7 +298,7 @@ def test_figures_of_two_commits_are_compared(tmp_path):
     ]
 
 
-def test_accepted_faults_are_no_failures_and_must_still_be_seen():
+def test_accepted_faults_must_still_occur():
     fault, *rest = accepted.ACCEPTED
     assert accepted.others([*accepted.ACCEPTED, "another"], everything=True) == ["another"]
     assert accepted.others([fault + "0"], everything=False) == [fault + "0"]
@@ -308,7 +308,7 @@ def test_accepted_faults_are_no_failures_and_must_still_be_seen():
 
 
 @vendors
-def test_kernels_that_ask_for_most_keep_the_limits(vendor, target):
+def test_largest_kernels_stay_within_the_limits(vendor, target):
     need(vendor)
     work = [(build, target) for build in builds(["simt"], QUICK) if not build.variant]
     table, failures = compile_all(work)
@@ -326,7 +326,7 @@ def test_kernels_that_ask_for_most_keep_the_limits(vendor, target):
     ],
     ids=["spill", "local", "group"],
 )
-def test_a_planted_fault_is_found(vendor, target, source, words, tmp_path):
+def test_planted_fault_is_detected(vendor, target, source, words, tmp_path):
     need(vendor)
     found = compile_one((planted(tmp_path, source), target))
     assert not isinstance(found, str), found
@@ -335,7 +335,7 @@ def test_a_planted_fault_is_found(vendor, target, source, words, tmp_path):
 
 
 @vendors
-def test_a_kernel_that_does_not_compile_is_named_with_its_line(vendor, target, tmp_path):
+def test_kernel_build_error_names_kernel_and_line(vendor, target, tmp_path):
     need(vendor)
     found = compile_one((planted(tmp_path, LOCAL.format(group=64, floats=64) + "int broken(\n"), target))
     assert isinstance(found, str)
@@ -354,7 +354,7 @@ def command(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
     )
 
 
-def test_a_compiler_that_was_asked_for_and_is_missing_is_a_fault(tmp_path):
+def test_missing_requested_compiler_is_a_fault(tmp_path):
     done = command("amd", PATH=str(tmp_path))
     assert done.returncode == 1
     assert "clang 16 or later is missing: apt-get install clang-19\n" in done.stderr
@@ -373,7 +373,7 @@ def figures_of_all_targets() -> figures.Table:
     return {Place(target, "simt", name): of for target in VENDOR_OF for of, name in kernels}
 
 
-def test_a_page_with_other_figures_is_found(tmp_path, monkeypatch):
+def test_outdated_page_is_detected(tmp_path, monkeypatch):
     table, versions = figures_of_all_targets(), dict.fromkeys(VENDORS, "a compiler 1.0")
     monkeypatch.setattr(page, "PAGE", tmp_path / "performance.md")
     page.PAGE.write_text(f"before\n{page.BEGIN}\n{page.END}\nafter\n")
@@ -385,12 +385,12 @@ def test_a_page_with_other_figures_is_found(tmp_path, monkeypatch):
     assert re.match(r"performance.md shows '\| `blend_forward` .*40.*', expected '.*41.*': run .* --write", fault)
 
 
-def test_ci_compares_the_page_with_fresh_figures():
+def test_ci_compares_the_page_with_new_statistics():
     jobs = YAML(typ="safe").load(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
     assert "-m tests.targets --check" in jobs["targets"]["steps"][-1]["run"]
 
 
-def test_the_page_shows_the_kernels_that_there_are():
+def test_page_lists_the_existing_kernels():
     shown = page.PAGE.read_text(encoding="utf-8").partition(page.BEGIN)[2].partition(page.END)[0]
     kernels = {name for path in KERNELS.glob("*.cl") for name in parse_kernels(path.read_text())}
     assert set(re.findall(r"^\| `(\w+)`", shown, re.M)) <= kernels

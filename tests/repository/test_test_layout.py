@@ -36,7 +36,7 @@ def test_no_test_module_imports_another():
     assert not faults, "move what they share to tests/support:\n" + "\n".join(faults)
 
 
-def test_names_of_tests_are_short():
+def test_test_names_are_short():
     faults = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
         for path, tree in MODULES.items()
