@@ -21,7 +21,7 @@ from clsplat.workflows.partition import Block
 
 
 def require_divisible(pipeline: Pipeline) -> None:
-    """Raise ConfigError if the blocks of a pipeline would not match, or if it does not start from a model."""
+    """Raise ConfigError if a pipeline has settings that would differ between blocks, or does not start from a model."""
     settings, first = pipeline.settings, pipeline.stages[0]
     trainings = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
     faults = {
@@ -38,14 +38,17 @@ def require_divisible(pipeline: Pipeline) -> None:
             "some modules would differ between blocks; leave them out",
         ),
         "densify.budget": (
-            any(getattr(stage.budget, "gaussians", None) for stage in _densities(pipeline.stages)),
-            "it counts all Gaussians; use densify.max_gaussians, which is split between blocks",
+            any(getattr(stage.budget, "gaussians", None) for stage in _densify_stages(pipeline.stages)),
+            "it limits the whole scene; use densify.max_gaussians, which is split between blocks",
         ),
         "densify.per_pixel": (
-            any(stage.per_pixel for stage in _densities(pipeline.stages)),
+            any(stage.per_pixel for stage in _densify_stages(pipeline.stages)),
             "blocks have different photos; use densify.max_gaussians, which is split between blocks",
         ),
-        "densify.inside": (any(stage.inside for stage in _densities(pipeline.stages)), "blocks set it; leave it out"),
+        "densify.inside": (
+            any(stage.inside for stage in _densify_stages(pipeline.stages)),
+            "each block sets it; leave it out",
+        ),
     }
     for key, (is_set, remedy) in faults.items():
         if is_set:
@@ -55,34 +58,36 @@ def require_divisible(pipeline: Pipeline) -> None:
 
 
 def block_pipeline(
-    pipeline: Pipeline, block: Block, start: Path, extent: float, share: Fraction = Fraction(1)
+    pipeline: Pipeline, block: Block, start: Path, extent: float, fraction: Fraction = Fraction(1)
 ) -> Pipeline:
     """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: of the whole scene; share: fraction of the pipeline's steps to train, with the rates of `_shared`.
+    extent: of the whole scene; fraction: of the pipeline's steps to train, with the rates of `_with_fewer_steps`.
     """
-    data, last, cell = pipeline.resolved(), _last(pipeline), block.box.model_dump()
-    stages = [_growing(stage, block) for stage in _starting(data["stages"][:last], start)]
+    data, last, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
+    stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:last], start)]
     names = [view["name"] for view in block.views]
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
     changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
     changed["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
     block_file = checked(pipeline.path, Document(changed))
-    return block_file if share == 1 else replace(block_file, settings=_shared(block_file.settings, share))
+    return (
+        block_file if fraction == 1 else replace(block_file, settings=_with_fewer_steps(block_file.settings, fraction))
+    )
 
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
     """Return the stages after training, for the merged model: evaluation, export, and reports."""
-    data, last = pipeline.resolved(), _last(pipeline)
-    stages = [*_starting(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
+    data, last = pipeline.resolved(), _count_until_last_edit(pipeline)
+    stages = [*_with_start(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
     return checked(pipeline.path, Document({**data, "stages": stages}))
 
 
 def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     """Return the pipeline of the coarse model with the scene, filters, and seed of the block pipeline."""
     data = pipeline.resolved()
-    same = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
-    return checked(coarse.path, Document({**coarse.resolved(), **same}))
+    shared = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
+    return checked(coarse.path, Document({**coarse.resolved(), **shared}))
 
 
 def without_start(pipeline: Pipeline) -> Pipeline:
@@ -92,49 +97,49 @@ def without_start(pipeline: Pipeline) -> Pipeline:
     return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
 
 
-def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
+def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFile:
     """Return settings with a fraction of the steps, and learning rates divided by its square root.
 
     Adam divides gradients by their RMS over steps.  A Gaussian seen in a fraction p of the views has gradients in that
-    fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is larger by 1 / share.
+    fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is larger by 1 / fraction.
     """
 
-    def changed(training: Optimize) -> Optimize:
+    def with_rates(training: Optimize) -> Optimize:
         if training.update != "all":  # rows outside the view keep their moments
             return training
-        return training.model_copy(update={"rates": training.rates.times(float(share) ** -0.5)})
+        return training.model_copy(update={"rates": training.rates.times(float(fraction) ** -0.5)})
 
-    return map_trainings(stretched(settings, share), Optimize, changed)
+    return map_trainings(stretched(settings, fraction), Optimize, with_rates)
 
 
-def _last(pipeline: Pipeline) -> int:
+def _count_until_last_edit(pipeline: Pipeline) -> int:
     """Return the number of stages up to the last one that changes the model."""
     return max(i for i, stage in enumerate(pipeline.stages, 1) if stage.edits or isinstance(stage, Optimize))
 
 
-def _densities(stages: Iterable[Stage]) -> Iterator[Densify]:
+def _densify_stages(stages: Iterable[Stage]) -> Iterator[Densify]:
     for stage in stages:
         yield from (inner for inner in (stage, *getattr(stage, "during", ())) if isinstance(inner, Densify))
 
 
-def _starting(stages: list[Any], file: Path) -> list[Any]:
+def _with_start(stages: list[Any], file: Path) -> list[Any]:
     """Return stages of a resolved file with this model as the input of `init`."""
     first, *others = stages
     return [{"init": {**first["init"], "file": str(file.resolve())}}, *others]
 
 
-def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
+def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
     """Return a stage of a resolved file with densification limited to a block and its share of Gaussians."""
     ((name, fields),) = stage.items()
     if name == "densify":
-        limited = _limited(Densify.model_validate(fields), block).model_dump(mode="json")
+        limited = _limit_densify(Densify.model_validate(fields), block).model_dump(mode="json")
         return {name: {key: limited[key] for key in fields}}
     if "during" in fields:
-        return {name: {**fields, "during": [_growing(inner, block) for inner in fields["during"]]}}
+        return {name: {**fields, "during": [_limit_growth(inner, block) for inner in fields["during"]]}}
     return stage
 
 
-def _limited(densify: Densify, block: Block) -> Densify:
+def _limit_densify(densify: Densify, block: Block) -> Densify:
     """Limit a densify stage to the cell of a block and its share, by pairs, of the number of Gaussians."""
     changed: dict[str, Any] = {"inside": block.growth}
     if densify.max_gaussians is not None:

@@ -57,7 +57,7 @@ from clsplat.workflows.block_pipelines import (
 )
 from clsplat.workflows.finetune import claim_folder, is_trained, train_in_folder
 from clsplat.workflows.folder import COARSE, MERGED, RECORD
-from clsplat.workflows.partition import SIGHT, Block, Partition, Partitioner
+from clsplat.workflows.partition import MIN_COVERAGE, Block, Partition, Partitioner
 
 # Estimates of the training time of blocks.
 
@@ -65,23 +65,25 @@ from clsplat.workflows.partition import SIGHT, Block, Partition, Partitioner
 def block_seconds(
     blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], units: int
 ) -> dict[str, list[float]]:
-    """Return the minimum and maximum training time of each block, s, for its first and its most Gaussians.
+    """Return the minimum and maximum training time of each block, s, for its initial and its maximum Gaussians.
 
     pipelines: by block name; size: of a photo, px; units: compute units of the device.
     """
     times = {}
     for block in blocks:
-        ends = (step_seconds(units, size, count) for count in _counts(block, pipelines[block.name], size))
+        estimates = (step_seconds(units, size, count) for count in _gaussian_range(block, pipelines[block.name], size))
         steps = sum(training.steps for training in _trainings(pipelines[block.name]))
-        times[block.name] = [steps * each[end] for end, each in enumerate(ends)]
+        times[block.name] = [steps * estimate[end] for end, estimate in enumerate(estimates)]
     return times
 
 
-def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the first and the largest number of Gaussians of a block; without a limit, the latter is a guess."""
+def _gaussian_range(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the initial and the maximum number of Gaussians of a block; without a limit, the latter is a guess."""
     first, pixels = int(block.start.sum()), size[0] * size[1]
-    own = [max_gaussians(training, pixels) or block.pairs * MAX_PER_PIXEL * pixels for training in _trainings(pipeline)]
-    return first, max(first, int(max(own)) + first - block.gaussians)
+    limits = [
+        max_gaussians(training, pixels) or block.pairs * MAX_PER_PIXEL * pixels for training in _trainings(pipeline)
+    ]
+    return first, max(first, int(max(limits)) + first - block.gaussians)
 
 
 def _trainings(pipeline: Pipeline) -> list[Optimize]:
@@ -89,7 +91,7 @@ def _trainings(pipeline: Pipeline) -> list[Optimize]:
 
 
 LOG = logging.getLogger("clsplat")
-MAX_BLOCKS = 99  # blocks
+MAX_BLOCKS = 99  # two digits, as in the names of block folders
 Steps = Literal["each", "shared"]
 
 
@@ -100,8 +102,8 @@ class BlocksPlan:
     pipeline: str = "blocks"
     coarse: str = "blocks_coarse"  # a pipeline, or a model
     blocks: int = 4
-    min_coverage: float = SIGHT  # fraction of a view's pixels above which it belongs to a block
-    steps: Steps = "each"  # per block: all steps of the pipeline, or a share by its views
+    min_coverage: float = MIN_COVERAGE  # fraction of a view's pixels above which it belongs to a block
+    steps: Steps = "each"  # per block: all steps of the pipeline, or a fraction in proportion to its views
     overrides: list[str] = field(default_factory=list)
     coarse_overrides: list[str] = field(default_factory=list)
 
@@ -115,7 +117,7 @@ class BlocksPlan:
 
 
 class Blocks:
-    """A training in blocks in its folder."""
+    """Trains the blocks of a scene in a folder, from the coarse model to the merged one."""
 
     def __init__(
         self, scene: Path, out: Path, plan: BlocksPlan, device: str | Device | None, execution: Execution | None = None
@@ -126,15 +128,17 @@ class Blocks:
                 "--on: blocks are trained as cells of a store; add the key `store`, or use another engine"
             )
         self.out, self.plan, self.execution = out, plan, execution
-        self._name = device if isinstance(device, str) else None
-        where = [f"scene.path={as_setting(photographs_of(scene))}"]
-        self.pipeline = load(plan.pipeline, [*where, "init.file=coarse", *plan.overrides])
+        self._device_name = device if isinstance(device, str) else None
+        overrides = [f"scene.path={as_setting(photographs_of(scene))}"]
+        self.pipeline = load(plan.pipeline, [*overrides, "init.file=coarse", *plan.overrides])
         require_divisible(self.pipeline)
-        self.given = _given(plan.coarse)
-        self.coarse = None if self.given else coarse_pipeline(load(plan.coarse, plan.coarse_overrides), self.pipeline)
-        if self.given and plan.coarse_overrides:
+        self.coarse_file = _coarse_file(plan.coarse)
+        self.coarse = (
+            None if self.coarse_file else coarse_pipeline(load(plan.coarse, plan.coarse_overrides), self.pipeline)
+        )
+        if self.coarse_file and plan.coarse_overrides:
             raise ConfigError(
-                "--set-coarse needs a coarse model that is trained; leave it out, or give a pipeline as --coarse"
+                "--set-coarse changes the training of the coarse model; leave it out, or give a pipeline as --coarse"
             )
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
@@ -143,27 +147,29 @@ class Blocks:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
     def question(self) -> dict[str, Any]:
-        """Return the inputs that identify the folder."""
+        """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and model."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
-        texts = {name: json.dumps(with_content_hashes(one), sort_keys=True) for name, one in pipelines.items()}
+        texts = {
+            name: json.dumps(with_content_hashes(pipeline), sort_keys=True) for name, pipeline in pipelines.items()
+        }
         digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
-        asked = {"blocks": self.plan.blocks, "min_coverage": self.plan.min_coverage, "steps": self.plan.steps}
-        model = {"model": sha256(self.given)} if self.given else {}
-        return {**asked, "photographs": self.scene.identity.digest, **model, **digests}
+        options = {"blocks": self.plan.blocks, "min_coverage": self.plan.min_coverage, "steps": self.plan.steps}
+        model = {"model": sha256(self.coarse_file)} if self.coarse_file else {}
+        return {**options, "photographs": self.scene.identity.digest, **model, **digests}
 
     def partition(self) -> Partition:
         """Train the coarse model if necessary, partition it, and write the manifest."""
-        file = self.given
+        file = self.coarse_file
         if file is None and self.coarse is not None:
             LOG.info("training the coarse model")
             file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
         model = load_model(file).with_origin(self.scene.scene.origin)
         photographs = Photographs(self.device, self.scene.background, budget=0)  # each photo is used once per pass
-        work = Partitioner(model, self.scene.scene, self.device, photographs)
-        found = work.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
-        found.write(self.out)
-        return found
+        partitioner = Partitioner(model, self.scene.scene, self.device, photographs)
+        partition = partitioner.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
+        partition.write(self.out)
+        return partition
 
     def plan_data(self, partition: Partition) -> dict[str, Any]:
         """Return the manifest with the estimated training time of each block."""
@@ -175,8 +181,8 @@ class Blocks:
 
     def block_pipeline(self, block: Block, partition: Partition) -> Pipeline:
         """Return the pipeline of a block."""
-        share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
-        return block_pipeline(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
+        fraction = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
+        return block_pipeline(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, fraction)
 
     def train(self, partition: Partition) -> list[tuple[Block, Path]]:
         """Train the unfinished blocks; return all blocks with their models, in order.
@@ -200,18 +206,18 @@ class Blocks:
                     LOG.warning("%s: no Gaussians are left in its cell; continuing without it", block.name)
         if failures:
             remedy = "fix that and run the same command again; finished blocks are kept"
-            kept = shell_quote(self.out / COARSE)
-            other = f"other settings need another --out; --coarse {kept} reuses the coarse model"
-            whole = failures.whole(len(pipelines))
-            error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
-            error.exit_code = whole.exit_code
+            coarse = shell_quote(self.out / COARSE)
+            other = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
+            summary = failures.whole(len(pipelines))
+            error = ClsplatError(f"{summary};  {remedy if self.coarse_file else f'{remedy}; {other}'}")
+            error.exit_code = summary.exit_code
             raise error
         if not files:
-            raise EmptyRegionError("no Gaussians are left in any block; use another pipeline and another --out")
+            raise EmptyRegionError("all blocks are empty after training; use another pipeline and another --out")
         return files
 
     def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
-        """Train the unfinished blocks as cells of a store, and put their runs into the block folders."""
+        """Train the unfinished blocks as cells of a sweep store; their runs are placed in the block folders."""
         cells = [
             MatrixCell(name, pipeline)
             for name, pipeline in pipelines.items()
@@ -219,7 +225,7 @@ class Blocks:
         ]
         if cells:
             name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.store_folder(self.out))
-            Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
+            Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._device_name)
 
     def merge(self, parts: list[tuple[Block, Path]]) -> Path:
         """Merge the models of all blocks in order; return the file."""
@@ -253,19 +259,19 @@ def train_in_blocks(
     """Train a scene in blocks in a folder; return the manifest and `run`, the folder of the merged model.
 
     Finished parts of an earlier call are kept, and interrupted ones resume.  only_plan: stop after the partition;
-    execution: where blocks are trained as cells of a store.  Raises ClsplatError, which names a failed block.
+    execution: where blocks are trained, as cells of a sweep store.  Raises ClsplatError, which names a failed block.
     """
-    work = Blocks(scene, out, plan or BlocksPlan(), device, execution)
-    with claim_folder(out, work.question(), RECORD, "a scene in blocks", "another --out"):
-        partition = work.partition()
+    blocks = Blocks(scene, out, plan or BlocksPlan(), device, execution)
+    with claim_folder(out, blocks.question(), RECORD, "a scene in blocks", "another --out"):
+        partition = blocks.partition()
         if only_plan:
-            return {**work.plan_data(partition), "run": None}
-        run = work.finish(work.merge(work.train(partition)))
+            return {**blocks.plan_data(partition), "run": None}
+        run = blocks.finish(blocks.merge(blocks.train(partition)))
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
 
-def _given(coarse: str) -> Path | None:
-    """Return the file if `coarse` is a model, or None if it is a pipeline.  Raises DataError."""
+def _coarse_file(coarse: str) -> Path | None:
+    """Return the model file if `coarse` names a model, or None if it names a pipeline.  Raises DataError."""
     path = Path(coarse)
     if path.is_dir() or (path.is_file() and detect(path)):
         require_model(path)
@@ -276,38 +282,45 @@ def _given(coarse: str) -> Path | None:
 # Text tables of a partition and of the state of its runs.
 
 HEADINGS = ("block", "owns", "starts from", "views", "cameras inside", "pairs", "initial MiB")
-GUESS = "memory is that at the start; times range from no growth to an estimated maximum of Gaussians"
-TIME = "estimated time"
+TIME_HEADING = "estimated time"
+NOTE = "memory is at the start of training; times range from no growth to an estimated maximum of Gaussians"
 
 
-def table(found: dict[str, Any]) -> str:
-    """Format a manifest as text; MiB are device memory at the start of training.
+def table(manifest: dict[str, Any]) -> str:
+    """Format a manifest as text.  MiB: device memory at the start of training.
 
-    The time of a block ranges from no growth to the most Gaussians.
+    If the manifest has times, they range from no growth to the maximum number of Gaussians.
     """
-    whole = ["whole", *[f"{found['gaussians']:,}"] * 2, str(found["views"]), "", "100 %", _mib(found["memory"])]
-    times = [one["seconds"] for one in found["blocks"] if "seconds" in one]
+    scene_row = [
+        "whole",
+        *[f"{manifest['gaussians']:,}"] * 2,
+        str(manifest["views"]),
+        "",
+        "100 %",
+        _mib(manifest["memory"]),
+    ]
+    times = [block["seconds"] for block in manifest["blocks"] if "seconds" in block]
     if not times:
-        return text_table([HEADINGS, *map(_cells, found["blocks"]), whole])
-    rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(found["blocks"], times, strict=True)]
+        return text_table([HEADINGS, *map(_cells, manifest["blocks"]), scene_row])
+    rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(manifest["blocks"], times, strict=True)]
     low, high = (sum(ends) for ends in zip(*times, strict=True))
-    total = [*whole, f"{minutes_text((low, high))}, one after another"]
-    return f"{text_table([[*HEADINGS, TIME], *rows, total])}\n{GUESS}"
+    total_row = [*scene_row, f"{minutes_text((low, high))}, one after another"]
+    return f"{text_table([[*HEADINGS, TIME_HEADING], *rows, total_row])}\n{NOTE}"
 
 
-def status_table(found: dict[str, Any]) -> str:
+def status_table(status: dict[str, Any]) -> str:
     """Format the result of `blocks_status`, one line per run."""
-    done = sum(part["state"] == "done" for part in found["parts"])
-    lines = [f"{found['in_blocks']}: {found['state']}, {done} of {len(found['parts'])} runs are done"]
-    for part in found["parts"]:
+    done_count = sum(part["state"] == "done" for part in status["parts"])
+    lines = [f"{status['in_blocks']}: {status['state']}, {done_count} of {len(status['parts'])} runs are done"]
+    for part in status["parts"]:
         first = status_text(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
         lines.append(f"{first}; {part['message']}" if part.get("message") else first)
     return "\n  ".join(map(one_line, lines))
 
 
 def _cells(block: dict[str, Any]) -> list[str]:
-    by_place = sum(view["why"] == "place" for view in block["views"])
-    counts = [f"{block['gaussians']:,}", f"{block['start']:,}", str(len(block["views"])), str(by_place)]
+    cameras = sum(view["why"] == "inside" for view in block["views"])
+    counts = [f"{block['gaussians']:,}", f"{block['start']:,}", str(len(block["views"])), str(cameras)]
     return [block["name"], *counts, f"{100 * block['pairs']:.0f} %", _mib(block["memory"])]
 
 
@@ -321,12 +334,12 @@ def _mib(size: int) -> str:
 def plan_blocks(
     scene: Path, blocks: int, pipeline: str = "blocks", device: str | Device | None = None
 ) -> dict[str, Any]:
-    """Return the manifest of a partition of the scene's points, with estimated times; nothing is written.
+    """Partition the scene's points, and return the manifest with estimated times; nothing is written.
 
     Raises ConfigError for an invalid number of blocks, and DataError if the scene has no or too few points.
     """
     settings = load(pipeline, [f"scene.path={as_setting(photographs_of(scene))}", "init.file=points"]).settings
-    with log_level(logging.ERROR):  # it is read and logged again below
+    with log_level(logging.ERROR):  # `Blocks` reads the scene again and logs its warnings
         original = read_run_scene(settings.scene, settings.scene.folder).original
         points = original.points
     if points is None or not len(points):
@@ -335,8 +348,8 @@ def plan_blocks(
         model = Path(folder, "points.ply")
         tables = from_points(points, Init().opacity, settings.model.sh_degree)
         Model(**tables, rendering=NUMBERS, sky=None, origin=original.origin).save(model)
-        work = Blocks(scene, Path(folder), BlocksPlan(pipeline, str(model), blocks), device)
+        blocks_run = Blocks(scene, Path(folder), BlocksPlan(pipeline, str(model), blocks), device)
         try:
-            return work.plan_data(work.partition())
+            return blocks_run.plan_data(blocks_run.partition())
         except DataError as error:
-            raise DataError(f"{scene}, by its {pluralize(len(points), 'point')}: {error}") from error
+            raise DataError(f"{scene}, partitioned by its {pluralize(len(points), 'point')}: {error}") from error

@@ -24,51 +24,51 @@ from clsplat.runs.model_file import ModelFile
 from clsplat.viewer.charts import Line, curve
 from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
-# The pruning ladder: models with fewer and fewer Gaussians, each fine-tuned from the previous one.
+# The pruning ladder: a series of models, each pruned and fine-tuned from the previous one.
 
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; each rung writes a PLY
 PALETTE = "palette_sh"
 # stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded ones
 VECTORS = ("reduce_sh", PALETTE, "optimize", "share_palette", PALETTE)
-FITTING = ("init", *VECTORS, "round_tables", "optimize", "round_tables")
-FITTED, SOG = "fitted", "model.sog"
+SOG_STAGES = ("init", *VECTORS, "round_tables", "optimize", "round_tables")
+SOG_FOLDER, SOG = "fitted", "model.sog"
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """The folder and the fine-tuning of the rungs."""
+    """Prunes and fine-tunes a model in steps, the rungs, each in its run folder."""
 
     out: Path
     tuning: Tuning
 
-    def rung(self, keep: float, before: float) -> Path:
-        """Prune from the fraction `before` of the original Gaussians to `keep`, and train; return the model's file.
+    def train_rung(self, keep: float, previous: float) -> Path:
+        """Prune from the fraction `previous` of the original Gaussians to `keep`, and train; return the model's file.
 
         Finished work of an earlier call is kept, and interrupted work resumes.
         """
         if keep == 1:
             return self.tuning.source.file
-        file = self.tuning.source.file if before == 1 else self.folder(before) / MODEL
-        return self.tuning.train(self.pipeline(file, keep / before), self.folder(keep))
+        file = self.tuning.source.file if previous == 1 else self.folder(previous) / MODEL
+        return self.tuning.train(self.pipeline(file, keep / previous), self.folder(keep))
 
     def folder(self, keep: float) -> Path:
         """Return the run folder of a rung."""
         return self.out / f"keep_{round(100 * keep):02d}"
 
-    def fitted(self, file: Path, name: str, degree: int, quality: str) -> Path:
-        """Train a rung with the SH palette of a SOG; return that SOG."""
+    def train_sog(self, file: Path, name: str, degree: int, quality: str) -> Path:
+        """Fine-tune a rung with the SH palette and rounding of a SOG; return the SOG file."""
         values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
-        values |= {f"stages.{i}.quality": quality for i, stage in enumerate(FITTING) if stage == PALETTE}
-        pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
-        return self.tuning.train(pipeline, self.out / FITTED / name, SOG)
+        values |= {f"stages.{i}.quality": quality for i, stage in enumerate(SOG_STAGES) if stage == PALETTE}
+        pipeline = self.tuning.pipeline(SOG_STAGES, values, file=SOG, quality=quality)
+        return self.tuning.train(pipeline, self.out / SOG_FOLDER / name, SOG)
 
     def pipeline(self, file: Path, keep: float) -> Pipeline:
-        """Return the recipe that prunes a model file to a fraction of its Gaussians."""
+        """Return the pipeline that prunes a model file to the fraction `keep` of its Gaussians and trains it."""
         return self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), "prune_least.keep": keep})
 
 
-def checked_keeps(keeps: Sequence[float]) -> list[float]:
-    """Return fractions of the Gaussians in descending order.  Raises ConfigError for invalid or no fractions."""
+def ordered_keeps(keeps: Sequence[float]) -> list[float]:
+    """Return the unique fractions in descending order.  Raises ConfigError if there are none or one is invalid."""
     ordered = sorted(set(keeps), reverse=True)
     if not ordered or not all(0.01 <= keep <= 1 for keep in ordered):
         raise ConfigError("--keep: expected fractions of the Gaussians from 0.01 to 1, such as 1,0.7,0.5")
@@ -102,8 +102,8 @@ class CompressionTarget:
     """A maximum size, or a maximum loss in PSNR."""
 
     text: str
-    most: int | None = None  # bytes
-    change: float | None = None  # dB, change of the PSNR
+    max_bytes: int | None = None
+    psnr_change: float | None = None  # dB, at most 0
 
     @classmethod
     def parse(cls, text: str) -> "CompressionTarget":
@@ -117,41 +117,41 @@ class CompressionTarget:
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         if unit == "db":
             if value > 0:
-                raise ConfigError(f"--target {quote(text)}: is a gain; {EXPECTED}")
-            return cls(text.strip(), change=value)
+                raise ConfigError(f"--target {quote(text)}: a target above 0 dB is a gain; {EXPECTED}")
+            return cls(text.strip(), psnr_change=value)
         if value * UNITS[unit] < 1:
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
-        return cls(text.strip(), most=int(value * UNITS[unit]))
+        return cls(text.strip(), max_bytes=int(value * UNITS[unit]))
 
     def is_met(self, point: Point, psnr: float) -> bool:
         """Return whether a file meets the target; psnr: of the original model, dB."""
-        if self.most is not None:
-            return point.bytes <= self.most
-        return point.psnr >= psnr + (self.change or 0)
+        if self.max_bytes is not None:
+            return point.bytes <= self.max_bytes
+        return point.psnr >= psnr + (self.psnr_change or 0)
 
     def best(self, points: Sequence[Point], psnr: float) -> Point | None:
         """Return the best file for a size, or the smallest for a loss; None if no file meets the target."""
-        met = [point for point in points if self.is_met(point, psnr)]
-        if self.most is not None:
-            return max(met, key=lambda point: (point.psnr, -point.bytes), default=None)
-        return min(met, key=lambda point: (point.bytes, -point.psnr), default=None)
+        candidates = [point for point in points if self.is_met(point, psnr)]
+        if self.max_bytes is not None:
+            return max(candidates, key=lambda point: (point.psnr, -point.bytes), default=None)
+        return min(candidates, key=lambda point: (point.bytes, -point.psnr), default=None)
 
     def nearest(self, points: Sequence[Point]) -> Point:
-        """Return the file closest to the target."""
+        """Return the file closest to the target: the smallest one for a size, or the best one for a loss."""
         smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
-        return best if self.most is None else smallest
+        return best if self.max_bytes is None else smallest
 
     @property
     def remedy(self) -> str:
         """What to do if no file meets the target."""
-        if self.most is not None:
+        if self.max_bytes is not None:
             return "give a larger size, or smaller fractions with --keep"
         return "allow a larger loss, or train longer with --steps"
 
-    def ends(self, rung: Sequence[Point], psnr: float) -> bool:
-        """Return whether fewer Gaussians cannot help: all files of this rung fit, or none is good enough."""
+    def is_decided(self, rung: Sequence[Point], psnr: float) -> bool:
+        """Return whether fewer Gaussians cannot help: every file of a rung fits, or none is good enough."""
         met = [self.is_met(point, psnr) for point in rung]
-        return all(met) if self.most is not None else not any(met)
+        return all(met) if self.max_bytes is not None else not any(met)
 
 
 # The rate–distortion curve and table of a search, as text and as an offline page.
@@ -174,10 +174,10 @@ def cells(point: Point, source: Point) -> list[str]:
     ]
 
 
-def table(found: dict[str, Any]) -> str:
+def table(result: dict[str, Any]) -> str:
     """Format the record of a search as text; a star marks the chosen file."""
-    source, points = Point(**found["source"]), [Point(**point) for point in found["points"]]
-    chosen = found["chosen"] and Point(**found["chosen"])
+    source, points = Point(**result["source"]), [Point(**point) for point in result["points"]]
+    chosen = result["chosen"] and Point(**result["chosen"])
     marks = ["", "", *("*" if point == chosen else "" for point in points)]
     rows = [HEADINGS, *(cells(point, source) for point in (source, *points))]
     return text_table([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
@@ -193,7 +193,7 @@ def page(
     model: str,
     result: str = "",
 ) -> str:
-    """Return the HTML page of a search; `result`: the name of the file that it wrote."""
+    """Return the HTML page of a search; result: the name of the file that it wrote."""
     return render(
         "compress.html.j2",
         title=f"{scene} · {source.file}, compressed to {target.text}",
@@ -216,15 +216,15 @@ def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> 
 
 
 def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) -> list[Line]:
-    """Return a line per fraction of the Gaussians, and the target."""
-    shares = dict.fromkeys(point.keep for point in points)
+    """Return a chart line for each fraction of the Gaussians, and one for the target."""
+    keeps = dict.fromkeys(point.keep for point in points)
     lines = [
         Line(sorted((p.bytes / 1e6, p.psnr) for p in points if p.keep == keep), f"{keep:.0%} of the Gaussians")
-        for keep in shares
+        for keep in keeps
     ]
     largest = max((point.bytes for point in points), default=0) / 1e6
-    if target.change is not None and points:
-        level = source.psnr + target.change
+    if target.psnr_change is not None and points:
+        level = source.psnr + target.psnr_change
         lines.append(Line([(0, level), (largest, level)], f"target {target.text}", "var(--target)", dash=1))
     return lines
 
@@ -256,7 +256,7 @@ class Search:
         return self.target.best(self.points, self.source.psnr)
 
     def data(self) -> dict[str, Any]:
-        """Return all as plain data."""
+        """Return the record of the search as JSON data."""
         chosen = self.chosen
         return {
             **self.question,
@@ -293,7 +293,7 @@ def compress(
     Raises ConfigError for a target that no file meets, after writing the page, and OutputError if another process
     searches in `out`.
     """
-    wanted, shares = CompressionTarget.parse(target), checked_keeps(keeps)
+    goal, fractions = CompressionTarget.parse(target), ordered_keeps(keeps)
     if steps is not None:
         require_steps(steps)
     if form not in get_args(Format):
@@ -302,34 +302,32 @@ def compress(
     source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
     require_static(source.file, first.to_splat_file(), form)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
-    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
+    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": fractions, "steps": steps}
     size = model_bytes(source.file)  # fails for a damaged model, before the folder is created
     with claim_folder(out, question, RECORD, "a search", "another --out"):
-        warn_about_losses(_result(out, form), first.to_splat_file())
-        whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
-        search = Search(out, wanted, question, whole, measurer.split, source.scene_name)
+        warn_about_losses(_result_path(out, form), first.to_splat_file())
+        original = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+        search = Search(out, goal, question, original, measurer.split, source.scene_name)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
-        before = 1.0
-        for keep in shares:
-            rung = _measured(ladder, ladder.rung(keep, before), keep, form, measurer)
+        previous = 1.0
+        for keep in fractions:
+            rung = _measure_rung(ladder, ladder.train_rung(keep, previous), keep, form, measurer)
             search.points += rung
             search.write()
-            before = keep
-            if (
-                wanted.ends(rung, whole.psnr) and keep < 1
-            ):  # not at 1: a fine-tuned rung can be better than the original
+            previous = keep
+            if keep < 1 and goal.is_decided(rung, original.psnr):  # a fine-tuned rung can be better than the original
                 break
-        return _finished(search, form)
+        return _write_result_path(search, form)
 
 
-def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
+def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
     """Write a rung with each SH setting, read the files back, and measure them."""
     points, model = [], load(source)
-    for degree, quality in _settings(form, model.sh_degree):
+    for degree, quality in _sh_settings(form, model.sh_degree):
         name = f"keep_{round(100 * keep):02d}_degree_{degree}_{quality}"
         file = ladder.out / TRIALS / f"{name}.{form}"
         if form == "sog":
-            _copy(ladder.fitted(source, name, degree, quality), file)
+            _copy(ladder.train_sog(source, name, degree, quality), file)
         else:
             lower = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
             lower.save(file, Writing(quality=quality, quiet=True))
@@ -340,21 +338,21 @@ def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer:
     return points
 
 
-def _settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
-    """Return the distinct settings for a model of this degree; there is one for degree 0."""
-    lower = ((min(most, degree), quality) for most, quality in SETTINGS[form])
-    return dict.fromkeys((most, quality if most else "balanced") for most, quality in lower)
+def _sh_settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
+    """Return the distinct SH degrees and qualities for a model of this degree; a single one for degree 0."""
+    lower = ((min(limit, degree), quality) for limit, quality in SETTINGS[form])
+    return dict.fromkeys((limit, quality if limit else "balanced") for limit, quality in lower)
 
 
-def _finished(search: Search, form: Format) -> dict[str, Any]:
+def _write_result_path(search: Search, form: Format) -> dict[str, Any]:
     """Copy the chosen file to the result.  Raises ConfigError if there is none."""
     chosen, psnr = search.chosen, search.source.psnr
-    file = _result(search.out, form)
+    file = _result_path(search.out, form)
     if chosen is None:
-        near = search.target.nearest(search.points)
+        nearest = search.target.nearest(search.points)
         raise ConfigError(
-            f"--target {search.target.text}: no file meets it; the closest, {search.out / near.file}, has "
-            f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; {search.target.remedy}"
+            f"--target {search.target.text}: no file meets it; the closest, {search.out / nearest.file}, has "
+            f"{nearest.bytes / 1e6:.3g} MB and {nearest.psnr - psnr:+z.2f} dB; {search.target.remedy}"
             + (f"; the existing {file.name} is for another target" if file.exists() else "")
         )
     _copy(search.out / chosen.file, file)
@@ -362,7 +360,7 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 
 
-def _result(out: Path, form: Format) -> Path:
+def _result_path(out: Path, form: Format) -> Path:
     return out / f"compressed.{form}"
 
 

@@ -40,7 +40,7 @@ from clsplat.sweeps.store import CellAttempt, readable_checkpoints
 
 LOG = logging.getLogger("clsplat")
 RECIPE, TRAINING = "compress", "optimize"
-MIN_STEPS = 20  # so that each training of the recipe has steps to average
+MIN_STEPS = 20  # so that each training of the recipe has steps to average over
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,16 @@ class Tuning:
     device: Device
 
     def pipeline(self, stages: Sequence[str], values: Mapping[str, Any], **export: str) -> Pipeline:
-        """Return some stages of the recipe, in order, plus an export, with values set by key path."""
+        """Return a pipeline of these stages of the recipe and an export.  values: settings by key path."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        chosen = [*_choose_class(data["stages"], stages), {"export": {"file": MODEL, **export}}]
+        chosen = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, **export}}]
         document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
         pipeline = checked(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
             return pipeline
-        first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
+        first = next(stage for stage in data["stages"] if _has_name(stage, TRAINING))[TRAINING]["steps"]
         return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
 
     def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
@@ -97,15 +97,15 @@ class Tuning:
 def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
     """Run a pipeline in a folder; return the file that it writes.
 
-    A finished run is kept, an interrupted one resumes, and lost files are restored.  If all checkpoints are damaged,
+    A finished run is kept, an interrupted one resumes, and missing files are restored.  If all checkpoints are damaged,
     the run starts over.
     """
     state = RunState.read(folder)
     if not state.is_whole(pipeline):
-        is_whole = any(readable_checkpoints([CellAttempt(folder)]))
-        if state.checkpoints and not is_whole:
+        is_resumable = any(readable_checkpoints([CellAttempt(folder)]))
+        if state.checkpoints and not is_resumable:
             LOG.warning("%s: no checkpoint is intact; training starts over", folder)
-        start: Start = "new" if not path_exists(folder) else "resume" if is_whole else "restart"
+        start: Start = "new" if not path_exists(folder) else "resume" if is_resumable else "restart"
         try:
             run_pipeline(pipeline, state, device, start)
         except Interrupted as error:
@@ -124,17 +124,17 @@ def require_steps(steps: int) -> None:
         raise ConfigError(f"--steps {steps}: expected at least {MIN_STEPS}")
 
 
-def _choose_class(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
-    """Return the stages with these names, in order; their steps are counted from the first of them."""
-    chosen, left, skipped = [], iter(stages), 0
+def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
+    """Return the stages with these names, in order, with start steps relative to the first of them."""
+    chosen, remaining, skipped = [], iter(stages), 0
     for name in names:
-        while not _is(stage := next(left), name):
-            skipped += stage[TRAINING]["steps"] if _is(stage, TRAINING) else 0
-        chosen.append(_earlier(stage, skipped) if _is(stage, TRAINING) else stage)
+        while not _has_name(stage := next(remaining), name):
+            skipped += stage[TRAINING]["steps"] if _has_name(stage, TRAINING) else 0
+        chosen.append(_shift_start(stage, skipped) if _has_name(stage, TRAINING) else stage)
     return chosen
 
 
-def _earlier(training: Any, steps: int) -> Any:
+def _shift_start(training: Any, steps: int) -> Any:
     """Shift the start steps of a training's inner stages, which count from the start of the run, by `steps`."""
     keys = training[TRAINING]
     during = [
@@ -145,49 +145,51 @@ def _earlier(training: Any, steps: int) -> Any:
     return {TRAINING: {**keys, "during": during}}
 
 
-def _is(stage: Any, name: str) -> bool:
+def _has_name(stage: Any, name: str) -> bool:
     """Return whether a stage of a file, a name or a mapping, has this name."""
     return bool(stage == name or (isinstance(stage, dict) and name in stage))
 
 
 # A folder in which models are trained for one set of inputs, so that interrupted work can resume.
 
-WORDS = {"sha256": "the model's bytes"}  # descriptions of keys of a question
+LABELS = {"sha256": "the model's bytes"}  # of keys of a question, for messages
 
 
 @contextmanager
-def claim_folder(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
+def claim_folder(out: Path, question: dict[str, Any], record: str, content: str, remedy: str) -> Iterator[None]:
     """Create and lock a folder, write the question to its record, and remove files of killed processes.
 
-    what: what the folder is for, such as "a search"; remedy: what to give instead of this folder.
+    content: a noun for messages, such as "a search"; remedy: what to give instead of this folder.
     Raises ConfigError if the folder belongs to something else, and OutputError if another process uses it.
     """
-    _require_own(out, question, record, what, remedy)
+    _require_same_question(out, question, record, content, remedy)
     with raising_output_error(out):
         make_folder(out)
     with lock.lock_folder(out):
-        _require_own(out, question, record, what, remedy)  # again, because another process may have started
+        _require_same_question(
+            out, question, record, content, remedy
+        )  # again, because another process may have started
         remove_partial_files(out, border=PIPELINE)
         if not (out / record).exists():
             write_text(out / record, json.dumps(question, indent=1) + "\n")
         yield
 
 
-def _require_own(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> None:
-    """Raise ConfigError if a folder belongs to another question or has other files."""
+def _require_same_question(out: Path, question: dict[str, Any], record: str, content: str, remedy: str) -> None:
+    """Raise ConfigError if a folder has the record of other inputs, or files but no record."""
     if not path_exists(out / record):
         if path_exists(out) and not (out.is_dir() and all(_is_leftover(path.name) for path in out.iterdir())):
-            raise ConfigError(f"{out}: has other files than those of {what}; give {remedy}")
+            raise ConfigError(f"{out}: contains files that are not part of {content}; give {remedy}")
         return
     try:
-        before = read_json(out / record)
+        previous = read_json(out / record)
     except DataError:
-        before = None
-    if not isinstance(before, dict):
-        raise ConfigError(f"{out / record}: is not the record of {what}; remove {out} or give {remedy}")
-    differing = [WORDS.get(key, key) for key, value in question.items() if before.get(key) != value]
+        previous = None
+    if not isinstance(previous, dict):
+        raise ConfigError(f"{out / record}: is not the record of {content}; remove {out} or give {remedy}")
+    differing = [LABELS.get(key, key) for key, value in question.items() if previous.get(key) != value]
     if differing:
-        raise ConfigError(f"{out}: has {what} that differs in {', '.join(differing)}; remove it or give {remedy}")
+        raise ConfigError(f"{out}: has {content} that differs in {', '.join(differing)}; remove it or give {remedy}")
 
 
 def _is_leftover(name: str) -> bool:
@@ -220,9 +222,9 @@ class Measurer:
         return Identity.from_scene(scene, files).digest
 
     def figures(self, model: Model) -> tuple[float, float]:
-        """Return PSNR in dB and SSIM."""
-        views, placed = self.opened.scene.split(self.split), model.with_origin(self.opened.scene.origin)
-        painter = SplatPainter(self.rasterizer, placed.upload(self.opened.device), self.photographs.background)
+        """Return the mean PSNR in dB and the mean SSIM of a model."""
+        views, shifted = self.opened.scene.split(self.split), model.with_origin(self.opened.scene.origin)
+        painter = SplatPainter(self.rasterizer, shifted.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

@@ -22,7 +22,7 @@ def block_name(number: int) -> str:
 
 
 def is_in_blocks(folder: Path) -> bool:
-    """Return whether a folder is that of a scene in blocks."""
+    """Return whether a folder contains a scene trained in blocks."""
     return (folder / RECORD).is_file()
 
 
@@ -34,14 +34,14 @@ def status_of(folder: Path) -> dict[str, Any]:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a scene in blocks by `verify_blocks`, and anything else by `clsplat.runs.verify`."""
+    """Check a scene in blocks with `verify_blocks`, and anything else with `clsplat.runs.verify.check`."""
     return verify_blocks(Path(pipeline)) if is_in_blocks(Path(pipeline)) else verify.check(pipeline)
 
 
 def blocks_status(out: Path) -> dict[str, Any]:
-    """Return the `state` of a scene in blocks, and `parts`: the name and `run_status` of each run.
+    """Return the `state` of a scene in blocks, and `parts`: the name and status of each run.
 
-    The state is `done` when the merged model is done; before that running, failed, or unfinished.
+    The state is "done" when the merged model is finished, and "running", "failed", or "unfinished" before that.
     Raises DataError if the record is damaged.
     """
     parts = [{"name": name, **_status(out / name)} for name in _parts(out)]
@@ -60,15 +60,18 @@ def blocks_status(out: Path) -> dict[str, Any]:
 
 
 def verify_blocks(out: Path) -> dict[str, Any]:
-    """Verify all runs of a scene in blocks and the files next to them; return the same as `verify`, with a `remedy`."""
+    """Verify all runs of a scene in blocks and the files next to them.
+
+    Returns the keys of `clsplat.runs.verify.verify`, and `remedy`.
+    """
     state = blocks_status(out)["state"]
-    objects = list(_objects(out, state == "done"))
+    objects = list(_check_files(out, state == "done"))
     return {
         "run": str(out),
         "state": state,
         "whole": all(entry["whole"] for entry in objects),
         "objects": objects,
-        "remedy": f"run its `clsplat blocks … --out {shell_quote(out)}` again to restore lost files",
+        "remedy": f"run the same `clsplat blocks … --out {shell_quote(out)}` again to restore missing files",
     }
 
 
@@ -76,7 +79,7 @@ def _parts(out: Path) -> list[str]:
     """Return the run folders in the order of training."""
     record = read_json(out / RECORD)
     if not (isinstance(record, dict) and type(record.get("blocks")) is int):
-        raise DataError(f"{out / RECORD}: the number of blocks is missing; restore that file, or remove {out}")
+        raise DataError(f"{out / RECORD}: the number of blocks is missing; restore the file, or remove {out}")
     return [*([COARSE] if COARSE in record else []), *map(block_name, range(record["blocks"])), MERGED]
 
 
@@ -87,23 +90,23 @@ def _status(folder: Path) -> dict[str, Any]:
         return {"state": "unknown", "message": one_line(error)}
 
 
-def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
-    """Yield the result for each file; all files must exist when the scene is done."""
+def _check_files(out: Path, is_done: bool) -> Iterator[dict[str, Any]]:
+    """Yield the result of verifying each file; when the scene is done, all files must exist."""
 
-    def manifest(path: Path) -> str:
+    def describe_manifest(path: Path) -> str:
         data = read_json(path)
         if not (isinstance(data, dict) and isinstance(data.get("blocks"), list)):
             raise DataError("has no list of blocks")
         return f"of {len(data['blocks'])} blocks"
 
     parts = _parts(out)
-    looks: dict[str, Callable[[Path], str]] = {MANIFEST: manifest}
-    looks |= {f"{name}.ply": partial(verify.output, None) for name in parts if name != COARSE}
-    for name, look in looks.items():
-        if done or (out / name).exists():
-            yield verify.check_file(out, name, look)
+    readers: dict[str, Callable[[Path], str]] = {MANIFEST: describe_manifest}
+    readers |= {f"{name}.ply": partial(verify.output, None) for name in parts if name != COARSE}
+    for name, read in readers.items():
+        if is_done or (out / name).exists():
+            yield verify.check_file(out, name, read)
     for part in parts:
         if (state := RunState.read(out / part)).phase:
             yield from ({**entry, "file": f"{part}/{entry['file']}"} for entry in verify.verify(state)["objects"])
-        elif done:
+        elif is_done:
             yield {"file": part, "whole": False, "detail": "is missing"}

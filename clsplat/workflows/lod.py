@@ -66,7 +66,7 @@ class DetailLevel:
 
 
 class LevelTrainer:
-    """Trains and measures levels."""
+    """Fine-tunes levels on the photos of their scene, and measures them."""
 
     def __init__(self, opened: ModelFile, folder: Path, plan: LodPlan) -> None:
         self.folder, self.plan, self.source = folder, plan, opened.source
@@ -74,8 +74,8 @@ class LevelTrainer:
         self.measurer = Measurer(opened)
         self.tuning = Tuning("lod", opened.source, opened.gaussians, self.steps, opened.device)
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Lock the training folder during a block, if anything is trained."""
+    def lock(self) -> AbstractContextManager[None]:
+        """Return a context that locks the training folder, if anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
         question: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
@@ -83,14 +83,14 @@ class LevelTrainer:
         question["photographs"] = self.measurer.identity()
         return claim_folder(self.folder, question, RECORD, "the training of levels", "the name of another folder")
 
-    def measured(self, model: Model) -> DetailLevel:
-        """Measure a level without training."""
+    def measure(self, model: Model) -> DetailLevel:
+        """Measure the PSNR of a level without training it."""
         psnr = self.measurer.figures(model)[0]
         return DetailLevel(model, psnr, psnr)
 
     def train(self, number: int, model: Model) -> DetailLevel:
-        """Train and measure a level."""
-        merged = self.measured(model)
+        """Fine-tune a level, unless `steps` is 0, and measure its PSNR before and after."""
+        merged = self.measure(model)
         if not self.steps:
             return merged
         file = self.folder / f"level_{number}.ply"
@@ -98,19 +98,19 @@ class LevelTrainer:
         size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
         pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
         trained = load(self.tuning.train(pipeline, self.folder / f"level_{number}"))
-        return DetailLevel(trained, merged.psnr, self.measured(trained).psnr)
+        return DetailLevel(trained, merged.psnr, self.measure(trained).psnr)
 
 
 NEIGHBORS = 8  # candidates for merging with a Gaussian
 BLOCK = 1 << 16  # pairs per batch of costs
-LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # limits that keep derived numbers within float64
+LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # limits that keep derived values within float64
 Tables = dict[str, Floats]
 
 
 def decimate(model: Model, keep: float = 0.5) -> Model:
     """Reduce a model to a fraction of its Gaussians, at least one, by merging neighbors.
 
-    A world filter is baked.  Raises ConfigError for an invalid fraction, and DataError for values that are not finite.
+    A world filter is baked in.  Raises ConfigError for an invalid fraction, DataError for values that are not finite.
     """
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
@@ -120,67 +120,69 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
     target = min(len(plain), max(1, int(keep * len(plain) + 0.5)))
     if target == len(plain):
         return plain
-    tables = _settled(plain)
+    tables = _clipped_tables(plain)
     while (count := len(tables["means"])) > target:
         first, second = match_pairs(tables)
-        tables = _joined(tables, first[: count - target], second[: count - target])
+        tables = _merge_pairs(tables, first[: count - target], second[: count - target])
     fewer: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
     return replace(plain, **fewer)
 
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
     """Return disjoint pairs of rows, cheapest first; at least one pair if there are two rows."""
-    one, two = _neighbors(tables["means"])
-    cost = pair_cost(tables, one, two)
-    order = np.lexsort((two, one, np.where(np.isfinite(cost), cost, np.inf)))
-    free = bytearray(b"\1") * len(tables["means"])
+    first, second = _neighbors(tables["means"])
+    cost = pair_cost(tables, first, second)
+    order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
+    is_free = bytearray(b"\1") * len(tables["means"])
     chosen = []
     for start in range(0, len(order), BLOCK):
-        some = order[start : start + BLOCK]
-        for at, i, j in zip(some.tolist(), one[some].tolist(), two[some].tolist(), strict=True):
-            if free[i] and free[j]:
-                free[i] = free[j] = 0
-                chosen.append(at)
-    return one[chosen], two[chosen]
+        batch = order[start : start + BLOCK]
+        for pair, i, j in zip(batch.tolist(), first[batch].tolist(), second[batch].tolist(), strict=True):
+            if is_free[i] and is_free[j]:
+                is_free[i] = is_free[j] = 0
+                chosen.append(pair)
+    return first[chosen], second[chosen]
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
     """Return the cost of merging each pair, [pairs]; symmetric up to rounding."""
-    mass, size = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
+    mass, log_volume = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
-    return np.concatenate([_block_cost(tables, mass, size, first[block], second[block]) for block in blocks])
+    return np.concatenate([_block_cost(tables, mass, log_volume, first[block], second[block]) for block in blocks])
 
 
-def _block_cost(tables: Tables, mass: Floats, size: Floats, first: Rows, second: Rows) -> Floats:
+def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, second: Rows) -> Floats:
     mixtures = Mixtures.from_pairs(tables, mass, first, second)
-    share = mixtures.share[:, 0]
+    fraction = mixtures.share[:, 0]
     variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
-    cost: Floats = log_scales_of(variances).sum(axis=1) - (1 - share) * size[first] - share * size[second]
+    cost: Floats = (
+        log_scales_of(variances).sum(axis=1) - (1 - fraction) * log_volume[first] - fraction * log_volume[second]
+    )
     for name in ("sh_base", "sh_rest"):
         cost += np.square(tables[name][first] - tables[name][second]).sum(axis=1)
     return cost
 
 
 def _neighbors(means: Floats) -> tuple[Rows, Rows]:
-    """Return pairs of a row and one of its nearest neighbors, lower row first, unique and in ascending order.
+    """Return pairs of a row and one of its nearest neighbors: lower row first, unique, in ascending order.
 
     Rows at the same position form a chain, and only its first row has neighbors at other positions.
     """
     positions, first, position = np.unique(means, axis=0, return_index=True, return_inverse=True)
     count = len(positions)
     nearest = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
-    one, two = first[np.repeat(np.arange(count), nearest.shape[1])], first[nearest.ravel()]
+    row, other = first[np.repeat(np.arange(count), nearest.shape[1])], first[nearest.ravel()]
     order = np.argsort(position.ravel(), kind="stable")
-    same = np.diff(position.ravel()[order]) == 0
-    one = np.concatenate([one, order[:-1][same]])
-    two = np.concatenate([two, order[1:][same]])
-    count, apart = len(means), one != two
-    pairs = np.unique(np.minimum(one, two)[apart].astype(np.int64) * count + np.maximum(one, two)[apart])
+    is_same = np.diff(position.ravel()[order]) == 0
+    row = np.concatenate([row, order[:-1][is_same]])
+    other = np.concatenate([other, order[1:][is_same]])
+    count, differ = len(means), row != other
+    pairs = np.unique(np.minimum(row, other)[differ].astype(np.int64) * count + np.maximum(row, other)[differ])
     return pairs // count, pairs % count
 
 
-def _settled(model: Model) -> Tables:
-    """Return the tables in float64, clipped to the range of the formulas."""
+def _clipped_tables(model: Model) -> Tables:
+    """Return the tables in float64, with unit quaternions, clipped to the range of the formulas."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
     tables["quats"] = unit(tables["quats"])
     tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
@@ -188,24 +190,24 @@ def _settled(model: Model) -> Tables:
     return tables
 
 
-def _joined(tables: Tables, first: Rows, second: Rows) -> Tables:
-    """Return the tables with merged Gaussians at the rows `first`, without the rows `second`."""
-    kept = np.ones(len(tables["means"]), bool)
-    kept[second] = False
+def _merge_pairs(tables: Tables, first: Rows, second: Rows) -> Tables:
+    """Return the tables with each pair merged into its row of `first`, and the rows `second` removed."""
+    remains = np.ones(len(tables["means"]), bool)
+    remains[second] = False
     mixtures = merge(tables, first, second, surface)
     for name, values in mixtures.items():
         tables[name][first] = values
-    return {name: table[kept] for name, table in tables.items()}
+    return {name: table[remains] for name, table in tables.items()}
 
 
 LOG = logging.getLogger("clsplat")
-FEW = 1_000_000  # Gaussians; below, PlayCanvas recommends a single SOG
+MIN_GAUSSIANS = 1_000_000  # below this, PlayCanvas recommends a single SOG
 
 
 def levels_of_detail(
     model: Path, folder: Path, scene: Path | None = None, plan: LodPlan | None = None, device: Any = None
 ) -> dict[str, Any]:
-    """Write levels of detail as streamed SOG; return its `folder`, `bytes`, the measured `split`, and `levels`.
+    """Write levels of detail as streamed SOG; return the `folder`, its `bytes`, the measured `split`, and the `levels`.
 
     With photos, each coarser level is trained before the next one is merged from it, in run folders in FOLDER.training;
     interrupted training resumes.  Raises ConfigError, DataError, OutputError.
@@ -217,12 +219,12 @@ def levels_of_detail(
         raise DataError(f"{model}: the model has no Gaussians to merge")
     require_static(model, first.to_splat_file(), "SOG")
     require_in_range(model, first.to_splat_file(), "SOG")
-    if len(first) < FEW:
+    if len(first) < MIN_GAUSSIANS:
         count = pluralize(len(first), "Gaussian")
         LOG.warning("%s: has only %s; below a million a single SOG is better: `clsplat convert`", model, count)
     training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     with new_folder(folder) as new:
-        with training.locked() if training else nullcontext():
+        with training.lock() if training else nullcontext():
             levels = _levels(first, plan, training)
         digest = write_lod(new, [level.model.to_splat_file() for level in levels])
         write_sky_file(first.sky, new / LOD_META, digest)
@@ -238,7 +240,7 @@ def levels_of_detail(
 
 
 def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
-    """Return the model with its photos, or None without photos, and its Gaussians."""
+    """Return the model with its photos, or None if it has none, and its Gaussians with the world filter baked in."""
     run = run_of(model) if scene is None else None
     if scene is None and run is None:
         gaussians = _without_photos(model, plan, device, "has no known photos")
@@ -247,27 +249,27 @@ def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tupl
     try:
         opened = ModelFile(model, scene, device)
     except DataError as error:
-        if run is None or (fault := _fault_of_photographs(run)) is None:
+        if run is None or (photo_error := _photo_error(run)) is None:
             raise
         if plan.steps != 0:
-            raise DataError(f"{fault} (give --scene DIR, or --steps 0 to merge without photos)") from error
+            raise DataError(f"{photo_error} (give --scene DIR, or --steps 0 to merge without photos)") from error
         gaussians = _without_photos(model, plan, device, "its photos cannot be read")
-        LOG.warning("%s; levels are merged without training and not measured", fault)
+        LOG.warning("%s; levels are merged without training and not measured", photo_error)
         return None, gaussians
     return opened, opened.gaussians.baked()
 
 
-def _without_photos(model: Path, plan: LodPlan, device: Any, why: str) -> Model:
+def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Model:
     """Return the Gaussians of a model without photos.  Raises ConfigError for options that need photos."""
     gaussians = load(model).baked()
-    given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
-    if names := ", ".join(name for name, value in given.items() if value):
-        raise ConfigError(f"{model}: {why}, which {names} needs; give --scene, or leave that out")
+    options = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
+    if names := ", ".join(name for name, value in options.items() if value):
+        raise ConfigError(f"{model}: {reason}, which {names} needs; give --scene, or leave {names} out")
     return gaussians
 
 
-def _fault_of_photographs(run: Path) -> DataError | None:
-    """Return why the photos of a run cannot be read, or None."""
+def _photo_error(run: Path) -> DataError | None:
+    """Return the error that reading the photos of a run raises, or None."""
     try:
         read_scene(photographs_of(run))
     except DataError as error:
@@ -276,7 +278,7 @@ def _fault_of_photographs(run: Path) -> DataError | None:
 
 
 def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[DetailLevel]:
-    levels = [training.measured(first) if training else DetailLevel(first)]
+    levels = [training.measure(first) if training else DetailLevel(first)]
     for number in range(1, plan.levels):
         fewer = decimate(levels[-1].model, plan.keep)
         LOG.info("level %d: %s", number, pluralize(len(fewer), "Gaussian"))
@@ -296,10 +298,10 @@ def _figures(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
 HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 
 
-def table(found: dict[str, Any]) -> str:
+def table(result: dict[str, Any]) -> str:
     """Format the result of `levels_of_detail` as text."""
-    used = len(HEADINGS) if found["split"] else 3
-    return text_table([HEADINGS[:used], *(_cells(level)[:used] for level in found["levels"])])
+    columns = len(HEADINGS) if result["split"] else 3
+    return text_table([HEADINGS[:columns], *(_cells(level)[:columns] for level in result["levels"])])
 
 
 def _cells(level: dict[str, Any]) -> list[str]:

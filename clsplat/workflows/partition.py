@@ -26,8 +26,8 @@ from clsplat.workflows.folder import MANIFEST, block_name
 # Cells: the leaves of a kd-tree over the Gaussians of a coarse model, with equal shares of a weight.
 
 Floats = NDArray[np.float64]
-CORE = (0.01, 0.99)  # weight quantiles that define the size of a cell, because a few Gaussians are far away
-DIGITS = 9  # of a cut; more than float32 has
+SIZE_QUANTILES = (0.01, 0.99)  # by weight; the extremes would follow the few Gaussians that are far away
+DIGITS = 9  # significant digits of a cut; more than float32 has
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class PartitionCell:
     box: Box
     size: Floats  # [3] scene units, between quantiles of its Gaussians
 
-    def grown(self, share: float) -> Box:
-        """Return the box extended on each side by half of this fraction of its size."""
-        step = 0.5 * share * self.size
-        low = [None if b is None else _short(b - by) for b, by in zip(self.box.low, step, strict=True)]
-        high = [None if b is None else _short(b + by) for b, by in zip(self.box.high, step, strict=True)]
+    def extended(self, fraction: float) -> Box:
+        """Return the box extended on each side by half of `fraction` of the cell's size."""
+        step = 0.5 * fraction * self.size
+        low = [None if b is None else _rounded(b - by) for b, by in zip(self.box.low, step, strict=True)]
+        high = [None if b is None else _rounded(b + by) for b, by in zip(self.box.high, step, strict=True)]
         return Box(low=low, high=high)
 
 
@@ -56,43 +56,45 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Part
     return _cut(means.astype(np.float64), weights, Box(), count)
 
 
-def assign_cells(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[np.int64]:
-    """Return the index of the cell that contains each point of [N, 3], [N].
+def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) -> NDArray[np.int64]:
+    """Return the index of the cell that contains each mean, [N].  means: [N, 3].
 
-    Raises DataError for points that are not finite.
+    Raises DataError for means that are not finite.
     """
     owner = np.full(len(means), -1)
-    for number, cell in enumerate(found):
+    for number, cell in enumerate(partition):
         owner[cell.box.holds(means)] = number
     if (owner < 0).any():
-        lost = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
-        raise DataError(f"{lost} of the coarse model have positions that are not finite; train it again")
+        count = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
+        raise DataError(f"{count} of the coarse model have positions that are not finite; train it again")
     return owner
 
 
-def quantile(values: Floats, weights: Floats, share: float) -> float:
+def quantile(values: Floats, weights: Floats, fraction: float) -> float:
     """Return the weighted quantile of values, [N]: the smallest value that reaches this fraction of the weights."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
-    return float(values[order[min(int(np.searchsorted(total, share * total[-1])), len(order) - 1)]])
+    return float(values[order[min(int(np.searchsorted(total, fraction * total[-1])), len(order) - 1)]])
 
 
 def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
-    """Split a box with these Gaussians into cells."""
-    bounds = np.array([[quantile(means[:, axis], weights, share) for axis in range(3)] for share in CORE])
+    """Split a box recursively, with the Gaussians inside it, into `count` cells."""
+    bounds = np.array(
+        [[quantile(means[:, axis], weights, fraction) for axis in range(3)] for fraction in SIZE_QUANTILES]
+    )
     size = bounds[1] - bounds[0]
     if count == 1:
         return [PartitionCell(box, size)]
-    axis, first = int(size.argmax()), count // 2
-    cut = _short(quantile(means[:, axis], weights, first / count))
+    axis, count_below = int(size.argmax()), count // 2
+    cut = _rounded(quantile(means[:, axis], weights, count_below / count))
     below = means[:, axis] < cut
     if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
         raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; give fewer --blocks")
-    parts = ((below, "high", first), (~below, "low", count - first))
+    halves = ((below, "high", count_below), (~below, "low", count - count_below))
     return [
         cell
-        for chosen, side, shares in parts
-        for cell in _cut(means[chosen], weights[chosen], _with_bound(box, side, axis, cut), shares)
+        for rows, side, cells_in_half in halves
+        for cell in _cut(means[rows], weights[rows], _with_bound(box, side, axis, cut), cells_in_half)
     ]
 
 
@@ -102,72 +104,72 @@ def _with_bound(box: Box, side: str, axis: int, cut: float) -> Box:
     return box.model_copy(update={side: bounds})
 
 
-def _short(value: float) -> float:
+def _rounded(value: float) -> float:
     """Round a value to the digits stored in files."""
     return float(f"{value:.{DIGITS}g}")
 
 
-# The views of a block: those with cameras in its cell, and those of which it covers enough pixels.
+# The views of a block: cameras inside its cell, and views of which its Gaussians cover enough pixels.
 
-Why = Literal["place", "sight", "best"]
+Reason = Literal["inside", "coverage", "best"]
 
 
 @dataclass(frozen=True)
 class Membership:
     """Which of V views belong to which of B blocks."""
 
-    share: Floats  # [V, B] fraction of a view's pixels covered by a cell's Gaussians, by blending weight
+    coverage: Floats  # [V, B] fraction of a view's pixels covered by a cell's Gaussians, by blending weight
     inside: NDArray[np.bool_]  # [V, B] whether the camera is in the cell
-    sight: float  # fraction of pixels above which a view belongs to a block
+    min_coverage: float  # fraction of pixels above which a view belongs to a block
 
     @property
     def view_blocks(self) -> NDArray[np.bool_]:
-        """The blocks of each view, [V, B]; at least the one that it shows most of."""
-        best = np.arange(self.share.shape[1]) == self.share.argmax(axis=1)[:, None]
-        return np.asarray(best | self.inside | (self.share > self.sight))
+        """Whether each view belongs to each block, [V, B]; each view belongs at least to the block it shows most of."""
+        best = np.arange(self.coverage.shape[1]) == self.coverage.argmax(axis=1)[:, None]
+        return np.asarray(best | self.inside | (self.coverage > self.min_coverage))
 
     @property
-    def chosen(self) -> NDArray[np.bool_]:
-        """The blocks of each view, [V, B]; a block without views gets the view that shows most of it."""
+    def assigned(self) -> NDArray[np.bool_]:
+        """As `view_blocks`, [V, B], but a block without views gets the view that shows most of it."""
         blocks = self.view_blocks
         for block in np.flatnonzero(~blocks.any(axis=0)):
-            blocks[self.share[:, block].argmax(), block] = True
+            blocks[self.coverage[:, block].argmax(), block] = True
         return blocks
 
-    def why(self, view: int, block: int) -> Why:
-        """Return the reason why a view belongs to a block."""
+    def reason(self, view: int, block: int) -> Reason:
+        """Return why a view belongs to a block: by its camera, its coverage, or because it shows most of it."""
         if self.inside[view, block]:
-            return "place"
-        return "sight" if self.share[view, block] > self.sight else "best"
+            return "inside"
+        return "coverage" if self.coverage[view, block] > self.min_coverage else "best"
 
 
-def count_pairs(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
-    """Return the number of (tile, Gaussian) pairs of `count` Gaussians over all views, [N], a proxy of training cost.
+def count_pairs(renders: Iterable[RenderedView], count: int, tile: int) -> Floats:
+    """Estimate the number of (tile, Gaussian) pairs of each Gaussian over all views, [N], a proxy for training cost.
 
-    It is estimated from the radius of each splat, bounded by the image size.
+    count: N; tile: side in px.  The estimate uses the radius of each splat and is bounded by the image size.
     """
     total = np.zeros(count)
-    for look in looks:
-        camera, radius = look.photograph.camera, look.radius().astype(np.float64)
+    for render in renders:
+        camera, radius = render.photograph.camera, render.radius().astype(np.float64)
         sides = [np.minimum(2 * radius / tile + 1, -(-side // tile)) for side in (camera.width, camera.height)]
         total += np.where(radius > 0, sides[0] * sides[1], 0)
     return total
 
 
-def pixel_share(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
+def view_coverage(render: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the fraction of a view's pixels covered by each block, [B], and which Gaussians are visible, [N].
 
     owner: the block of each Gaussian, [N].  Masked pixels do not count.
     """
-    weight = look.sum(WEIGHT)
-    pixels = max(int(look.counted().sum()), 1)
+    weight = render.sum(WEIGHT)
+    pixels = max(int(render.counted().sum()), 1)
     return np.bincount(owner, weight.astype(np.float64), blocks) / pixels, weight > 0
 
 
 LOG = logging.getLogger("clsplat")
 Bits = NDArray[np.bool_]
 NEAR_CELL, GROWTH = 0.2, 0.2  # fractions of a cell's size by which it is extended, for cameras and for densification
-SIGHT = 0.05  # fraction of a view's pixels
+MIN_COVERAGE = 0.05  # fraction of a view's pixels
 
 
 @dataclass(frozen=True)
@@ -176,12 +178,12 @@ class Block:
 
     number: int
     cell: PartitionCell
-    gaussians: int  # of the coarse model that it owns
+    gaussians: int  # number of the coarse model's Gaussians in its cell
     pairs: float  # fraction of all pairs
-    start: Bits  # [N] initial Gaussians: its own, those that its views see, and those that no view sees
-    views: list[dict[str, Any]]  # name, why, and share of pixels
+    start: Bits  # [N] initial Gaussians: in its cell, visible in its views, or visible in no view
+    views: list[dict[str, Any]]  # name, why, and share: the fraction of pixels covered
     memory: int  # device memory at the start, bytes
-    origin: NDArray[np.floating]  # [3] world coordinates of the zero of `cell`
+    origin: NDArray[np.floating]  # [3] world coordinates of the origin of `cell`
 
     @property
     def name(self) -> str:
@@ -196,14 +198,14 @@ class Block:
     @property
     def growth(self) -> Box:
         """The box in which Gaussians grow, in world coordinates."""
-        return self.cell.grown(GROWTH).shifted(-self.origin)
+        return self.cell.extended(GROWTH).shifted(-self.origin)
 
     def data(self) -> dict[str, Any]:
         """Return the block's entry in the manifest."""
-        grown = {"cell": self.box, "growth": self.growth}
+        boxes = {"cell": self.box, "growth": self.growth}
         return {
             "name": self.name,
-            **{name: box.model_dump() for name, box in grown.items()},
+            **{name: box.model_dump() for name, box in boxes.items()},
             "gaussians": self.gaussians,
             "start": int(self.start.sum()),
             "pairs": self.pairs,
@@ -214,7 +216,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Partition:
-    """All blocks, and properties of the whole scene."""
+    """The blocks of a scene, the coarse model, and figures of the whole scene."""
 
     blocks: list[Block]
     model: Model  # the coarse one
@@ -224,9 +226,9 @@ class Partition:
     views: int
 
     def data(self) -> dict[str, Any]:
-        """Return the manifest."""
-        whole = {"gaussians": len(self.model), "views": self.views, "extent": self.extent, "memory": self.memory}
-        return {"coarse": self.coarse, **whole, "blocks": [block.data() for block in self.blocks]}
+        """Return the manifest as JSON data."""
+        scene = {"gaussians": len(self.model), "views": self.views, "extent": self.extent, "memory": self.memory}
+        return {"coarse": self.coarse, **scene, "blocks": [block.data() for block in self.blocks]}
 
     def write(self, folder: Path) -> None:
         """Write the manifest and, next to it, the initial Gaussians of each block."""
@@ -244,66 +246,70 @@ class Partitioner:
         self.extent = scene.extent
         self._rasterizer, self._uploaded = Rasterizer(device), model.upload(device)
 
-    def partition(self, count: int, coarse: str, sight: float = SIGHT) -> Partition:
-        """Split the model into `count` blocks.  coarse: SHA-256 of its file; sight: as in `Membership`.
+    def partition(self, count: int, coarse: str, min_coverage: float = MIN_COVERAGE) -> Partition:
+        """Split the model into `count` blocks.  coarse: SHA-256 of its file; min_coverage: as in `Membership`.
 
         Each view is rendered twice.  Raises DataError if the model cannot be split into that many blocks.
         """
         means, total = self.model.means, len(self.model)
-        pairs = count_pairs(self._looks(self.views), total, int(self.device.tuning["TILE"]))
-        found = cells(means, pairs, count)
-        owner = assign_cells(means, found)
-        members, seen = self._members(owner, found, sight)
+        pairs = count_pairs(self._render(self.views), total, int(self.device.tuning["TILE"]))
+        partition_cells = cells(means, pairs, count)
+        owner = assign_cells(means, partition_cells)
+        members, needed = self._members(owner, partition_cells, min_coverage)
         blocks = [
             Block(
                 number,
                 cell,
                 int((owner == number).sum()),
                 float(pairs[owner == number].sum() / (pairs.sum() or 1)),
-                start := seen[number] | (owner == number),
-                self._listed(members, number),
-                self._memory(int(start.sum()), np.flatnonzero(members.chosen[:, number]).tolist()),
+                start := needed[number] | (owner == number),
+                self._view_entries(members, number),
+                self._memory(int(start.sum()), np.flatnonzero(members.assigned[:, number]).tolist()),
                 self.model.origin,
             )
-            for number, cell in enumerate(found)
+            for number, cell in enumerate(partition_cells)
         ]
         memory = self._memory(total, range(len(self.views)))
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
-    def _members(self, owner: NDArray[np.int64], found: list[PartitionCell], sight: float) -> tuple[Membership, Bits]:
-        """Return the views of each block, and the Gaussians that they see or that no view sees, [B, N]."""
+    def _members(
+        self, owner: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
+    ) -> tuple[Membership, Bits]:
+        """Return the views of each block, and the Gaussians visible in its views or in no view, [B, N]."""
         positions = np.stack([view.position for view in self.views])
-        inside = np.stack([cell.grown(NEAR_CELL).holds(positions) for cell in found], axis=1)
-        shares, seen = np.zeros(inside.shape), np.zeros((len(found), len(owner)), bool)
-        for view, look in enumerate(self._looks(self.views)):
-            shares[view], visible = pixel_share(look, owner, len(found))
-            seen[Membership(shares[[view]], inside[[view]], sight).view_blocks[0]] |= visible
-        members = Membership(shares, inside, sight)
-        for view, block in np.argwhere(members.chosen & ~members.view_blocks):
-            (look,) = self._looks([self.views[view]])
-            seen[block] |= pixel_share(look, owner, len(found))[1]
-        return members, seen | ~seen.any(axis=0)  # Gaussians hidden from all views may become visible in any
+        inside = np.stack([cell.extended(NEAR_CELL).holds(positions) for cell in partition], axis=1)
+        coverage, visible_in_block = np.zeros(inside.shape), np.zeros((len(partition), len(owner)), bool)
+        for view, render in enumerate(self._render(self.views)):
+            coverage[view], visible = view_coverage(render, owner, len(partition))
+            visible_in_block[Membership(coverage[[view]], inside[[view]], min_coverage).view_blocks[0]] |= visible
+        members = Membership(coverage, inside, min_coverage)
+        for view, block in np.argwhere(members.assigned & ~members.view_blocks):
+            (render,) = self._render([self.views[view]])
+            visible_in_block[block] |= view_coverage(render, owner, len(partition))[1]
+        return members, visible_in_block | ~visible_in_block.any(
+            axis=0
+        )  # Gaussians hidden from all views may become visible in any
 
-    def _looks(self, views: Sequence[View]) -> Iterator[RenderedView]:
+    def _render(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
         return RenderedView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
-    def _listed(self, members: Membership, block: int) -> list[dict[str, Any]]:
-        """Return the views of a block, in scene order, with reasons."""
+    def _view_entries(self, members: Membership, block: int) -> list[dict[str, Any]]:
+        """Return the manifest entries of a block's views, in scene order."""
         return [
             {
                 "name": self.views[view].name,
-                "why": members.why(view, block),
-                "share": round(float(members.share[view, block]), 4),
+                "why": members.reason(view, block),
+                "share": round(float(members.coverage[view, block]), 4),
             }
-            for view in np.flatnonzero(members.chosen[:, block]).tolist()
+            for view in np.flatnonzero(members.assigned[:, block]).tolist()
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:
         """Return the device memory, bytes, of a training that starts with these Gaussians and views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
-        held = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
+        cached = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
         motion = self.model.motion
         tables = first_tables(self.model.sh_degree, 0 if motion is None else motion.shape[1])
-        return plan(self.device.info, tables, held, max(sizes) // 4).needed(gaussians)
+        return plan(self.device.info, tables, cached, max(sizes) // 4).needed(gaussians)

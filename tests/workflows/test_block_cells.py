@@ -34,9 +34,9 @@ def test_long_sides_are_cut_and_thin_ones_are_not(rng):
 def test_cell_grows_by_half_the_share_on_each_bounded_side():
     left, right = cells(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
     assert 0 < left.box.high[0] == right.box.low[0] <= 10
-    assert left.grown(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])
-    assert right.grown(0.2).low[0] == pytest.approx(right.box.low[0] - 0.1 * right.size[0])
-    assert right.grown(0.2).high == [None] * 3
+    assert left.extended(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])
+    assert right.extended(0.2).low[0] == pytest.approx(right.box.low[0] - 0.1 * right.size[0])
+    assert right.extended(0.2).high == [None] * 3
 
 
 def test_nothing_is_not_cut():
@@ -60,14 +60,14 @@ def test_a_quantile_follows_the_weights():
     assert quantile(np.array([3.0, 1, 2]), np.array([1.0, 1, 8]), 0.5) == 2
 
 
-def test_views_belong_by_place_by_sight_and_to_their_best_block():
+def test_views_belong_by_camera_by_coverage_or_to_the_best_block():
     share = np.array([[0.9, 0.2, 0.0], [0.04, 0.03, 0.0], [0.0, 0.0, 0.0]])
     inside = np.array([[False, False, False], [False, True, False], [False, False, False]])
-    members = Membership(share, inside, sight=0.05)
+    members = Membership(share, inside, min_coverage=0.05)
     chosen = [[True, True, True], [True, True, False], [True, False, False]]  # the last block has but a best view
-    assert members.chosen.tolist() == chosen
-    reasons = [members.why(view, block) for view, block in ((0, 0), (1, 0), (1, 1), (0, 2))]
-    assert reasons == ["sight", "best", "place", "best"]
+    assert members.assigned.tolist() == chosen
+    reasons = [members.reason(view, block) for view, block in ((0, 0), (1, 0), (1, 1), (0, 2))]
+    assert reasons == ["coverage", "best", "inside", "best"]
 
 
 def written(path: Path, rng: np.random.Generator, count: int, near: float = 0.2) -> dict[str, np.ndarray]:
@@ -103,4 +103,4 @@ def test_models_that_do_not_fit_together_are_not_joined(rng, tmp_path):
 
 def test_a_box_of_all_space_is_the_cell_of_one_block():
     (cell,) = cells(np.zeros((3, 3)), np.zeros(3), 1)
-    assert cell.box == cell.grown(0.2) == Box()
+    assert cell.box == cell.extended(0.2) == Box()

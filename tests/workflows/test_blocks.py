@@ -279,11 +279,11 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
         ("scene.validation=4", "scene.validation cannot be used with blocks: a block has no validation views"),
         (
             "densify.inside={low: [0, null, null]}",
-            "densify.inside cannot be used with blocks: blocks set it; leave it out",
+            "densify.inside cannot be used with blocks: each block sets it; leave it out",
         ),
         (
             "densify.budget={type: parabola, gaussians: 900}",
-            "densify.budget cannot be used with blocks: it counts all",
+            "densify.budget cannot be used with blocks: it limits the whole",
         ),
         ("densify.per_pixel=0.1", "densify.per_pixel cannot be used with blocks: blocks have different photos"),
         ("init.source=random", "start with `init: {source: model}`, and add a stage 'optimize'"),

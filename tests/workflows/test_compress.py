@@ -23,7 +23,7 @@ from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import ModelSource, evaluate
 from clsplat.training.run import Run
 from clsplat.workflows import compress
-from clsplat.workflows.compress import FITTING, CompressionTarget, Ladder, Point, checked_keeps, page, table
+from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Ladder, Point, ordered_keeps, page, table
 from clsplat.workflows.finetune import Tuning
 from tests.support.html_page import Page
 from tests.support.runs import NO_PROCESS
@@ -58,7 +58,7 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_targets(text, most, change):
     found = CompressionTarget.parse(text)
-    assert (found.most, found.change) == (most, change)
+    assert (found.max_bytes, found.psnr_change) == (most, change)
 
 
 @pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
@@ -87,10 +87,10 @@ def test_the_best_of_a_size_and_the_smallest_of_a_loss():
 
 def test_the_search_goes_down_until_it_cannot_be_better():
     rung = [point(900, 30.0), point(500, 29.5)]
-    assert not CompressionTarget.parse("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
-    assert CompressionTarget.parse("1kB").ends(rung, 30), "all fit"
-    assert not CompressionTarget.parse("-0.1dB").ends(rung, 30)
-    assert CompressionTarget.parse("0dB").ends(rung, 31), "none is good enough"
+    assert not CompressionTarget.parse("600B").is_decided(rung, 30), "fewer Gaussians let more settings fit"
+    assert CompressionTarget.parse("1kB").is_decided(rung, 30), "all fit"
+    assert not CompressionTarget.parse("-0.1dB").is_decided(rung, 30)
+    assert CompressionTarget.parse("0dB").is_decided(rung, 31), "none is good enough"
 
 
 def test_unsearched_format_is_refused_before_anything_is_opened():
@@ -101,8 +101,8 @@ def test_unsearched_format_is_refused_before_anything_is_opened():
 @pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [float("nan")], [0.501, 0.5]])
 def test_what_are_no_shares_is_refused(keeps):
     with pytest.raises(ConfigError, match="--keep: expected fractions"):
-        checked_keeps(keeps)
-    assert checked_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
+        ordered_keeps(keeps)
+    assert ordered_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
 
 
 def test_every_file_is_measured_as_it_is_read_back(searched, few_steps, tiny_scene):
@@ -169,7 +169,7 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
     monkeypatch.setattr(model_file, "load", load)
     monkeypatch.setattr(compress, "load", load)
     (tmp_path / "own.txt").write_text("mine")
-    with pytest.raises(ConfigError, match="has other files"):
+    with pytest.raises(ConfigError, match="contains files that are not part of"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
     assert opened == [few_steps / "point_cloud.ply"]
 
@@ -194,7 +194,7 @@ def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
     with pytest.raises(ConfigError, match="a search that differs in steps; remove it or give another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
-    with pytest.raises(ConfigError, match="has other files than those of a search"):
+    with pytest.raises(ConfigError, match="contains files that are not part of a search"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
 
 
@@ -308,7 +308,7 @@ def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, 
     """Their steps count from the first stage that is run, not from that of the recipe."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     tuning = Tuning("compress", ModelSource.of(few_steps, None), model, steps, None)
-    settings = tuning.pipeline(FITTING, {"init.file": str(few_steps / "point_cloud.ply")}).settings
+    settings = tuning.pipeline(SOG_STAGES, {"init.file": str(few_steps / "point_cloud.ply")}).settings
     trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
     assert tuple(training.steps for training in trainings) == lengths
     assert tuple(training.during[-1].start for training in trainings) == starts

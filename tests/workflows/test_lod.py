@@ -119,7 +119,7 @@ def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
 def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
-    message = rf"model\.ply: has no known photos, which --{option} needs; give --scene, or leave that out$"
+    message = rf"model\.ply: has no known photos, which --{option} needs; give --scene, or leave --{option} out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(alone, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
@@ -145,7 +145,7 @@ def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog
 
 
 def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
-    message = r"run: its photos cannot be read, which --device needs; give --scene, or leave that out$"
+    message = r"run: its photos cannot be read, which --device needs; give --scene, or leave --device out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
