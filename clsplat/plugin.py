@@ -31,7 +31,7 @@ from clsplat.render.filters import FilterViews, ScreenFilter, WorldFilter
 from clsplat.render.workspace import Workspace
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import pose_matrix
-from clsplat.scene.images import require_files, safe_join
+from clsplat.scene.lookup import require_files, safe_join
 from clsplat.scene.quality import Measures
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError
 from clsplat.core.files import write_text
 from clsplat.scene.images import read_image, write_image
-from clsplat.scene.transforms_json import Transforms, view_name
+from clsplat.scene.transforms_json import FrameFiles, Transforms, view_name
 
 MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scenes
 
@@ -49,8 +49,9 @@ def pyramid(pixels: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
 
 def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> dict[str, Any]:
     """Write one split's images and return its columns, one value for each image."""
-    rows = []
-    for i, (frame, view) in enumerate(zip(transforms.frames, transforms.views(), strict=True)):
+    folder, rows = transforms.path.parent, []
+    views = filter(None, FrameFiles(folder, folder, transforms.frames).views(transforms.path, "refuse"))
+    for i, (frame, view) in enumerate(zip(transforms.frames, views, strict=True)):
         pixels = read_image(view.image_path)
         height, width = pixels.shape[:2]
         if pixels.dtype != np.uint8 or height % 2 ** (levels - 1) or width % 2 ** (levels - 1):

@@ -22,7 +22,7 @@ from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, RenderLimits
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import Missing
+from clsplat.scene.lookup import Missing
 from clsplat.scene.photographs import with_masks
 from clsplat.scene.scene import HOLDOUT, Background, Scene
 from clsplat.scene.view import Alpha

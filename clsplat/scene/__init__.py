@@ -4,8 +4,8 @@ from clsplat.core.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.colmap import pose_matrix as pose_matrix
 from clsplat.scene.detect import read_scene as read_scene
-from clsplat.scene.images import require_files as require_files
-from clsplat.scene.images import safe_join as safe_join
+from clsplat.scene.lookup import require_files as require_files
+from clsplat.scene.lookup import safe_join as safe_join
 from clsplat.scene.reader import Parts as Parts
 from clsplat.scene.reader import Reader as Reader
 from clsplat.scene.scene import PointCloud as PointCloud

@@ -5,6 +5,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,14 +17,14 @@ from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, intern_lens
 from clsplat.scene.camera import MODELS as LENS_MODELS
-from clsplat.scene.images import find_existing, safe_join
-from clsplat.scene.photographs import find_mask
+from clsplat.scene.lookup import FileLookup
+from clsplat.scene.photographs import find_masks
 from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.reprojection import reprojection_residuals
 from clsplat.scene.scene import PointCloud, Scene, Tracks, every_nth, make_scene
 from clsplat.scene.times_file import add_times
-from clsplat.scene.view import View
+from clsplat.scene.view import NO_FILE, View, fit_to_photograph
 
 # Define the records of a COLMAP model: camera models, cameras and images.
 
@@ -331,11 +332,14 @@ class ColmapReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         model, images = _largest_model(path)
         cameras = read_cameras(model)
-        folder = image_folder(path)
-        views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-        on_disk = find_existing(path, [view.image_path for view in views], self.missing)
-        skipped = tuple(view.name for view, exists in zip(views, on_disk, strict=True) if not exists)
-        views = add_times([view for view, exists in zip(views, on_disk, strict=True) if exists], folder)
+        images, files, masks = self._files_of(path, images)
+        views = [view_of(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
+        on_disk = files.existing(path, self.missing, [image.where for image in images])
+        ordered = sorted(zip(views, on_disk, strict=True), key=lambda pair: pair[0].name)
+        skipped = tuple(view.name for view, exists in ordered if not exists)
+        views = add_times([view for view, exists in ordered if exists], files.folder)
+        if files.reduced:
+            images, views = _fit_reduced(images, views, files.reduced)
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
@@ -348,21 +352,40 @@ class ColmapReader(Reader):
         model, images = models[0]
         cameras = parts.attempt(read_cameras, model)
         parts.points = parts.attempt(read_point_table, model)
-        parts.image_folder = folder = image_folder(parts.path)
-        files = [parts.attempt(safe_join, folder, image.name, image.where) for image in images]
-        parts.expected = [file for file in files if file]
-        for image in images if cameras else []:
-            if view := parts.attempt(view_of, image, cameras, folder):
+        images, files, masks = self._files_of(parts.path, images)
+        parts.image_folder = files.folder
+        parts.expect(files)
+        for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
+            if view := parts.attempt(view_of, image, cameras, file, mask):
                 parts.views.append(view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = image.observed
 
+    def _files_of(
+        self, path: Path, images: Sequence[ImageRecord]
+    ) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
+        """Return images with the names of their files, the files, and masks."""
+        folder = image_folder(path, self.root)
+        files = FileLookup(self.root or folder.parent, folder, [image.name for image in images])
+        renamed = [image._replace(name=name) for image, name in zip(images, files.names, strict=True)]
+        return renamed, files, find_masks(folder.with_name("masks"), files.names)
+
+
+def _fit_reduced(
+    images: list[ImageRecord], views: list[View], reduced: set[Path]
+) -> tuple[list[ImageRecord], list[View]]:
+    """Return images and views with pixels and cameras at the size of reduced photographs."""
+    fitted = [fit_to_photograph(view) if view.image_path in reduced else view for view in views]
+    widths = [[(view.lens or view.camera).width for view in pair] for pair in zip(fitted, views, strict=True)]
+    scales = {view.name: new / old for view, (new, old) in zip(views, widths, strict=True)}
+    return [image._replace(pixels=image.pixels * scales.get(image.name, 1.0)) for image in images], fitted
+
 
 def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
-    """Return a view for each image of the largest model, whether or not the file exists, and the points."""
+    """Return a view without a photograph for each image of the largest model, and the points."""
     model, images = _largest_model(path)
-    cameras, folder, table = read_cameras(model), image_folder(path), read_point_table(model)
-    return [view_of(image, cameras, folder) for image in images], table.cloud() if table else None
+    cameras, table = read_cameras(model), read_point_table(model)
+    return [view_of(image, cameras) for image in images], table.cloud() if table else None
 
 
 def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
@@ -400,14 +423,20 @@ def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     return best
 
 
-def image_folder(path: Path) -> Path:
-    """Return `images` next to `sparse` if `path` is `sparse` or one of its models, otherwise `images` in `path`."""
-    return next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path) / "images"
+def image_folder(path: Path, root: Path | None = None) -> Path:
+    """Return `images` next to `sparse` if `path` is `sparse` or one of its models, otherwise `images` in `path`.
+
+    Without that folder, return the first `images` above it that is not above `root`.
+    """
+    folder = next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path)
+    above = [folder, *(parent for parent in folder.parents if root and parent.is_relative_to(root))]
+    return next((parent / "images" for parent in above if (parent / "images").is_dir()), above[-1] / "images")
 
 
-def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
+def view_of(
+    image: ImageRecord, cameras: dict[int, CameraRecord], file: Path = NO_FILE, mask: Path | None = None
+) -> View:
     """Return the view of an image.  Raises DataError if the image or its camera is invalid."""
-    image_path = safe_join(folder, image.name, image.where)
     if image.camera not in cameras:
         raise DataError(
             f"{image.where}: image {quote(image.name)} names camera {image.camera}; expected one of the cameras file, "
@@ -421,7 +450,7 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
         ) from error
     lens = intern_lens(_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
-    return View(image.name, camera, pose, image_path, find_mask(folder.with_name("masks"), image.name), lens=distortion)
+    return View(image.name, camera, pose, file, mask, lens=distortion)
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:

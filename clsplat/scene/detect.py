@@ -1,12 +1,15 @@
 """Find the reader of a dataset among shipped readers and those of plug-ins."""
 
-from pathlib import Path
+import logging
+from dataclasses import replace
+from pathlib import Path, PureWindowsPath
 
-from clsplat.core.errors import ConfigError, DataError, shell_quote
+from clsplat.core.errors import ConfigError, DataError, first_few, shell_quote
 from clsplat.formats.table import detect as model_format
-from clsplat.scene.colmap import ColmapReader
+from clsplat.scene.colmap import ColmapReader, find_models, read_images
 from clsplat.scene.images import is_image
 from clsplat.scene.llff import LlffReader
+from clsplat.scene.lookup import walk_folders
 from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
@@ -47,9 +50,66 @@ def find_reader(path: Path) -> Reader | None:
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
+Found = tuple[Reader, Path]  # a dataset: its reader and its folder
+MAX_DEPTH = 2  # folders between a scene and the dataset in it
+logger = logging.getLogger("clsplat")
+
+
+def find_datasets(path: Path) -> list[Found]:
+    """Return the dataset in a folder, otherwise all in the folders one and two levels below it."""
+    datasets = list[Found]()
+    if reader := find_reader(path):
+        return [(reader, path)]
+    for folder, _ in walk_folders(path, MAX_DEPTH):
+        if any(folder.is_relative_to(above) for _, above in datasets):
+            continue
+        if reader := find_reader(folder):
+            reader.root = path
+            datasets.append((reader, folder))
+    return datasets
+
+
+def find_dataset(path: Path) -> Found | None:
+    """Return the dataset in a folder or, if it is the only one, below it; None without one.
+
+    Several COLMAP models of the same photographs count as one: the model next to a folder `images`, otherwise that with
+    the most images, otherwise that of binary files.  Raises DataError, with a list, for other datasets.
+    """
+    datasets = find_datasets(path)
+    if len(datasets) <= 1:
+        return datasets[0] if datasets else None
+    names = {folder: image_names(folder) for _, folder in datasets if find_models(folder)}
+    ranks = {
+        folder: ((folder / "images").is_dir(), len(images), bool([*folder.rglob("cameras.bin")]))
+        for folder, images in names.items()
+    }
+    best = max(ranks.values(), default=None)
+    chosen = [found for found in datasets if ranks.get(found[1]) == best]
+    if len(names) == len(datasets) and len(chosen) == 1:
+        reader, folder = chosen[0]
+        if all(images & names[folder] for images in names.values()):
+            return reader, folder
+    listed = first_few([f"{folder.relative_to(path)} ({reader.name})" for reader, folder in datasets])
+    raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {listed}; give the folder of one of them")
+
+
+def image_names(folder: Path) -> set[str]:
+    """Return the comparable names of the images of a COLMAP dataset; none if it is damaged."""
+    try:
+        return {PureWindowsPath(image.name).stem for model in find_models(folder) for image in read_images(model)}
+    except DataError:
+        return set()
+
+
+def place_note(path: Path, found: Found) -> str:
+    """Return a sentence that says which dataset below `path` is read; "" for a dataset in `path` itself."""
+    reader, folder = found
+    return "" if folder == path else f"the {reader.name} dataset in {folder.relative_to(path).as_posix()} is used"
+
+
 def is_scene(path: Path) -> bool:
     """Return whether a folder holds a dataset in a format that read_scene can read."""
-    return find_reader(path) is not None
+    return bool(find_datasets(path))
 
 
 def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
@@ -66,9 +126,12 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             fault = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
         raise DataError(f"{path}: {fault}; expected the folder of a dataset")
     split = holdout if isinstance(holdout, Split) else Split(holdout)
-    if reader := find_reader(path):
+    if found := find_dataset(path):
+        reader, folder = found
+        if note := place_note(path, found):
+            logger.info("%s: %s", path, note)
         reader.missing = split.missing
-        return split.applied(reader.read(path, split.of_reader))
+        return split.applied(replace(reader.read(folder, split.of_reader), path=path))
     if any(is_image(file) for file in path.iterdir()):
         raise DataError(
             f"{path}: photographs without cameras; `clsplat run photos --scene {shell_quote(path)}` finds the cameras"

@@ -1,22 +1,20 @@
 """Read the image files of a dataset: headers, pixels, EXIF data; write images."""
 
 import json
-import logging
 import math
-import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any, Literal
+from pathlib import Path, PurePath
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quote, shorten
+from clsplat.core.errors import DataError, quote
 from clsplat.core.files import open_atomic, write_text
 from clsplat.core.reading import open_file, read_file, read_json
 
@@ -154,8 +152,6 @@ def strip_png_metadata(data: bytes) -> bytes:
 
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
-logger = logging.getLogger("clsplat")
-Missing = Literal["refuse", "skip"]  # what to do about missing photographs
 MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
 REDUCED = {  # what OpenCV decodes to gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
@@ -184,40 +180,6 @@ def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file in pixels.  Raises DataError when it cannot be read."""
     height, width = read_image(path).shape[:2]
     return width, height
-
-
-def safe_join(folder: Path, name: str, where: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `where`, when that is outside the folder."""
-    path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
-    if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
-        raise DataError(f"{where}: the file name {quote(name)} is not a path below {folder}; rename it")
-    return folder / name
-
-
-def require_files(path: Path, files: Iterable[Path]) -> None:
-    """Raise DataError that names the first few `files` of the dataset at `path` that do not exist, if any."""
-    find_existing(path, list(files), "refuse", "")
-
-
-def find_existing(
-    path: Path,
-    files: Sequence[Path],
-    missing: Missing,
-    remedy: str = ", or --set scene.missing=skip to train without them",
-) -> list[bool]:
-    """Return which of the photographs of the dataset at `path` exist.
-
-    Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are missing.
-    """
-    exists = [os.path.exists(file) for file in files]  # unlike Path.exists, never raises
-    lost = [str(file) for file, is_there in zip(files, exists, strict=True) if not is_there]
-    if lost:
-        names = ", ".join(map(shorten, lost[:3])) + (", ..." if len(lost) > 3 else "")
-        fault = f"{path}: {len(lost)} of {len(files)} image files are missing: {names}"
-        if missing == "refuse" or len(lost) == len(files):
-            raise DataError(f"{fault}; put them back{remedy if len(lost) < len(files) else ''}")
-        logger.warning("%s; the scene is read without them", fault)
-    return exists
 
 
 def read_header(path: Path) -> Header:

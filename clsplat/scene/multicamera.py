@@ -4,7 +4,7 @@ import logging
 import os
 import re
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 
 from clsplat.core.errors import DataError, first_few, shell_quote
 from clsplat.scene.colmap import camera_views, find_models, read_images
@@ -54,7 +54,7 @@ class MulticameraReader(Reader):
 
 def names_of(image: str) -> tuple[str, str]:
     """Return the possible names of an image's camera: the name of the image, and that of its folder."""
-    name = PurePosixPath(image)
+    name = PureWindowsPath(image)
     return name.stem, name.parent.name
 
 
@@ -121,7 +121,8 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
         transforms = Transforms(path / TRANSFORMS)
         first = next(iter(frames.values()))[0]
         header = read_header(first)
-        posed = [view_of(frame, (header.width, header.height)) for frame in transforms.frames]
+        size = header.width, header.height
+        posed = [view_of(frame, frame.image_name(), size) for frame in transforms.frames]
         points = transforms.points(Clock(0.0, 1.0))
     else:
         posed, points = camera_views(path)

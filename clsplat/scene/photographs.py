@@ -3,14 +3,16 @@
 import hashlib
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, pluralize
 from clsplat.scene.images import read_image, write_image
+from clsplat.scene.lookup import FileLookup
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_image, load_mask
 
@@ -49,9 +51,12 @@ def _loaded(view: View, background: tuple[float, float, float]) -> NDArray[np.ui
 LOG = logging.getLogger("clsplat")
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image: its name with .png appended (COLMAP) or as the suffix; None without one."""
-    return next((file for file in _candidates(folder, name) if os.path.isfile(file)), None)  # never raises
+def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """Return the mask of each image: its name with .png appended (COLMAP) or as the suffix; None without one."""
+    if not folder.is_dir():
+        return [None] * len(names)
+    files = FileLookup(folder, folder, names, _mask_names, strict=True)
+    return [file if os.path.isfile(file) else None for file in files.paths]  # unlike Path.is_file, never raises
 
 
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
@@ -68,11 +73,12 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
             f"{scene.path}: the dataset already has masks, such as {existing}; remove scene.masks, "
             "or the masks of the dataset"
         )
-    views = tuple(replace(view, mask_path=find_mask(folder, view.name)) for view in scene.views)
+    masks = find_masks(folder, [view.name for view in scene.views])
+    views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
     count, missing = len(views), [view.name for view in views if view.mask_path is None]
     if len(missing) == count:
         fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
-        names = " or ".join(str(file) for file in dict.fromkeys(reversed(_candidates(folder, missing[0]))))
+        names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))
         raise DataError(
             f"{folder}: {fault}; expected {names} for the first of {count}, white in pixels "
             "to use: rename the files, or set scene.masks to another folder"
@@ -85,5 +91,5 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     return replace(scene, views=views)
 
 
-def _candidates(folder: Path, name: str) -> tuple[Path, Path]:
-    return folder / f"{name}.png", (folder / name).with_suffix(".png")
+def _mask_names(name: str) -> list[str]:
+    return list(dict.fromkeys((f"{name}.png", str(PurePosixPath(name).with_suffix(".png")))))

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.scene.images import Missing
+from clsplat.scene.lookup import FileLookup, Missing
 from clsplat.scene.points import PointTable
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -37,6 +37,7 @@ class Parts:
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
+    notes: list[str] = field(default_factory=list)  # about files that are not where the dataset says
     scene: Scene | None = None
     refusal: str = ""
 
@@ -49,6 +50,13 @@ class Parts:
                 self.faults.append(str(error))
             return None
 
+    def expect(self, files: FileLookup) -> None:
+        """Add files that the dataset names, with a note on how they were matched."""
+        self.expected += files.paths
+        self.notes += [files.note] if files.note else []
+        if not all(path.is_relative_to(files.folder) for path in files.paths):
+            self.image_folder = None
+
 
 class Reader(ABC):
     """A dataset format.
@@ -60,6 +68,7 @@ class Reader(ABC):
     name: ClassVar[str]  # of the format
     expects: ClassVar[str]  # the files that mark the format, in a few words
     missing: Missing = "refuse"  # what to do about missing photographs
+    root: Path | None = None  # of the scene, where files are looked for; None: the folder of the dataset
     defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -3,8 +3,10 @@
 import logging
 import math
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path, PureWindowsPath
+from itertools import repeat
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,13 @@ import numpy as np
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens
-from clsplat.scene.images import Missing, find_existing, image_size, read_header, require_files, safe_join
+from clsplat.scene.images import read_header
+from clsplat.scene.lookup import FileLookup, Missing, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock, make_clock
-from clsplat.scene.view import Floats, View
+from clsplat.scene.view import NO_FILE, Floats, View, fit_to_photograph
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
@@ -50,15 +53,21 @@ class JsonFrame:
             raise DataError(f"{self.where}: {key} is {quote(value)}; expected {BELOW_MAX}: export the file again")
         return float(value)
 
-    def file(self, key: str, suffix: str = "") -> Path | None:
-        """Return a path below the folder of the JSON file, with `suffix` where it has none, or None."""
+    def file_name(self, key: str) -> str | None:
+        """Return a path with forward slashes and without a leading `./`, or None.  Raises DataError."""
         value = self.value(key)
-        if value is None:
-            return None
-        if not isinstance(value, str):
+        if value is not None and not isinstance(value, str):
             raise DataError(f"{self.where}: {key} is {quote(value)}; expected a path below {self.folder}")
-        path = safe_join(self.folder, view_name(value), self.where)
-        return path if path.suffix else path.with_name(path.name + suffix)
+        return None if value is None else view_name(value)
+
+    def image_name(self) -> str:
+        """Return the path of the image.  Raises DataError when the frame has none."""
+        name = self.file_name("file_path")
+        if name is None:
+            raise DataError(
+                f"{self.where}: it has no `file_path`; expected the path of an image: export the file again"
+            )
+        return name
 
 
 class Transforms:
@@ -78,24 +87,6 @@ class Transforms:
         """Return the place and the `time` of every frame, as the file has it.  Raises DataError for another value."""
         return [(frame.where, frame.number("time")) for frame in self.frames]
 
-    def views(self, missing: Missing = "refuse", clock: Clock | None = None) -> list[View]:
-        """Return one view per frame, in the order of the file; of those whose image is missing as `missing` says.
-
-        An image without a size in the file has the size of the first one.  Photographs of lenses with distortion are
-        undistorted when they are read.
-        Raises DataError for damaged numbers, missing files and paths that leave the folder.
-        """
-        images = [image_path_of(frame) for frame in self.frames]
-        there = find_existing(self.path, images, missing)
-        frames = [frame for frame, found in zip(self.frames, there, strict=True) if found]
-        lost = [frame for frame, found in zip(self.frames, there, strict=True) if not found]
-        self.skipped = tuple(view_name(str(frame.value("file_path"))) for frame in lost)
-        require_files(self.path, filter(None, (frame.file("mask_path") for frame in frames)))
-        has_sizes = all(frame.number("w") and frame.number("h") for frame in frames)
-        size = None if has_sizes else image_size(images[there.index(True)])
-        require_files(self.path, filter(None, (frame.file("static_path") for frame in frames)))
-        return [view_of(frame, size, clock) for frame in frames]
-
     def points(self, clock: Clock | None = None) -> PointCloud | None:
         """Read the points; None when there are none."""
         path = self.points_path()
@@ -104,26 +95,91 @@ class Transforms:
 
     def points_path(self) -> Path | None:
         """Return `ply_file_path`, or else `points3d.ply` where that exists."""
-        given = JsonFrame(self.path.parent, str(self.path), self.table).file("ply_file_path")
+        given = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
         beside = self.path.parent / "points3d.ply"
-        return given or (beside if beside.is_file() else None)
+        if given is None:
+            return beside if beside.is_file() else None
+        return safe_join(self.path.parent, given, str(self.path))
 
 
-def list_frames(parts: Parts, *names: str) -> None:
+class FrameFiles:
+    """The photographs and masks of frames of one folder, looked for below `root`."""
+
+    def __init__(self, root: Path, folder: Path, frames: Sequence[JsonFrame]) -> None:
+        self.root, self.folder, self.frames = root, folder, frames
+        self.photographs = FileLookup(root, folder, [frame.image_name() for frame in frames], _with_png)
+
+    def layers(self, where: Path, key: str, exists: Sequence[bool]) -> list[Path | None]:
+        """Return the file `key` of each frame that exists, or None.  Raises DataError when one is missing."""
+        names = [
+            frame.file_name(key) if is_there else None for frame, is_there in zip(self.frames, exists, strict=True)
+        ]
+        rows = [i for i, name in enumerate(names) if name is not None]
+        files = FileLookup(
+            self.root, self.folder, [name for name in names if name], strict=True, taken=self.photographs.paths
+        )
+        files.existing(where, "refuse", [self.frames[i].where for i in rows])
+        paths = dict(zip(rows, files.paths, strict=True))
+        return [paths.get(i) for i in range(len(names))]
+
+    def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View | None]:
+        """Return the view of each frame; None for missing photographs, as `missing` says.
+
+        An image without a size in the file has that of its photograph.  Photographs of lenses with distortion are
+        undistorted when they are read.
+        Raises DataError for damaged numbers and missing files.
+        """
+        exists = self.photographs.existing(where, missing, [frame.where for frame in self.frames])
+        masks, still = (self.layers(where, key, exists) for key in ("mask_path", "static_path"))
+        views = list[View | None]()
+        for i, (frame, path) in enumerate(zip(self.frames, self.photographs.paths, strict=True)):
+            if not exists[i]:
+                views.append(None)
+                continue
+            view = view_of(frame, self.photographs.names[i], size_of(frame, path), path, masks[i], still[i], clock)
+            views.append(fit_to_photograph(view) if path in self.photographs.reduced else view)
+        return views
+
+    def skipped(self, views: Sequence[View | None]) -> tuple[str, ...]:
+        """Return the names of missing photographs."""
+        return tuple(name for name, view in zip(self.photographs.names, views, strict=True) if view is None)
+
+    @property
+    def renamed(self) -> dict[str, str]:
+        """The names of the views by those in the file."""
+        return dict(zip(self.photographs.given, self.photographs.names, strict=True))
+
+
+def _with_png(name: str) -> list[str]:
+    """Return a file name; Blender's exporter omits the suffix."""
+    return [name if PurePosixPath(name).suffix else f"{name}.png"]
+
+
+def size_of(frame: JsonFrame, path: Path) -> tuple[int, int] | None:
+    """Return the size of the photograph of a frame, or None if the frame has one.  Raises DataError."""
+    if frame.number("w") and frame.number("h"):
+        return None
+    header = read_header(path)
+    return header.width, header.height
+
+
+def list_frames(parts: Parts, root: Path, *names: str) -> None:
     """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
     moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
     clock = parts.attempt(make_clock, parts.path, moments)
-    for transforms in filter(None, files):
-        frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
-        paths = [path for _, path in frames if path]
-        parts.expected += paths
-        if parts.scene is None:
-            first = next((path for path in paths if os.path.isfile(path)), None)
-            header = parts.attempt(read_header, first) if first else None
-            size = (header.width, header.height) if header else None
-            views = [parts.attempt(view_of, frame, size, clock) for frame, path in frames if path]
-            parts.views += [view for view in views if view]
+    frames = [frame for file in filter(None, files) for frame in file.frames]
+    lookup = FrameFiles(root, parts.path, [frame for frame in frames if parts.attempt(frame.image_name)])
+    parts.expect(lookup.photographs)
+    if parts.scene is None:
+        exists = [os.path.isfile(path) for path in lookup.photographs.paths]
+        masks = parts.attempt(lookup.layers, parts.path, "mask_path", exists) or repeat(None)
+        rows = zip(lookup.frames, lookup.photographs.names, lookup.photographs.paths, masks, exists, strict=False)
+        for frame, name, path, mask, is_there in rows:
+            size = parts.attempt(size_of, frame, path) if is_there else None
+            if is_there or (frame.value("w") and frame.value("h")):  # otherwise the missing file is the only fault
+                view = parts.attempt(view_of, frame, name, size, path, mask, None, clock)
+                parts.views += [view] if view else []
     if files and files[0]:
         place = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, place) if place else None
@@ -136,27 +192,26 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def view_of(frame: JsonFrame, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+def view_of(
+    frame: JsonFrame,
+    name: str,
+    size: tuple[int, int] | None,
+    image: Path = NO_FILE,
+    mask: Path | None = None,
+    still: Path | None = None,
+    clock: Clock | None = None,
+) -> View:
     """Return the view of a frame; `size` is the image's where the frame has none.
 
-    clock: of the scene, where it moves.  Raises DataError.
+    still: the mask of what does not move; clock: of the scene, where it moves.  Raises DataError.
     """
-    image, mask = image_path_of(frame), frame.file("mask_path")
     lens = intern_lens(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
-    moment, still = frame.number("time"), frame.file("static_path")
+    moment = frame.number("time")
     time = None if clock is None or moment is None else float(clock(moment))
-    name, matrix = view_name(frame.value("file_path")), camera_to_world_of(frame)
+    matrix = camera_to_world_of(frame)
     pose = np.linalg.inv(matrix)[:3]
     return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still, camera_to_world=matrix)
-
-
-def image_path_of(frame: JsonFrame) -> Path:
-    """Return the path of a frame's image.  Raises DataError when the frame has none."""
-    path = frame.file("file_path", suffix=".png")  # Blender's exporter omits the suffix
-    if path is None:
-        raise DataError(f"{frame.where}: it has no `file_path`; expected the path of an image: export the file again")
-    return path
 
 
 def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
@@ -252,15 +307,17 @@ class BlenderReader(Reader):
         transforms = Transforms(path / TRAIN_FILE)
         held = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
         clock = make_clock(path, transforms.moments() + (held.moments() if held else []))
-        train = transforms.views(self.missing, clock)
-        test = held.views(self.missing, clock) if held else []
+        files = FrameFiles(self.root or path, path, transforms.frames + (held.frames if held else []))
+        every = files.views(path if held else transforms.path, self.missing, clock)
+        train = list(filter(None, every[: len(transforms.frames)]))
+        test = list(filter(None, every[len(transforms.frames) :]))
         held_out = set(range(len(train), len(train) + len(test)))
         # NeRF and later papers render these scenes on white.
         scene = make_scene(path, train + test, held_out, transforms.points(clock), background="white")
-        return replace(scene, skipped=transforms.skipped + (held.skipped if held else ()))
+        return replace(scene, skipped=files.skipped(every))
 
     def list_parts(self, parts: Parts) -> None:
-        list_frames(parts, TRAIN_FILE, TEST_FILE)
+        list_frames(parts, self.root or parts.path, TRAIN_FILE, TEST_FILE)
 
 
 # Read nerfstudio and instant-ngp datasets: one transforms.json.
@@ -285,23 +342,25 @@ class NerfstudioReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRANSFORMS_FILE)
         clock = make_clock(transforms.path, transforms.moments())
-        views = sorted(transforms.views(self.missing, clock), key=lambda view: view.name)
-        train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
+        files = FrameFiles(self.root or path, path, transforms.frames)
+        every = files.views(transforms.path, self.missing, clock)
+        views, skipped = sorted(filter(None, every), key=lambda view: view.name), files.skipped(every)
+        train, test = (_listed(transforms, key, files.renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             scene = make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
-            return replace(scene, skipped=transforms.skipped)
+            return replace(scene, skipped=skipped)
         test = test or set()
         kept = views if train is None else [view for view in views if view.name in train | test]
         if len(kept) < len(views):
             logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
         held_out = {i for i, view in enumerate(kept) if view.name in test}
-        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=transforms.skipped)
+        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=skipped)
 
     def list_parts(self, parts: Parts) -> None:
-        list_frames(parts, TRANSFORMS_FILE)
+        list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
 
 
-def _listed(transforms: Transforms, key: str) -> set[str] | None:
+def _listed(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
     """Return the view names of a list of file paths, or None where there is none.  Raises DataError."""
     entries = transforms.table.get(key)
     if entries is None:
@@ -309,12 +368,12 @@ def _listed(transforms: Transforms, key: str) -> set[str] | None:
     if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
         raise DataError(f"{transforms.path}: {key} is not a list of file paths; export the file again")
     names = {view_name(entry) for entry in entries}
-    unknown = sorted(names - {view_name(path) for frame in transforms.frames if (path := frame.value("file_path"))})
+    unknown = sorted(names - renamed.keys())
     if unknown:
         raise DataError(
             f"{transforms.path}: {key} lists {quote(unknown[0])}, which no frame has; remove it from the list"
         )
-    return names
+    return {renamed[name] for name in names}
 
 
 # Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes.
@@ -334,15 +393,19 @@ class MultiscaleReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)
-        train, test = (_views(path / METADATA_FILE, splits, name) for name in ("train", "test"))
-        there = find_existing(path, [view.image_path for view in train + test], self.missing)
-        skipped = tuple(view.name for view, found in zip(train + test, there, strict=True) if not found)
-        test = [view for view, found in zip(test, there[len(train) :], strict=True) if found]
-        train = [view for view, found in zip(train, there[: len(train)], strict=True) if found]
+        first, second = (_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
+        files = FrameFiles(self.root or path, path, first + second)
+        every = files.views(path, self.missing)
+        sized = [
+            view and replace(view, downscale=2 ** (frame.number("label") or 0))
+            for frame, view in zip(files.frames, every, strict=True)
+        ]
+        train, test = list(filter(None, sized[: len(first)])), list(filter(None, sized[len(first) :]))
         points = path / POINTS
         held_out = set(range(len(train), len(train) + len(test)))
         cloud = read_points_ply(points) if points.is_file() else None
-        return replace(make_scene(path, train + test, held_out, cloud, background="white"), skipped=skipped)
+        scene = make_scene(path, train + test, held_out, cloud, background="white")
+        return replace(scene, skipped=files.skipped(every))
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)
@@ -350,14 +413,14 @@ class MultiscaleReader(Reader):
         parts.points = parts.attempt(read_ply_table, points) if points.is_file() else None
 
 
-def _views(path: Path, splits: Any, name: str) -> list[View]:
+def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
     table = splits.get(name) if isinstance(splits, dict) else None
     columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
         raise DataError(f"{path}: '{name}' lacks lists of one length called {', '.join(COLUMNS)}; make it again")
     if len(columns[0]) > MAX_FRAMES:
         raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
-    views = []
+    frames = []
     for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
         values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}
         frame = JsonFrame(path.parent, f"{path}: {name}[{i}]", values)
@@ -366,7 +429,5 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
             raise DataError(
                 f"{frame.where}: label is {quote(label)}; expected the number of its halvings, 0 to 8: make it again"
             )
-        image, matrix = image_path_of(frame), camera_to_world_of(frame)
-        view = View(view_name(file), camera_of(frame, None), np.linalg.inv(matrix)[:3], image, downscale=2**level)
-        views.append(replace(view, camera_to_world=matrix))
-    return views
+        frames.append(frame)
+    return frames

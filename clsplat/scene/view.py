@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
-from clsplat.scene.camera import MODELS, Camera, Lens
-from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image
+from clsplat.scene.camera import MODELS, Camera, Lens, intern_lens
+from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_header, read_image
 
 Floats = NDArray[np.floating]
 ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
@@ -53,6 +53,7 @@ Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
 NO_FILE = Path()  # of a view without a photograph
+MAX_ROUNDING = 1.5  # px; a reduced image has whole pixels
 MIN_WHITE = 0.99  # fraction of the largest value: JPEG does not store white exactly
 
 
@@ -260,6 +261,20 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
         f"same size{'' if view.lens else ', or a larger image of the same shape'}: use the images the cameras were "
         "made from"
     )
+
+
+def fit_to_photograph(view: View) -> View:
+    """Return a view whose photograph is smaller than its camera, but of its shape, with a camera of that size."""
+    header, camera = read_header(view.image_path), view.lens or view.camera
+    across, down = header.width / camera.width, header.height / camera.height
+    if across >= 1 or abs(header.height - across * camera.height) > MAX_ROUNDING:
+        return view
+    if view.lens is None:
+        return replace(view, camera=view.camera.resized(header.width, header.height))
+    scales = (*(across, down)[: MODELS[view.lens.model][0]], across, down)
+    scaled = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
+    lens = intern_lens(replace(view.lens, width=header.width, height=header.height, params=scaled))
+    return replace(view, lens=lens, camera=lens.pinhole)
 
 
 def sample_views(views: Sequence[View], max_count: int) -> Sequence[View]:

@@ -12,7 +12,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from clsplat.core.errors import DataError, pluralize, quote
 from clsplat.core.reading import read_text
 from clsplat.core.settings import InputPath, Settings, in_one_sentence
-from clsplat.scene.images import Missing, is_image
+from clsplat.scene.images import is_image
+from clsplat.scene.lookup import Missing
 from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_views
 
 LOG = logging.getLogger("clsplat")

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from clsplat.core.errors import OutputError
 from clsplat.scene.camera import Camera
-from clsplat.scene.images import image_size, require_files, write_image
+from clsplat.scene.images import image_size, write_image
+from clsplat.scene.lookup import require_files
 from clsplat.scene.view import View, load_image
 from tests.support.data_sets import data_set
 from tests.support.refusals import refusal

@@ -18,7 +18,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.progress import captured_log, counted, log_level
 from clsplat.prepare.gather import list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
-from clsplat.scene.detect import find_reader, read_scene
+from clsplat.scene.detect import find_dataset, place_note, read_scene
 from clsplat.scene.identity import ImageFile, decode_all
 from clsplat.scene.images import CameraExposure, is_image, read_exif_exposure, read_gray
 from clsplat.scene.points import MAX_VALUE
@@ -261,6 +261,7 @@ class Facts:
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
+    notes: list[str]  # sentences about files that are not where the dataset says
     faults: list[str]  # why parts of it cannot be read
     refusal: str  # why training does not start
 
@@ -306,6 +307,7 @@ def measure_dataset(parts: Parts) -> Facts:
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,
+        notes=parts.notes,
         faults=parts.faults,
         refusal=parts.refusal,
     )
@@ -395,9 +397,12 @@ def read_parts(path: Path) -> Parts:
             if not path.is_dir():
                 raise
             parts.refusal = str(error)
-        if reader := find_reader(path):
+        if found := parts.attempt(find_dataset, path):
+            reader, parts.path = found
             parts.kind = reader.name
             reader.list_parts(parts)
+            parts.path = path
+            parts.notes += filter(None, [place_note(path, found)])
             if parts.scene and parts.points:
                 parts.points = parts.points._replace(positions=parts.points.positions - parts.scene.origin)
     if parts.kind == "none":

@@ -46,7 +46,7 @@ class Finding:
 def unprepared(facts: Facts) -> Iterator[Finding]:
     """Yield findings about a folder of photographs without cameras: how to find them, and which files are left out."""
     count, damaged = facts.on_disk, facts.comparison.unreadable
-    if facts.kind != "none" or not (count or facts.left_out):
+    if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
     contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
     readable = count - len(damaged)
@@ -132,6 +132,8 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
+    for note in facts.notes:
+        yield Finding("note", note)
     for names in facts.same_but_case[:MAX_NAMES]:
         fault = f"{' and '.join(map(shorten, names))} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
