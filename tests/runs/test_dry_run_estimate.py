@@ -42,7 +42,7 @@ def expected(pipeline: str, photos: Path, *sets: str) -> list[str]:
     return module.estimate_time(asked, planned, names, known(asked, names), device, None)  # type: ignore[arg-type]
 
 
-def test_time_of_parts_follows_from_the_number_of_pieces(photos):
+def test_time_estimates_scale_with_the_work(photos):
     """23 photographs have 253 pairs; 20 are trained on, until 5 measurements 350 steps apart and a refit of 350, or
     7,000 steps and as many again."""
     steps = ", ".join(f"{{stage: {name}}}" for name in ("find_features", "match_features", "map_cameras", "undistort"))
@@ -57,7 +57,7 @@ def test_time_of_parts_follows_from_the_number_of_pieces(photos):
     assert lines[-1].split()[1:4] == ["0.1", "to", "4.4"]
 
 
-def test_number_of_photographs_gives_the_growth_to_be_chosen(photos):
+def test_estimated_growth_follows_the_number_of_images(photos):
     """Whether they show a sky is not known before they are prepared."""
     for path in photos.iterdir():
         cv2.imwrite(str(path), np.zeros((120, 160, 3), np.uint8))
@@ -81,7 +81,7 @@ def test_number_of_photographs_gives_the_growth_to_be_chosen(photos):
         (("scene.holdout={names: [00.jpg, 01.JPG]}",), 21),
     ],
 )
-def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, training):
+def test_unprepared_photographs_give_the_training_count(photos, sets, training):
     asked = load("photos", [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
     names = listed(asked, asked.preparation(out), out)
@@ -113,14 +113,14 @@ def as_cell(asked, state, device, start):
         (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is a test view"),
     ],
 )
-def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
+def test_impossible_split_is_refused_before_preparation(photos, begin, sets, complaint):
     asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
         begin(asked, RunState.read(photos.parent / "runs" / "a"), None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
-def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
+def test_split_that_depends_on_cameras_is_not_refused_early(photos, caplog):
     """Which photographs a number holds out follows from those that are placed."""
     asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
     (photos / "left.heic").write_bytes(b"")
@@ -138,13 +138,13 @@ def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     assert "the photos decide init.transparent, " in told, "what they will decide"
 
 
-def test_files_that_are_left_out_are_told_once(photos, caplog):
+def test_skipped_files_are_reported_once(photos, caplog):
     (photos / "left.heic").write_bytes(b"")
     Job.open("photos", photos, photos.parent / "runs" / "a").describe()
     assert len([record for record in caplog.records if "HEIC" in record.getMessage()]) == 1
 
 
-def test_dry_run_says_what_photographs_will_decide(photos):
+def test_dry_run_lists_the_undecided_settings(photos):
     asked = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
     lines = [
         line.strip() for line in describe(asked, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
@@ -154,7 +154,7 @@ def test_dry_run_says_what_photographs_will_decide(photos):
     assert "dropout" not in found
 
 
-def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):
+def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
     """A scene that holds cameras has a line for its training alone; nothing is written."""
     text = Job.open("smoke", tiny_scene, tmp_path / "run").describe()
     parts = text[text.index("expected:") :].splitlines()
@@ -181,7 +181,7 @@ def test_pairs_are_all_of_them_or_those_of_neighbors(count):
         ({"keep": "best", "patience": 40}, 7000),
     ],
 )
-def test_patience_says_how_early_a_training_may_end(keys, fewest):
+def test_patience_gives_the_fewest_steps(keys, fewest):
     training = {"steps": 7000, "losses": [{"type": "l1"}], **keys}
     assert Optimize.model_validate(training).min_steps == fewest
     if "patience" in keys:

@@ -48,7 +48,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_a_signal_at_the_start_ends_with_code_130_and_a_sentence(place, tmp_path):
+def test_signal_at_the_start_exits_with_130_and_a_message(place, tmp_path):
     script = START + PLACES[place] + END
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
@@ -58,7 +58,7 @@ def test_a_signal_at_the_start_ends_with_code_130_and_a_sentence(place, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_signal_in_an_import_waits_for_its_end(tmp_path, monkeypatch):
+def test_signal_during_an_import_waits_for_the_import(tmp_path, monkeypatch):
     (tmp_path / "slow_module.py").write_text("import signal\nsignal.raise_signal(signal.SIGTERM)\nDONE = True\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(KeyboardInterrupt), stopping_on_signals(stop_at_once):  # noqa: PT012
@@ -68,7 +68,7 @@ def test_a_signal_in_an_import_waits_for_its_end(tmp_path, monkeypatch):
         time.sleep(5)
 
 
-def test_an_import_without_an_end_is_stopped(tmp_path, monkeypatch):
+def test_hanging_import_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr("clsplat.core.signals.IMPORT_SECONDS", 0.2)
     loop = f"while time.monotonic() < {time.monotonic() + 30}:\n    time.sleep(0.01)\n"
     endless = "import signal, time\nsignal.raise_signal(signal.SIGTERM)\n" + loop

@@ -100,7 +100,7 @@ def run(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return run
 
 
-def test_whichever_write_fails_nothing_is_lost(run, tmp_path, record_property):
+def test_any_failing_write_loses_nothing(run, tmp_path, record_property):
     whole = tmp_path / "whole"
     with pytest.MonkeyPatch.context() as patch:
         counts = Faults(patch, whole).counts

@@ -47,7 +47,7 @@ def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exc
 
 
 @pytest.mark.parametrize(("where", "step"), [("photograph", 6), ("kernel", 5)])  # 5: after the edit of step 4
-def test_a_failure_inside_a_step_leaves_the_step_before(
+def test_failure_within_a_step_saves_the_previous_step(
     where, step, tiny_scene, tmp_path, monkeypatch, few_steps, caplog
 ):
     raised = fails_at(step, monkeypatch, where)
@@ -70,7 +70,7 @@ def test_a_failure_inside_a_step_leaves_the_step_before(
         *((SystemExit(3), 2), (GeneratorExit(), 1), (StopIteration("out"), 2)),
     ],
 )
-def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, few_steps):
+def test_failing_evaluation_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, few_steps):
     evaluate, calls = Evaluate.run, []
 
     def run(stage, run):
@@ -106,7 +106,7 @@ def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
     assert states == ["failed"]
 
 
-def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_path, monkeypatch, few_steps):
+def test_failed_report_is_written_on_resume(tiny_scene, tmp_path, monkeypatch, few_steps):
     def fail(stage, run):
         raise ZeroDivisionError
 
@@ -121,7 +121,7 @@ def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_pat
 
 
 @pytest.mark.parametrize("place", ["SplatStats.add", "density edit"])
-def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, few_steps, caplog):
+def test_incomplete_step_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, few_steps, caplog):
     of, name, at = (SplatStats, "add", 7) if place == "SplatStats.add" else (control, "apply_edit", 2)
     before, calls = getattr(of, name), []
 
@@ -143,7 +143,7 @@ def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monk
     assert records(tmp_path) == records(few_steps)
 
 
-def test_a_state_that_cannot_be_saved_does_not_hide_the_failure(tiny_scene, tmp_path, monkeypatch, caplog):
+def test_failed_save_does_not_hide_the_first_error(tiny_scene, tmp_path, monkeypatch, caplog):
     fails_at(6, monkeypatch, "photograph")
     save = checkpoint.save
 

@@ -82,7 +82,7 @@ def test_a_damaged_test_view_stops_a_run_before_its_first_step(scene, tmp_path):
         clsplat.Trainer(scene, "smoke")
 
 
-def test_all_damaged_files_are_in_one_sentence(scene, tmp_path):
+def test_one_message_lists_all_damaged_files(scene, tmp_path):
     train_views = read_scene(scene).split("train")
     for view in train_views[1:6]:
         view.image_path.write_bytes(b"nothing")
@@ -96,7 +96,7 @@ def test_all_damaged_files_are_in_one_sentence(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_photograph_of_another_size_is_found_in_the_same_pass(scene):
+def test_image_of_another_size_is_found_in_the_same_pass(scene):
     view = views(scene)[3]
     cv2.imwrite(str(view.image_path), np.zeros((30, 40, 3), np.uint8))
     files = decode_all(views(scene))
@@ -112,7 +112,7 @@ def test_masks_are_decoded_too(tmp_path):
         require_decodable(folder, decode_all(views(folder)))
 
 
-def test_jpeg_without_its_end_is_damaged_whatever_decoders_say(tmp_path, monkeypatch):
+def test_truncated_jpeg_is_damaged_even_if_it_decodes(tmp_path, monkeypatch):
     images = [replace(image, name=f"{image.name[:2]}.jpg") for image in orbit().images]
     folder = write(tmp_path / "scene", replace(orbit(), images=images))
     file = folder / "images" / "05.jpg"
@@ -123,7 +123,7 @@ def test_jpeg_without_its_end_is_damaged_whatever_decoders_say(tmp_path, monkeyp
     assert files[file].fault == f"{file}: the end of the file is missing; copy it again"
 
 
-def test_views_without_photographs_are_left_out(scene):
+def test_views_without_images_are_skipped(scene):
     made = clsplat.View.looking_at((4, 0, 1), (0, 0, 0), (0, 0, 1), views(scene)[0].camera)
     assert len(decode_all([*views(scene), made])) == 10
 
@@ -131,7 +131,7 @@ def test_views_without_photographs_are_left_out(scene):
 # ---- once
 
 
-def test_what_was_decoded_is_only_hashed_the_second_time(scene, decoded, cache):
+def test_checked_images_are_only_hashed_later(scene, decoded, cache):
     first = decode_all(views(scene))
     assert len(decoded) == 10
     decoded.clear()
@@ -147,7 +147,7 @@ def test_what_was_decoded_is_only_hashed_the_second_time(scene, decoded, cache):
     assert decoded == []
 
 
-def test_another_version_of_the_decoder_decodes_again(scene, decoded, monkeypatch):
+def test_new_decoder_version_decodes_again(scene, decoded, monkeypatch):
     decode_all(views(scene))
     monkeypatch.setattr(cv2, "__version__", "99.0")
     decode_all(views(scene))
@@ -162,14 +162,14 @@ def test_damaged_files_are_decoded_each_time(scene, decoded):
         assert file.name in decoded
 
 
-def test_a_cache_that_cannot_be_written_costs_time_only(scene, decoded, cache):
+def test_unwritable_cache_costs_only_time(scene, decoded, cache):
     cache.write_text("a file cannot hold a folder")
     for _ in range(2):
         assert not any(found.fault for found in decode_all(views(scene)).values())
     assert len(decoded) == 20
 
 
-def test_a_damaged_cache_is_not_believed(scene, decoded, cache):
+def test_damaged_cache_is_ignored(scene, decoded, cache):
     decode_all(views(scene))
     (file,) = (cache / "decoded").iterdir()
     lines = file.read_bytes().splitlines(keepends=True)
@@ -182,7 +182,7 @@ def test_a_damaged_cache_is_not_believed(scene, decoded, cache):
     assert len(decoded) <= 1  # the line behind the half one
 
 
-def test_a_full_cache_starts_again(scene, decoded, cache, monkeypatch):
+def test_full_cache_is_cleared(scene, decoded, cache, monkeypatch):
     monkeypatch.setattr(decoding, "MAX_REMEMBERED", 500)
     for size in (10, 20, 20):
         decode_all(views(scene))
@@ -191,7 +191,7 @@ def test_a_full_cache_starts_again(scene, decoded, cache, monkeypatch):
     assert file.stat().st_size < 10 * 80
 
 
-def test_only_a_few_photographs_are_held_at_once(scene, monkeypatch):
+def test_only_a_few_images_are_in_memory_at_once(scene, monkeypatch):
     held, most, lock = [0], [0], threading.Lock()
 
     def decode(data: bytes, path: Path, upright: bool = False) -> np.ndarray:
@@ -210,14 +210,14 @@ def test_only_a_few_photographs_are_held_at_once(scene, monkeypatch):
     assert 1 <= most[0] <= 3
 
 
-def test_whoever_listens_hears_how_far_it_is(scene):
+def test_listeners_receive_the_progress(scene):
     heard: list[tuple[str, int, int]] = []
     with progress.listening(lambda *what, seconds_left: heard.append(what)):
         decode_all(views(scene))
     assert heard == [("photographs decoded", i, 10) for i in range(11)]
 
 
-def test_the_log_gets_a_line_now_and_then(scene, monkeypatch, caplog):
+def test_progress_is_logged_periodically(scene, monkeypatch, caplog):
     caplog.set_level("INFO", "clsplat")
     decode_all(views(scene))
     assert "photographs decoded" not in caplog.text
@@ -240,7 +240,7 @@ def edited(path: Path, change: Callable[[dict], None]) -> None:
     path.write_text(json.dumps(table, indent=3))
 
 
-def test_a_folder_elsewhere_and_files_written_again_are_the_same(scene, tmp_path):
+def test_moved_or_rewritten_equal_files_are_the_same(scene, tmp_path):
     before = identity(scene)
     elsewhere = shutil.copytree(scene, tmp_path / "elsewhere")
     edited(elsewhere / "transforms_train.json", lambda table: None)
@@ -258,7 +258,7 @@ def test_the_order_of_the_test_views_does_not_matter(scene):
     assert other.digest != identity(opened).digest
 
 
-def test_every_change_is_named(scene, tmp_path):
+def test_every_input_change_is_named(scene, tmp_path):
     opened, before = read_scene(scene), identity(scene)
     train, test = opened.split("train"), opened.split("test")
 
@@ -294,7 +294,7 @@ def test_every_change_is_named(scene, tmp_path):
     assert said(many) == f"the photograph of 10 views ({names}, …)"
 
 
-def test_a_record_that_was_changed_is_damaged(scene):
+def test_altered_record_is_damaged(scene):
     data = identity(scene).data()
     data["points"] = "other"
     for text in (data, {}, [], None, {**data, "train": 3}):
@@ -303,7 +303,7 @@ def test_a_record_that_was_changed_is_damaged(scene):
 
 
 @pytest.mark.parametrize("what", ["photograph", "pose", "points"])
-def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
+def test_run_does_not_resume_with_other_inputs(scene, tmp_path, what):
     out = tmp_path / "run"
     train(scene, out, *FEW)
     (out / "point_cloud.ply").unlink()  # else there is nothing to do
@@ -332,7 +332,7 @@ def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume")
 
 
-def test_without_the_record_the_checkpoint_knows_the_inputs(scene, tmp_path, caplog):
+def test_checkpoint_identifies_inputs_without_the_record(scene, tmp_path, caplog):
     train(scene, tmp_path / "run", *FEW)
     record = tmp_path / "run" / "inputs.json"
     record.write_text("{}")
@@ -346,7 +346,7 @@ def test_without_the_record_the_checkpoint_knows_the_inputs(scene, tmp_path, cap
     assert record.read_text() == "{}", "the new inputs do not become those of the start"
 
 
-def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path, caplog):
+def test_run_with_unchecked_inputs_resumes_with_a_warning(scene, tmp_path, caplog):
     train(scene, tmp_path / "run", *FEW)
     (tmp_path / "run" / "inputs.json").unlink()
     newest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]
@@ -358,7 +358,7 @@ def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path
 # ---- dry runs
 
 
-def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
+def test_dry_run_of_a_resume_prints_the_step(scene, tmp_path):
     out = tmp_path / "run"
     words = ["run", "smoke", *WORDS, "--scene", scene, "--out", out, "--dry-run"]
     assert "nothing to resume; would run in" in command(*words, "--resume").stdout
@@ -383,7 +383,7 @@ def test_a_dry_run_finds_damaged_photographs(scene, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["empty", "too few"])
-def test_a_dry_run_of_photographs_is_refused_as_the_run_is(scene, tmp_path, monkeypatch, how):
+def test_dry_run_of_photographs_is_refused_like_the_run(scene, tmp_path, monkeypatch, how):
     folder = tmp_path / "photos"
     folder.mkdir()
     if how == "too few":
@@ -396,7 +396,7 @@ def test_a_dry_run_of_photographs_is_refused_as_the_run_is(scene, tmp_path, monk
             assert not (tmp_path / "runs").exists()
 
 
-def test_a_moved_scene_goes_on_to_the_same_bits(scene, few_steps, tmp_path):
+def test_resuming_a_moved_scene_gives_the_same_bits(scene, few_steps, tmp_path):
     train(scene, tmp_path / "run", *FEW)
     moved = shutil.move(scene, tmp_path / "elsewhere")
     (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()

@@ -61,7 +61,7 @@ def live():
         yield opened
 
 
-def test_a_run_that_is_looked_at_has_the_bits_of_one_that_is_not(live, few_steps, tiny_scene, tmp_path, monkeypatch):
+def test_live_page_does_not_change_the_bits(live, few_steps, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "FAREWELL", 30.0)  # it ends as soon as the page has heard
     client, seen = Client(live), {}
 
@@ -102,7 +102,7 @@ def test_a_run_that_is_looked_at_has_the_bits_of_one_that_is_not(live, few_steps
     assert [point[0] for point in seen["end"]["points"]] == [10, 12]
 
 
-def test_the_title_names_the_folder_that_the_user_gave(live, tiny_scene, tmp_path, monkeypatch):
+def test_title_names_the_given_folder(live, tiny_scene, tmp_path, monkeypatch):
     """Not that of the prepared photographs, whose name is a hash."""
     prepared = tmp_path / "undistort-f22e16004ac0"
     shutil.copytree(tiny_scene, prepared)
@@ -111,7 +111,7 @@ def test_the_title_names_the_folder_that_the_user_gave(live, tiny_scene, tmp_pat
     assert live.desk.shown.title == f"smoke · {tiny_scene.name}"
 
 
-def test_nothing_is_drawn_while_nobody_looks(live, tiny_scene, tmp_path, monkeypatch):
+def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Preview, "draw", lambda *_: pytest.fail("a picture that nobody asked for"))
     trained(live, tiny_scene, tmp_path / "run")
 
@@ -153,7 +153,7 @@ def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, t
         trained(live, tiny_scene, tmp_path / "run")
 
 
-def test_pictures_wait_for_their_share_of_the_time(live, tiny_scene, tmp_path):
+def test_live_renders_wait_for_their_time_budget(live, tiny_scene, tmp_path):
     """Without credit no picture is drawn, however often it is asked for."""
     live.desk.budget = Credit(0.0, 1.0)
     client, answers = Client(live), []
@@ -182,14 +182,14 @@ def test_the_server_ends_with_the_run(tiny_scene, tmp_path, capsys):
         http.client.HTTPConnection("127.0.0.1", port).request("GET", "/")
 
 
-def test_a_port_in_use_ends_the_run_before_it_begins(live, tiny_scene, tmp_path):
+def test_used_port_is_refused_before_the_run(live, tiny_scene, tmp_path):
     port = urlsplit(live.address).port
     with pytest.raises(ConfigError, match=f"port {port} of 127.0.0.1 cannot be used"):
         Job.open("smoke", tiny_scene, tmp_path / "run", FEW).run(live=port)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_picture_of_a_view_is_its_render(live, tiny_scene, tmp_path):
+def test_live_image_of_a_view_is_its_render(live, tiny_scene, tmp_path):
     run = trained(live, tiny_scene, tmp_path / "run")
     for view in run.scene.views[:3]:
         jpeg = Preview(run).draw(PageCamera(1, view, "still")).jpeg
@@ -200,7 +200,7 @@ def test_a_picture_of_a_view_is_its_render(live, tiny_scene, tmp_path):
         assert jpeg == data.tobytes()
 
 
-def test_the_side_of_a_picture_follows_its_time():
+def test_image_size_adapts_to_the_render_time():
     preview = Preview.__new__(Preview)
     preview._costs = {}
     assert preview._side("moving") == SIDES[0]

@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.large]
 NEWEST = "live.watch.live.newest"
 
 
-def test_the_page_is_whole_and_its_scripts_short():
+def test_page_is_self_contained_and_its_scripts_are_short():
     text = page().decode()
     assert Page(text).elements["script"] == 1
     assert "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'sha256-" in text

@@ -16,7 +16,7 @@ def refusal(target: str, host: str = "localhost") -> int:
     return caught.value.answer.status
 
 
-def test_a_request_is_its_path_behind_the_secret_and_its_fields():
+def test_request_has_a_path_after_the_secret_and_fields():
     request = read(f"/{TOKEN}/state.json?after=3", "localhost", TOKEN)
     assert (request.path, request.query) == ("state.json", {"after": "3"})
     assert request.number("after", 0, 9) == 3
@@ -24,39 +24,39 @@ def test_a_request_is_its_path_behind_the_secret_and_its_fields():
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1:9000", "[::1]:80", "LocalHost:1"])
-def test_names_of_this_machine_are_answered_at_every_port(host):
+def test_local_host_names_are_accepted_at_every_port(host):
     """A tunnel may end at another port."""
     assert read(f"/{TOKEN}/state.json", host, TOKEN).path == "state.json"
 
 
 @pytest.mark.parametrize("host", ["evil.example:8710", "127.0.0.1.evil.example", "localhost.evil", ""])
-def test_a_name_that_was_bound_to_this_machine_is_refused(host):
+def test_rebound_host_name_is_refused(host):
     assert refusal(f"/{TOKEN}/", host) == 403
 
 
 @pytest.mark.parametrize("target", ["/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/", "", "/é/"])
-def test_without_the_secret_nothing_is_there(target):
+def test_requests_without_the_secret_get_404(target):
     assert refusal(target) == 404
 
 
 @pytest.mark.parametrize("target", ["/secret-token/?" + "a=1&" * 50, "//["])
-def test_what_is_no_address_is_refused(target):
+def test_invalid_address_is_refused(target):
     assert refusal(target) == 400
 
 
 @pytest.mark.parametrize("text", ["", "-1", "10", "1.0", "१", "9" * 4000])
-def test_a_number_is_checked(text):
+def test_number_fields_are_validated(text):
     request = read(f"/{TOKEN}/?view=5", "localhost", TOKEN)
     request.query["view"] = text
     with pytest.raises(Refused, match="view: expected a whole number from 0 to 9"):
         request.number("view", 0, 9)
 
 
-def test_a_name_without_its_port():
+def test_host_name_omits_the_port():
     assert [host_name(text) for text in ("a:1", "a", "[::1]:5", "a:b")] == ["a", "a", "[::1]", "a:b"]
 
 
-def test_a_camera_is_what_the_page_has_written():
+def test_camera_is_read_as_the_page_writes_it():
     view = camera("1,2,3;0,0,0.70710678,0.70710678;100,110,50,40,101,81")
     assert view.position == pytest.approx([1, 2, 3])
     assert view.world_to_camera[:, :3].tolist() == [pytest.approx(row) for row in ([0, -1, 0], [1, 0, 0], [0, 0, 1])]
@@ -87,13 +87,13 @@ def test_an_impossible_camera_is_refused(text):
 
 
 @pytest.mark.parametrize("text", ["x", "nan", "1.01", "-0.1"])
-def test_a_moment_is_from_0_to_1(text):
+def test_time_is_from_0_to_1(text):
     assert moment("0.35") == 0.35
     with pytest.raises(Refused, match="time: expected a timestamp from 0"):
         moment(text)
 
 
-def test_page_that_missed_the_end_does_not_count_as_informed():
+def test_page_that_missed_the_end_is_not_counted_as_informed():
     class Ending(Desk):
         looks = 0
 

@@ -32,7 +32,7 @@ def talk(server: Server, data: bytes) -> bytes:
         return found
 
 
-def test_it_listens_on_the_loopback_address_alone(server):
+def test_server_listens_only_on_loopback(server):
     assert server.socket.getsockname()[0] == "127.0.0.1"
 
 
@@ -44,7 +44,7 @@ def test_requests_of_one_connection_are_answered_in_order(server):
 
 
 @pytest.mark.parametrize("method", [b"POST", b"HEAD", b"get", b"\xff"])
-def test_other_methods_are_refused_and_the_connection_closed(server, method):
+def test_other_methods_are_refused_and_close_the_connection(server, method):
     body = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n"
     head = method + b" /token/ HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(body)
     found = talk(server, head + body)
@@ -63,14 +63,14 @@ def test_an_answer_forbids_frames_caches_and_referrers(server):
     assert not [line for line in lines if line.startswith("Server")], "which would name the version of Python"
 
 
-def test_a_connection_that_says_nothing_is_closed(server, monkeypatch):
+def test_idle_connection_is_closed(server, monkeypatch):
     monkeypatch.setattr(module._Connection, "timeout", 0.1)
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(b"GET /tok")
         assert connection.recv(100) == b""
 
 
-def test_the_end_of_the_server_ends_its_connections(server):
+def test_server_closes_its_connections_at_its_end(server):
     request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(request)
@@ -123,7 +123,7 @@ def test_answers_are_paced(server):
     assert waited.wait(5)
 
 
-def test_budget_grows_to_a_limit_and_owes_what_was_too_much():
+def test_budget_is_capped_and_carries_debt():
     now = [100.0]
     budget = Credit(0.05, 1.0, lambda: now[0])
     assert budget.credit == 0
@@ -150,7 +150,7 @@ def asked(orders: Orders, *wanted: PageCamera) -> list[threading.Thread]:
     return threads
 
 
-def test_motion_comes_before_rest_and_the_queue_is_short():
+def test_moving_requests_take_precedence_and_the_queue_is_short():
     orders, picture = Orders(), EncodedPicture(b"", 1)
     wanted = [PageCamera(page, None, "again" if page < 2 else "moving") for page in range(MAX_WAITING)]
     threads = asked(orders, *wanted)
@@ -163,7 +163,7 @@ def test_motion_comes_before_rest_and_the_queue_is_short():
     assert not orders
 
 
-def test_a_page_that_asks_again_takes_its_own_place():
+def test_new_request_replaces_the_pages_previous_one():
     orders, first, second = Orders(), PageCamera(1, None, "moving"), PageCamera(1, None, "still")
     (thread,) = asked(orders, first)
     others = asked(orders, second)
@@ -174,7 +174,7 @@ def test_a_page_that_asks_again_takes_its_own_place():
     others[0].join(5)
 
 
-def test_who_has_waited_too_long_waits_no_more():
+def test_request_times_out():
     orders, order = Orders(), PageCamera(1, None, "moving")
     assert orders.ask(order, 0)
     assert order.picture is None

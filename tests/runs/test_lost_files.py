@@ -81,7 +81,7 @@ def change(path: Path) -> None:
     path.write_bytes(whole[:40] + b"x" * 20 + whole[60:])
 
 
-def test_the_last_stages_run_again_where_files_are_lost(saved_late, copy):
+def test_last_stages_run_again_if_files_are_lost(saved_late, copy):
     names = "viewer.html", "report.html", "cameras/cameras.json", "point_cloud.ply"
     for name in names:
         change(copy / name)
@@ -93,7 +93,7 @@ def test_the_last_stages_run_again_where_files_are_lost(saved_late, copy):
     assert records(copy) == records(saved_late), "what they have noted is not there twice"
 
 
-def test_a_whole_run_that_is_done_is_left_alone(copy, monkeypatch, caplog):
+def test_complete_finished_run_does_not_change(copy, monkeypatch, caplog):
     monkeypatch.setattr(opening, "open_run", lambda *arguments: pytest.fail("opened a device"))
     written = (copy / "status.json").read_bytes()
     with caplog.at_level("INFO", "clsplat"):
@@ -102,7 +102,7 @@ def test_a_whole_run_that_is_done_is_left_alone(copy, monkeypatch, caplog):
     assert (copy / "status.json").read_bytes() == written
 
 
-def test_records_are_named_until_they_return(saved_late, copy):
+def test_missing_records_are_named_until_restored(saved_late, copy):
     (copy / "metrics.jsonl").write_text((copy / "metrics.jsonl").read_text().replace('"step": 4', '"step": 3'))
     for _ in range(2):
         said = command("resume", copy).stderr
@@ -114,7 +114,7 @@ def test_records_are_named_until_they_return(saved_late, copy):
 
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, ZeroDivisionError])
-def test_stopped_resume_takes_no_damaged_file_as_complete(raised, copy, monkeypatch):
+def test_stopped_resume_accepts_no_damaged_file(raised, copy, monkeypatch):
     for name in ("viewer.html", "report.html", "metrics.jsonl"):
         change(copy / name)
 
@@ -174,7 +174,7 @@ def test_a_refused_resume_leaves_a_run_done(name, copy):
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_without_a_checkpoint_the_remedy_is_to_restart(copy):
+def test_remedy_without_a_checkpoint_is_to_restart(copy):
     shutil.rmtree(copy / "checkpoints")
     (copy / "point_cloud.ply").unlink()
     for _ in ("done", "its status is lost too"):
@@ -184,7 +184,7 @@ def test_without_a_checkpoint_the_remedy_is_to_restart(copy):
         (copy / "status.json").unlink(missing_ok=True)
 
 
-def test_cells_of_a_matrix_that_lost_files(tiny_scene, tmp_path):
+def test_matrix_cells_with_lost_files_run_again(tiny_scene, tmp_path):
     """One with a checkpoint has them again; one without is named, and does not stop the comparison."""
     (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene) + "  - checkpoint\n")
     out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
@@ -208,7 +208,7 @@ def test_cells_of_a_matrix_that_lost_files(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"ply\n"])
-def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, tmp_path):
+def test_candidate_without_its_model_is_trained_again(content, few_steps, info, tmp_path):
     """Compress and lod would publish a damaged one."""
     source = ModelSource.of(few_steps, None)
     model = load_model(source.file)
@@ -228,7 +228,7 @@ def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, t
     assert tuning.train(pipeline, tmp_path / "rung").read_bytes() == whole
 
 
-def test_run_killed_before_it_began_says_how_to_begin(tmp_path):
+def test_run_killed_before_its_start_has_a_remedy(tmp_path):
     """As by `kill -9` while the device is proved: there is no pipeline to go on with."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "status.json").write_text('{"state": "preparing", "process": 4194305}')

@@ -42,7 +42,7 @@ def removed(out: Path) -> dict[str, bytes]:
     return files(out)
 
 
-def test_who_holds_a_folder_can_ask_whether_it_still_does(tmp_path):
+def test_holder_can_check_its_lock(tmp_path):
     with lock.lock_folder(tmp_path) as require_held:
         require_held()
         (tmp_path / LOCK).unlink()
@@ -85,7 +85,7 @@ def test_a_run_that_lost_its_folder_writes_nothing_more(take, failure, tiny_scen
     assert files(tmp_path) == before
 
 
-def test_a_rescue_saves_nothing_into_a_folder_that_was_lost(tiny_scene, tmp_path, monkeypatch):
+def test_emergency_save_skips_a_lost_folder(tiny_scene, tmp_path, monkeypatch):
     """The stage that saves fails the first time: the state is whole, and would be rescued."""
     before: dict[str, bytes] = {}
     save = checkpoint.save
@@ -102,7 +102,7 @@ def test_a_rescue_saves_nothing_into_a_folder_that_was_lost(tiny_scene, tmp_path
     assert files(tmp_path) == before
 
 
-def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkeypatch, caplog):
+def test_heartbeat_stops_and_reports_a_lost_folder(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
         before = taken(tmp_path / "run")
@@ -114,7 +114,7 @@ def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkey
     assert "the run continues" not in caplog.text
 
 
-def test_run_ending_before_its_first_step_spares_the_next_one(tmp_path):
+def test_run_ending_before_its_first_step_keeps_the_new_status(tmp_path):
     before: dict[str, bytes] = {}
 
     def ends() -> None:

@@ -55,7 +55,7 @@ def test_run_equals_its_local_twin_and_names_the_origin(runs):
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.splat", "world.ply"])
-def test_file_is_evaluated_where_the_scene_is(runs, tmp_path, name):
+def test_file_is_evaluated_at_the_scene_origin(runs, tmp_path, name):
     convert(runs / "world", tmp_path / name, world=name == "world.ply")
     assert psnr(tmp_path / name, runs) == pytest.approx(
         psnr(runs / "world", runs), abs=0.5 if "splat" in name else 1e-3

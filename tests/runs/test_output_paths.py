@@ -63,7 +63,7 @@ def text_fields() -> list[tuple[type[Settings], str]]:
     ]
 
 
-def test_every_text_in_a_pipeline_is_an_input_or_checked_output():
+def test_every_string_setting_is_an_input_or_checked_output():
     found = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
     assert Execution in Settings.defined
     checked = {
@@ -77,7 +77,7 @@ WRITING = [kind for kind in Settings.defined if issubclass(kind, Stage) and kind
 
 
 @pytest.mark.parametrize("kind", WRITING, ids=lambda kind: kind.__name__)
-def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
+def test_stages_cannot_write_outside_or_over_records(kind):
     for field, suffixes in kind.named_outputs().items():
         suffix = next(iter(suffixes), "")
         for path in OUTSIDE:
@@ -93,13 +93,13 @@ def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
 @pytest.mark.parametrize(
     ("place", "text"), [("scene.path", "a\\0b"), ("init.file", "\\ud800"), ("evaluate.lpips", "a\\0b")]
 )
-def test_what_no_path_can_hold_is_refused_where_paths_are_read(place, text):
+def test_impossible_paths_are_refused_when_read(place, text):
     with pytest.raises(ConfigError, match="it contains a character that file names cannot have"):
         load("smoke", [f'{place}="{text}"'])
 
 
 @pytest.mark.parametrize("name", ["..", "a/b", "x" * 300, "NUL.txt", "a.", ""])
-def test_the_name_of_a_pipeline_is_that_of_a_folder(name):
+def test_pipeline_name_is_a_valid_folder_name(name):
     with pytest.raises(ConfigError, match=r"--set name=.*: expected"):
         load("smoke", [f"name={json.dumps(name)}"])
 
@@ -112,7 +112,7 @@ def matrix(tmp_path: Path, *scenes: str) -> Path:
 
 
 @pytest.mark.parametrize("scene", ["..", "a/..", "checkpoints", "y/" + "z" * 240])
-def test_a_cell_of_a_matrix_lies_in_its_folder(scene, tmp_path):
+def test_matrix_cell_is_inside_the_folder(scene, tmp_path):
     with pytest.raises(ConfigError, match="a cell of the matrix would be named"):
         load_experiment(str(matrix(tmp_path, scene)))
 
@@ -127,7 +127,7 @@ CLASHES = {
 
 
 @pytest.mark.parametrize("name", CLASHES)
-def test_two_stages_do_not_write_one_file(name, tmp_path):
+def test_two_stages_writing_one_file_are_refused(name, tmp_path):
     stages, clash = CLASHES[name]
     with pytest.raises(ConfigError, match=f"two stages write '{clash}'; give one of them another name"):
         load(str(pipeline(tmp_path, stages)))
@@ -144,7 +144,7 @@ def pipeline(tmp_path: Path, last: str) -> Path:
     return file
 
 
-def test_a_field_of_a_plugin_may_be_optional_and_is_found():
+def test_optional_output_field_of_a_plugin_is_checked():
     defined = list(Settings.defined)
 
     class Animate(Stage):

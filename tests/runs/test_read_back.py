@@ -56,7 +56,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
 
 
 @pytest.mark.slow
-def test_what_a_run_writes_is_in_the_table_of_reserved_names(finished):
+def test_files_of_a_run_have_reserved_names(finished):
     pipeline, run = finished
     chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
     made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
@@ -64,7 +64,7 @@ def test_what_a_run_writes_is_in_the_table_of_reserved_names(finished):
     assert made <= names.RESERVED
 
 
-def test_names_of_run_files_are_in_one_table_and_reserved():
+def test_run_file_names_are_listed_and_reserved():
     table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
     table -= {names.SYSTEM, names.MODULE_FILE_PREFIX, names.STORE}  # the last is a key, too
     assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
@@ -79,14 +79,14 @@ def test_names_of_run_files_are_in_one_table_and_reserved():
     assert not faults, "\n".join(faults)
 
 
-def test_views_that_differ_in_their_suffix_have_a_render_each():
+def test_views_that_differ_in_suffix_get_separate_renders():
     names = ["a.jpg", "a.png", "b/a.jpg", "c.jpg", "d"]
     files = [path.as_posix() for path in image_paths(Path("r"), names)]
     assert files == ["r/a.jpg.png", "r/a.png.png", "r/b/a.png", "r/c.png", "r/d.png"]
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_what_cannot_be_read_back_is_no_success(name, finished):
+def test_unreadable_output_is_a_failure(name, finished):
     pipeline, run = finished
     place, damage = DAMAGE[name]
     file = run.out / place
@@ -101,7 +101,7 @@ def test_what_cannot_be_read_back_is_no_success(name, finished):
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, change_a_value])
-def test_model_written_before_a_kill_is_the_one_written(damage, tiny_scene, tmp_path, monkeypatch):
+def test_model_damaged_after_a_kill_is_detected_or_rewritten(damage, tiny_scene, tmp_path, monkeypatch):
     out, few = tmp_path / "run", [*SETTINGS, "init.count=50"]
 
     def fail(*arguments):
@@ -122,7 +122,7 @@ def test_model_written_before_a_kill_is_the_one_written(damage, tiny_scene, tmp_
     assert {name: (out / name).read_bytes() for name in whole} == whole
 
 
-def test_a_model_of_a_cadence_that_never_came_is_not_expected(finished):
+def test_model_of_a_cadence_not_reached_is_not_expected(finished):
     _, run = finished
     late = load("smoke", [*SETTINGS[:1], SETTINGS[1].replace("every: 2, file: early", "every: 4, file: late")])
     outputs.check_outputs(late, run)
@@ -153,7 +153,7 @@ def test_later_stage_that_damages_the_model_is_an_error(tiny_scene, tmp_path, wi
     assert read_status(tmp_path / "run")["exit_code"] == OutputError.exit_code
 
 
-def test_a_writer_that_loses_bytes_is_noticed_at_once(tiny_scene, tmp_path, monkeypatch):
+def test_truncated_write_is_detected_at_once(tiny_scene, tmp_path, monkeypatch):
     save = Model.save
 
     def saved_and_cut(model: Model, path: Path, *more: Any) -> Any:

@@ -43,7 +43,7 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         assert {path.name for path in out.iterdir()} == {"status.json", "log.txt"}, "the corrected command can begin"
 
 
-def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):
+def test_folder_with_foreign_files_is_not_removed(tiny_scene, tmp_path, monkeypatch):
     def open_run(pipeline, out, *others):
         (out / "notes.txt").write_text("mine")
         raise ConfigError("refused")
@@ -55,7 +55,7 @@ def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
 
 
-def test_restart_begins_again_and_leaves_the_files_of_others(tiny_scene, tmp_path):
+def test_restart_keeps_foreign_files(tiny_scene, tmp_path):
     out = tmp_path / "run"
     arguments = ["run", "smoke", "--scene", tiny_scene, "--out", out, "--set", "optimize.steps=20", "init.count=100"]
     command(*arguments)

@@ -14,7 +14,7 @@ from tests.support.runs import FEW, crafted, digest, steps_saved, train
 pytestmark = pytest.mark.slow
 
 
-def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, caplog):
+def test_settings_without_effect_on_tables_may_change(killed_run, tiny_scene, few_steps, caplog):
     train(tiny_scene, killed_run, *FEW, "checkpoint.keep=1", "optimize.log_every=4", "render.folder=other", resume=True)
     assert digest(killed_run) == digest(few_steps)
     assert "bits are not" not in caplog.text
@@ -25,7 +25,7 @@ def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, 
 @pytest.mark.parametrize(
     "change", ["optimize.steps=14", "densify.stop=6", "optimize.losses.0.weight=0.7", "optimize.update=seen"]
 )
-def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, caplog):
+def test_training_values_may_change(change, killed_run, tiny_scene, caplog):
     run = train(tiny_scene, killed_run, *FEW, change, resume=True)
     assert run.step == (14 if "steps" in change else 12)
     assert caplog.text.count("from here on, bits differ from a run without this change") == 1
@@ -34,12 +34,12 @@ def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, capl
 
 
 @pytest.mark.parametrize("change", ["seed=3", "init.count=70", "model.sh_degree=2", "optimize.losses=[l1]"])
-def test_what_tables_depend_on_may_not_change(change, killed_run, tiny_scene):
+def test_settings_that_shape_tables_may_not_change(change, killed_run, tiny_scene):
     with pytest.raises(ConfigError, match=r"was made with other settings: .*restore it, or start again with `clsp"):
         train(tiny_scene, killed_run, *FEW, change, resume=True)
 
 
-def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, caplog):
+def test_fewer_steps_than_trained_are_refused(killed_run, tiny_scene, caplog):
     before = (killed_run / "pipeline.yaml").read_text()
     words = r"already at step 8; optimize.steps=6 would end before it: use 8 or more, or start over: `clsplat run`"
     with pytest.raises(ConfigError, match=words):
@@ -48,7 +48,7 @@ def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, ca
     assert (killed_run / "pipeline.yaml").read_text() == before
 
 
-def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_scene, tmp_path):
+def test_finished_training_accepts_no_new_values(few_steps, tiny_scene, tmp_path):
     out = shutil.copytree(few_steps, tmp_path / "run")
     before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
     words = rf"no step is left to train, at step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` with that"
@@ -61,13 +61,13 @@ def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_s
     assert len(json.loads((out / "metrics.json").read_text())["changes"]) == 2
 
 
-def test_training_ends_where_it_stopped_if_asked(killed_run):
+def test_training_can_end_at_its_current_step(killed_run):
     Job.resume(killed_run, ["optimize.steps=8"]).run()
     assert read_status(killed_run)["state"] == "done"
     assert (killed_run / "point_cloud.ply").is_file()
 
 
-def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):
+def test_finished_stage_keeps_its_settings(killed_run, tiny_scene):
     crafted(
         killed_run / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(stage_index=2, stage_step=0)
     )
@@ -75,7 +75,7 @@ def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=20", resume=True)
 
 
-def test_a_run_that_stopped_after_its_last_stage_ends(killed_run, tiny_scene, few_steps):
+def test_run_stopped_after_its_last_stage_finishes(killed_run, tiny_scene, few_steps):
     last = len(archive.read(killed_run / "checkpoints" / "step_000008.npz")[0]["pipeline"]["stages"])
     shutil.copy(few_steps / "checkpoints" / "step_000012.npz", killed_run / "checkpoints")
     written = {"point_cloud.ply": digest(few_steps)}

@@ -56,7 +56,7 @@ def quiet_log():
     ("name", "function"),
     list(zip(ENDINGS, 3 * ["opening.open_run", "runner.execute", "runner.run_stages"], strict=False)),
 )
-def test_every_exception_ends_in_a_sentence_and_a_status(name, function, tiny_scene, tmp_path, monkeypatch, capsys):
+def test_every_exception_gives_a_message_and_a_status(name, function, tiny_scene, tmp_path, monkeypatch, capsys):
     raised, kind, words = ENDINGS[name]
 
     def fail(*arguments):
@@ -82,7 +82,7 @@ def test_every_exception_ends_in_a_sentence_and_a_status(name, function, tiny_sc
 
 
 @pytest.mark.parametrize("place", [["--debug", "run"], ["run", "--debug"]], ids=["before", "after"])
-def test_debug_shows_the_traceback_before_the_line(place, tiny_scene, tmp_path, monkeypatch, capsys):
+def test_debug_prints_the_traceback_before_the_message(place, tiny_scene, tmp_path, monkeypatch, capsys):
     def fail(*arguments):
         raise ZeroDivisionError("by zero")
 
@@ -97,7 +97,7 @@ def test_debug_shows_the_traceback_before_the_line(place, tiny_scene, tmp_path, 
     assert lines[-1].startswith("error: internal error (a bug): ZeroDivisionError: by zero")
 
 
-def test_what_cannot_be_logged_is_a_failure_with_a_status(tiny_scene, tmp_path):
+def test_unwritable_log_is_a_failure_with_a_status(tiny_scene, tmp_path):
     (tmp_path / "run" / "log.txt").mkdir(parents=True)
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", expect=7)
     assert "log.txt: cannot be written" in done.stderr
@@ -127,7 +127,7 @@ def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", [["devices"], ["--help"]], ids=" ".join)
-def test_output_that_cannot_be_written_is_one_line(arguments):
+def test_unwritable_output_is_one_line(arguments):
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "clsplat", *arguments]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
@@ -137,12 +137,12 @@ def test_output_that_cannot_be_written_is_one_line(arguments):
     ]
 
 
-def test_a_scene_whose_name_is_no_text_is_refused(tmp_path):
+def test_scene_with_a_non_unicode_name_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="expected a path of UTF-8 text"):
         Job.open("smoke", tmp_path / "\udcff")
 
 
-def test_a_run_that_holds_a_run_keeps_its_status(tiny_scene, tmp_path):
+def test_folder_with_another_run_keeps_its_status(tiny_scene, tmp_path):
     (tmp_path / "pipeline.yaml").write_text("name: other\nstages: [init]\n")
     (tmp_path / "status.json").write_text('{"state": "done"}')
     clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, expect=2)
@@ -159,7 +159,7 @@ def test_the_terminal_keeps_stdout_for_json(capsys):
     assert captured.err == "a remark\nwarning: a warning\n"
 
 
-def test_a_command_without_stdout_says_so():
+def test_command_without_stdout_reports_it():
     done = subprocess.run(
         f'"{sys.executable}" -m clsplat --version >&-', shell=True, stderr=subprocess.PIPE, text=True, timeout=60
     )

@@ -53,7 +53,7 @@ def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
         opened(tiny_scene, out)
 
 
-def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path):
+def test_new_run_replaces_no_foreign_files(tiny_scene, tmp_path):
     (tmp_path / "holiday").mkdir()
     (tmp_path / "holiday" / "r_1.png").write_text("mine")
     (tmp_path / "report.html").write_text("mine")
@@ -89,7 +89,7 @@ def test_foreign_files_with_names_of_a_matrix_are_not_replaced(tmp_path):
         (tmp_path / name).unlink()
 
 
-def test_what_a_run_that_never_began_has_left_is_its_own(tiny_scene, tmp_path):
+def test_leftovers_of_a_refused_run_belong_to_the_run(tiny_scene, tmp_path):
     (tmp_path / "run.lock").touch()
     opened(tiny_scene, tmp_path)
     (tmp_path / "run.lock").write_text('{"process": 7}')
@@ -112,7 +112,7 @@ UNWRITABLE = {  # --out -> the exit code, and what the sentence says
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="names and faults of POSIX")
 @pytest.mark.parametrize("out", UNWRITABLE)
-def test_a_run_folder_that_cannot_be_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
+def test_impossible_run_folder_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     place = out.replace("FILE", "file").replace("SCENE", str(tiny_scene)).replace("ROOT", "/")
     monkeypatch.chdir(tmp_path)
@@ -130,7 +130,7 @@ def test_a_run_folder_that_cannot_be_is_one_sentence(out, tiny_scene, tmp_path, 
 
 
 @pytest.mark.parametrize("start", get_args(Start))
-def test_a_run_does_not_take_the_place_of_a_users_file(tiny_scene: Path, tmp_path: Path, start):
+def test_run_does_not_replace_a_users_file(tiny_scene: Path, tmp_path: Path, start):
     own = tmp_path / "pipeline.yaml"
     own.write_bytes(shipped()["smoke"].read_bytes())
     for act in (lambda job: job.describe(), lambda job: job.run()):
@@ -141,7 +141,7 @@ def test_a_run_does_not_take_the_place_of_a_users_file(tiny_scene: Path, tmp_pat
 
 
 @pytest.mark.parametrize("sign", ["status.json", "checkpoints/step_000004.npz", "its first line"])
-def test_what_a_run_wrote_is_begun_again(tmp_path: Path, sign):
+def test_restart_replaces_files_of_the_run(tmp_path: Path, sign):
     (tmp_path / "pipeline.yaml").write_text("# resolved from x.yaml\n" if sign == "its first line" else "name: x\n")
     if sign != "its first line":
         (tmp_path / sign).parent.mkdir(exist_ok=True)
@@ -163,7 +163,7 @@ PHASES: dict[str, tuple[Phase, dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("name", PHASES)
-def test_a_folder_tells_how_far_its_run_is(name, tmp_path):
+def test_run_state_follows_from_its_folder(name, tmp_path):
     phase, content = PHASES[name]
     for file, text in content.items():
         (tmp_path / file).parent.mkdir(exist_ok=True)

@@ -29,7 +29,7 @@ def done(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_run_is_a_model(done):
+def test_run_folder_is_a_model(done):
     model = done / "models/last.ply"
     assert run_of(done) == done
     assert run_of(model) == done.resolve()
@@ -38,7 +38,7 @@ def test_a_run_is_a_model(done):
     assert run_of(done.parent / "copy.ply") is None
 
 
-def test_a_model_of_a_run_has_its_scene(done, tiny_scene):
+def test_model_of_a_run_has_its_scene(done, tiny_scene):
     for model in (done, done / "models/last.ply"):
         source = ModelSource.of(model, None)
         assert (source.file.name, source.folder, source.settings.downscale) == ("last.ply", tiny_scene, 2)
@@ -50,7 +50,7 @@ def test_a_model_of_a_run_has_its_scene(done, tiny_scene):
     assert ModelSource.of(copy, tiny_scene).settings.downscale == 1
 
 
-def test_a_run_is_a_scene(done, tiny_scene, tmp_path):
+def test_run_folder_is_a_scene(done, tiny_scene, tmp_path):
     assert photographs_of(done) == tiny_scene
     assert photographs_of(tiny_scene) == tiny_scene
     assert clsplat.inspect_scene(done).trainable
@@ -61,7 +61,7 @@ def test_a_run_is_a_scene(done, tiny_scene, tmp_path):
         photographs_of(moved)
 
 
-def test_a_run_that_is_done_trains_longer(done, tiny_scene, tmp_path):
+def test_finished_run_trains_longer(done, tiny_scene, tmp_path):
     """Its last step is in a checkpoint, whatever the cadence; the longer run starts from there."""
     out = shutil.copytree(done, tmp_path / "run")
     assert steps_saved(out)[-1] == "step_000010.npz"
@@ -86,7 +86,7 @@ def test_finished_run_without_checkpoints_is_not_retrained(tiny_scene, tmp_path)
     assert digest(out) == before
 
 
-def test_the_summary_names_what_there_is(done, tiny_scene):
+def test_summary_lists_metrics_and_files(done, tiny_scene):
     lines = summary(done)
     assert lines[0].startswith("test PSNR ")
     assert f"  scene    {tiny_scene}" in lines
@@ -104,7 +104,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     assert summary(folder)[-1].endswith("in a browser; the model overfits: more photos help most")
 
 
-def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
+def test_summary_names_missing_photographs(done, tmp_path):
     assert (
         summarize_placement(FOUND) == "32 of 33 photographs placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
     )
@@ -120,7 +120,7 @@ def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
     assert "undistort 7 s" in text
 
 
-def test_the_report_begins_with_pictures_and_cameras(done, tiny_scene):
+def test_report_starts_with_images_and_cameras(done, tiny_scene):
     text = (done / "report.html").read_text()
     page = Page(text)
     titles = ["The worst views", "Photographs", "Figures", "Settings"]

@@ -26,14 +26,14 @@ def put(folder: Path, **values) -> dict:
     return reading.run_status(RunState.read(folder))
 
 
-def test_a_process_that_is_gone_was_killed(tmp_path):
+def test_missing_process_counts_as_killed(tmp_path):
     found = put(tmp_path)
     assert found["state"] == "killed"
     assert "silent" not in found
 
 
 @pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
-def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
+def test_remote_run_is_judged_only_by_its_heartbeat(elsewhere, tmp_path):
     found = put(tmp_path, **elsewhere)
     assert found["state"] == "running"
     assert 199 < found["silent"] < 300
@@ -49,7 +49,7 @@ def test_a_stopped_process_has_no_heartbeat(tmp_path):
     assert f"no heartbeat for {found['silent']} s; process {process.pid}" in reading.status_text(found)
 
 
-def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
+def test_status_prints_stage_and_time_left(tmp_path):
     amount = Amount(done=3, total=20, unit="views")
     found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
     assert reading.status_text(found).splitlines()[0] == (
@@ -57,14 +57,14 @@ def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
     )
 
 
-def test_the_lines_name_the_photographs_that_are_left_out(tmp_path):
+def test_status_prints_left_out_photographs(tmp_path):
     found = put(tmp_path, state="done", progress=None)
     features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
     found["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
     assert "3 of 4 photographs placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
 
 
-def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
+def test_clock_ahead_is_noted_and_gives_no_negative_time(tmp_path):
     found = put(tmp_path, host="a", time=time.time() + 500)
     assert found["silent"] == 0
     assert 490 < found["ahead"] <= 500
@@ -75,7 +75,7 @@ def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
 
 
 @pytest.mark.parametrize("state", ["killed", "failed", "interrupted"])
-def test_the_advice_is_a_command_that_works(state, tmp_path):
+def test_suggested_command_works(state, tmp_path):
     more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
     (tmp_path / "pipeline.yaml").touch()
     text = reading.status_text(put(tmp_path, **more))
@@ -89,7 +89,7 @@ def test_the_advice_is_a_command_that_works(state, tmp_path):
     assert "--restart" not in text
 
 
-def test_the_step_is_that_of_the_last_report_where_it_is_later(tmp_path):
+def test_step_is_the_later_of_status_and_report(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
     assert ": failed at step 8 of 9" in reading.status_text(put(tmp_path, state="failed"))
 
@@ -123,7 +123,7 @@ def test_a_status_of_a_newer_version_is_refused(tmp_path):
     assert "of a newer clsplat" in refusal(reading.run_status, RunState.read(tmp_path))
 
 
-def test_no_line_holds_what_a_terminal_obeys(tmp_path):
+def test_status_has_no_terminal_escapes(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": ' + "9" * 4000 + "}\n")
     found = put(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
     text = reading.status_text(found)

@@ -102,7 +102,7 @@ def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeyp
     assert not list((tmp_path / "renders").rglob("*.png"))
 
 
-def test_first_signal_stops_at_once_where_there_is_no_model(pipeline, tiny_scene, tmp_path, monkeypatch):
+def test_first_signal_without_a_model_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
     run = Init.run
     monkeypatch.setattr(Init, "run", lambda stage, state: signalled(run, 1)(stage, state))
     with pytest.raises(Interrupted, match="stopped at once"):

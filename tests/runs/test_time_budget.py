@@ -30,7 +30,7 @@ def test_steps_follow_from_a_rehearsal():
 
 @pytest.mark.parametrize("minutes", [2.0, 10.0, 60.0])
 @pytest.mark.parametrize(("growth", "until_share"), [(0.0, 0.5), (3.0, 0.5), (3.0, 0.9), (30.0, 0.5)])
-def test_it_takes_the_time_that_was_given(monkeypatch, minutes, growth, until_share):
+def test_run_takes_the_given_time(monkeypatch, minutes, growth, until_share):
     """By a made-up clock: steps take longer as Gaussians grow, in long trainings more than in a rehearsal."""
     clock, done, planned = [0.0], [0], list[int]()
 
@@ -110,7 +110,7 @@ def test_run_in_minutes_has_the_bits_of_its_pipeline(tiny_scene, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_run_that_dies_at_a_correction_keeps_what_was_chosen(tiny_scene, tmp_path, monkeypatch, few):
+def test_run_killed_at_a_correction_keeps_the_chosen_steps(tiny_scene, tmp_path, monkeypatch, few):
     """The pipeline is written before the checkpoint, which is of the corrected one."""
     execute = experiment.runner.execute
 
@@ -130,7 +130,7 @@ def test_run_that_dies_at_a_correction_keeps_what_was_chosen(tiny_scene, tmp_pat
 
 
 @pytest.mark.slow
-def test_rehearsal_that_takes_too_long_ends_its_steps(tiny_scene, tmp_path, monkeypatch, few):
+def test_too_long_rehearsal_is_shortened(tiny_scene, tmp_path, monkeypatch, few):
     """What follows them is rehearsed all the same; the rest is taken to be like the last."""
     found: list[Rehearsal] = []
 
@@ -163,12 +163,12 @@ def test_too_few_minutes_are_refused_in_the_rehearsal(tiny_scene, tmp_path, few_
     assert clsplat.check(out)["whole"]
 
 
-def test_training_is_not_cut_below_what_keeps_edits_apart():
+def test_training_keeps_enough_steps_to_separate_edits():
     assert time_budget.min_steps_of(load("splat")) == 300
     assert time_budget.min_steps_of(load("mip_nerf")) == 20
 
 
-def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):
+def test_impossible_time_budget_is_refused(tiny_scene, tmp_path, few_steps):
     with pytest.raises(ConfigError, match="omit it to continue"):
         clsplat.run(few_steps / "pipeline.yaml", out=few_steps, start="resume", minutes=1)
     with pytest.raises(ConfigError, match="a matrix has several"):

@@ -48,7 +48,7 @@ def damaged(out: Path) -> dict[str, str]:
     return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}
 
 
-def test_a_status_of_a_newer_version_is_not_damaged(copy):
+def test_status_of_a_newer_version_is_not_damage(copy):
     """A key that is new does not change the format; one of another format is not judged."""
     path = copy / "status.json"
     status = json.loads(path.read_text())
@@ -85,7 +85,7 @@ def test_complete_run_has_a_line_per_file_and_needs_no_device(finished, monkeypa
     assert (data["state"], data["whole"]) == ("done", True)
 
 
-def test_checksums_are_those_of_sha256sum(finished):
+def test_checksums_match_sha256sum(finished):
     sums = json.loads((finished / "checksums.json").read_text())
     import hashlib
 
@@ -94,7 +94,7 @@ def test_checksums_are_those_of_sha256sum(finished):
     assert {"pipeline.yaml", "metrics.json", "metrics.jsonl", "point_cloud.ply", "report.html"} < set(sums)
 
 
-def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
+def test_changed_byte_in_any_file_is_detected(finished, copy):
     files = [one["file"] for one in clsplat.check(finished)["objects"] if one["file"] != "status.json"]
     assert len(files) > 9
     for name in files:
@@ -109,7 +109,7 @@ def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\xff\x00", b"[]"])
-def test_a_file_that_is_gone_or_no_such_file_is_noticed(content, finished, copy):
+def test_missing_or_replaced_file_is_detected(content, finished, copy):
     older = min(path.relative_to(finished).as_posix() for path in finished.glob("checkpoints/*"))
     for one in clsplat.check(finished)["objects"]:
         path = copy / one["file"]
@@ -131,7 +131,7 @@ def test_damage_ends_with_exit_code_7_and_one_line(copy):
     assert data["whole"] is False
 
 
-def test_a_run_that_was_killed_is_whole_without_its_outputs(copy):
+def test_killed_run_is_complete_without_outputs(copy):
     for name in ("checksums.json", "metrics.json", "point_cloud.ply", "report.html"):
         (copy / name).unlink()
     status = json.loads((copy / "status.json").read_text())
@@ -144,12 +144,12 @@ def test_a_run_that_was_killed_is_whole_without_its_outputs(copy):
 
 
 @pytest.mark.parametrize("name", ["inputs.json", "checksums.json", "checkpoints/step_000020.npz", "report.html"])
-def test_what_a_run_that_is_done_must_have_is_missed(name, copy):
+def test_missing_outputs_of_a_finished_run_are_detected(name, copy):
     (copy / name).unlink()
     assert set(damaged(copy)) == {name}
 
 
-def test_missing_renders_are_noticed(copy):
+def test_missing_renders_are_detected(copy):
     shutil.rmtree(copy / "renders")
     assert damaged(copy)
     assert all(name.startswith("renders/test/") for name in damaged(copy))
@@ -173,7 +173,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_in_the_place_of_a_file_is_told(kind, finished, copy):
+def test_wrong_kind_of_file_is_reported(kind, finished, copy):
     if (make := KINDS[kind]) is None:
         pytest.skip("this system has no pipes with names")
     for name in [one["file"] for one in clsplat.check(finished)["objects"]]:
@@ -186,7 +186,7 @@ def test_what_is_in_the_place_of_a_file_is_told(kind, finished, copy):
         shutil.copyfile(finished / name, copy / name)
 
 
-def test_every_file_that_is_gone_is_named(finished, copy):
+def test_every_missing_file_is_named(finished, copy):
     """The list of checksums tells them, or the pipeline, or what every run has."""
     files = {one["file"] for one in clsplat.check(finished)["objects"]}
     outputs = {name for name in files if name.endswith((".ply", ".html", ".png"))}
@@ -208,7 +208,7 @@ def test_every_file_that_is_gone_is_named(finished, copy):
         assert damaged(copy).keys() == told, kept
 
 
-def test_a_run_without_checksums_is_not_called_whole(copy):
+def test_run_without_checksums_is_not_reported_as_complete(copy):
     (copy / "checksums.json").unlink()
     done = command("check", copy, expect=7)
     assert "checksums.json is missing, as in runs of a Trainer" in done.stderr
@@ -220,20 +220,20 @@ def test_every_file_has_one_line(finished):
     assert len(files) == len(set(files))
 
 
-def test_a_damaged_note_of_prepared_photographs_is_noticed(copy):
+def test_damaged_preparation_note_is_detected(copy):
     (copy / "prepared.json").write_text('{"inputs": "a", "folder": "b"}')
     assert damaged(copy) == {}
     (copy / "prepared.json").write_text("{}")
     assert set(damaged(copy)) == {"prepared.json"}
 
 
-def test_a_run_whose_process_is_gone_is_called_killed(copy):
+def test_run_without_a_process_is_reported_as_killed(copy):
     status = json.loads((copy / "status.json").read_text())
     (copy / "status.json").write_text(json.dumps({**status, "state": "running", "process": 2**22 + 1}))
     assert clsplat.check(copy)["state"] == clsplat.status(copy)["state"] == "killed"
 
 
-def test_the_remedy_is_one_that_works(copy):
+def test_suggested_remedy_works(copy):
     (copy / "point_cloud.ply").write_bytes(b"")
     assert f"`clsplat resume {copy}`" in command("check", copy, expect=7).stderr
     for path in (copy / "checkpoints").iterdir():
@@ -243,7 +243,7 @@ def test_the_remedy_is_one_that_works(copy):
     assert "resume" not in said
 
 
-def test_a_damaged_checkpoint_is_told_in_plain_words(copy):
+def test_damaged_checkpoint_is_described_plainly(copy):
     path = copy / "checkpoints" / "step_000020.npz"
     data = bytearray(path.read_bytes())
     path.write_bytes(b"")
@@ -256,7 +256,7 @@ def test_a_damaged_checkpoint_is_told_in_plain_words(copy):
     assert "resume" not in said, "it would leave the run as it is"
 
 
-def test_a_dry_resume_says_where_it_would_go_on(copy):
+def test_dry_resume_prints_the_step(copy):
     before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
     assert "up to date" in command("resume", copy, "--dry-run").stdout
     (copy / "report.html").unlink()
@@ -265,11 +265,11 @@ def test_a_dry_resume_says_where_it_would_go_on(copy):
     assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
 
 
-def test_a_path_without_anything_may_have_meant_a_run():
+def test_missing_path_error_mentions_run_folders():
     assert "expected a pipeline, a model, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
 
 
-def test_the_sums_are_those_of_the_run_that_ended_last(copy):
+def test_checksums_belong_to_the_last_finished_run(copy):
     (copy / "point_cloud.ply").write_bytes(b"")
     assert damaged(copy)
     (copy / "checkpoints" / "step_000020.npz").unlink()
@@ -277,7 +277,7 @@ def test_the_sums_are_those_of_the_run_that_ended_last(copy):
     assert damaged(copy) == {}
 
 
-def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
+def test_check_of_a_matrix_includes_its_cells(tiny_scene, tmp_path):
     (tmp_path / "two.yaml").write_text(TINY.format(scene=tiny_scene))
     out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
     assert damaged(out) == {}

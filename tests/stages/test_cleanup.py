@@ -82,14 +82,14 @@ def opened(scene: Path, model: Path, out: Path) -> Run:
 
 
 @pytest.mark.parametrize("row", RULES)
-def test_a_rule_removes_what_it_is_for(tiny_scene, spoilt, tmp_path, row):
+def test_each_rule_removes_its_target(tiny_scene, spoilt, tmp_path, row):
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = run.model.gaussians.get("means")
     Cleanup(stage="cleanup", rules=[RULES[row]]).act(run)
     np.testing.assert_array_equal(run.model.gaussians.get("means"), np.delete(before, row, axis=0))
 
 
-def test_all_rules_remove_all_of_them_and_say_which(tiny_scene, spoilt, tmp_path, caplog):
+def test_all_rules_remove_and_report_their_targets(tiny_scene, spoilt, tmp_path, caplog):
     run, caplog.handler.level = opened(tiny_scene, spoilt, tmp_path / "run"), 0
     before = {name: run.model.gaussians.get(name) for name in run.model.gaussians.trained}
     with caplog.at_level("INFO", logger="clsplat"):
@@ -103,17 +103,17 @@ def test_all_rules_remove_all_of_them_and_say_which(tiny_scene, spoilt, tmp_path
     assert (line["kind"], line["before"], line["after"], line["causes"]) == ("densify", 31, 27, causes)
 
 
-def test_what_is_large_on_the_screen_stays_unless_it_is_said():
+def test_large_screen_size_is_kept_by_default():
     assert Cleanup(stage="cleanup").rules == [RULES[row] for row in (FAINT, FAR, USELESS)]
 
 
-def test_one_photograph_is_enough_unless_it_is_said(tiny_scene, spoilt, tmp_path):
+def test_one_view_suffices_by_default(tiny_scene, spoilt, tmp_path):
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     Cleanup(stage="cleanup", rules=[PruneUseless(views_below=2)]).act(run)
     assert run.model.gaussians.count < 30, "others than the one out of sight"
 
 
-def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, tmp_path):
+def test_removing_every_gaussian_is_refused(tiny_scene, spoilt, tmp_path):
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = run.model.gaussians.get("means")
     with pytest.raises(NumericError, match="cleanup: its rules would remove all Gaussians; weaken them"):
@@ -122,7 +122,7 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
     assert run.is_consistent
 
 
-def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
+def test_undeclared_rewriting_rule_does_not_change_the_model(tiny_scene, spoilt, tmp_path, monkeypatch):
     monkeypatch.setattr(MergeNeighbors, "rewrites", False)
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
@@ -145,7 +145,7 @@ def finished(tiny_scene: Path, ending: str, tmp_path_factory: pytest.TempPathFac
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "ending", pipeline=ending)
 
 
-def test_a_training_goes_on_with_what_is_left(finished):
+def test_training_continues_after_a_cleanup(finished):
     (line,) = (one for one in map(json.loads, (finished.out / "metrics.jsonl").open()) if one["kind"] == "densify")
     assert line["step"] == 4
     assert min(line["causes"].values()) > 0
@@ -155,7 +155,7 @@ def test_a_training_goes_on_with_what_is_left(finished):
 
 
 @pytest.mark.parametrize("stop_at", [4, 6])
-def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, ending, tmp_path, stop_at):
+def test_resumed_run_has_the_same_bits(finished, tiny_scene, ending, tmp_path, stop_at):
     checked = load(ending, [f"scene.path='{tiny_scene}'", *("stages.1.log_every=1", "stages.3.log_every=1")])
     run = opening.open_run(checked, tmp_path / "run", None)
 
@@ -168,7 +168,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, en
     assert (run.out / "point_cloud.ply").read_bytes() == (finished.out / "point_cloud.ply").read_bytes()
 
 
-def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_scene, tmp_path, caplog):
+def test_refused_cleanup_saves_the_trained_state(finished, tiny_scene, tmp_path, caplog):
     out, path = tmp_path / "run", tmp_path / "ending.yaml"
     path.write_text(ENDING.replace(", {checkpoint: {every: 1}}", "").replace("{checkpoint: {every: 1}}", ""))
     with pytest.raises(NumericError, match="would remove all Gaussians"):
@@ -192,7 +192,7 @@ def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_s
         ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad of training steps; use it in densify"),
     ],
 )
-def test_rules_that_do_not_only_remove_are_refused(tmp_path, rules, complaint):
+def test_rules_that_do_more_than_remove_are_refused(tmp_path, rules, complaint):
     path = tmp_path / "x.yaml"
     path.write_text(f"name: x\nstages:\n  - init\n  - cleanup: {{rules: {rules}}}\n")
     with pytest.raises(ConfigError, match=complaint):

@@ -17,7 +17,7 @@ stages:
 
 
 @pytest.mark.slow
-def test_a_second_init_forgets_the_first_training(tiny_scene, tmp_path):
+def test_second_init_discards_the_first_training(tiny_scene, tmp_path):
     (tmp_path / "x.yaml").write_text(PIPELINE)
     run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "x.yaml"))
     assert run.model.gaussians.count == 700

@@ -70,7 +70,7 @@ def opened(scene: Path, pipeline: str, out: Path, *overrides: str) -> Run:
     return run
 
 
-def test_the_least_gaussians_go(tiny_scene, pipeline, tmp_path):
+def test_least_important_gaussians_are_removed(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     score, before = scores(run), run.model.gaussians.get("means")
     load_pipeline(pipeline).stages[1].act(run)
@@ -81,7 +81,7 @@ def test_the_least_gaussians_go(tiny_scene, pipeline, tmp_path):
     assert scores(run).sum() > 0.8 * score.sum(), "the others had little weight"
 
 
-def test_the_score_may_be_the_change_of_the_image(tiny_scene, pipeline, tmp_path):
+def test_image_change_can_be_the_score(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     by_weight = scores(run)
     score = sensitivities(run.survey().render(run.scene.split("train")), run.model.gaussians.count)
@@ -92,7 +92,7 @@ def test_the_score_may_be_the_change_of_the_image(tiny_scene, pipeline, tmp_path
     assert not np.array_equal(kept, np.sort(np.argsort(-by_weight, kind="stable")[: len(kept)]))
 
 
-def test_of_equal_scores_the_first_stay():
+def test_ties_keep_the_first_gaussians():
     np.testing.assert_array_equal(np.flatnonzero(largest(np.array([1.0, 2, 1, 2, 1]), 3)), [0, 1, 3])
 
 
@@ -121,7 +121,7 @@ def test_a_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
         assert run.model.degree == run.model.gaussians.sh_degree == min(degree, 1)
 
 
-def test_the_bands_that_matter_least_become_zero(tiny_scene, pipeline, tmp_path):
+def test_least_important_bands_become_zero(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     energy = band_energy(run.model.gaussians.get("sh_rest")) * scores(run)[:, None]
     load_pipeline(pipeline, ["reduce_sh.degree=2", "reduce_sh.share=0.25"]).stages[3].act(run)
@@ -130,7 +130,7 @@ def test_the_bands_that_matter_least_become_zero(tiny_scene, pipeline, tmp_path)
     assert energy[zero].max() <= energy[~zero].min()
 
 
-def test_the_measured_file_is_read_again(finished, tiny_scene):
+def test_measured_file_is_read_back(finished, tiny_scene):
     """Metrics are those of the quantized file, not those of the model that it was made from."""
     from clsplat.runs.model_file import evaluate
 
@@ -141,7 +141,7 @@ def test_the_measured_file_is_read_again(finished, tiny_scene):
     assert abs(found["psnr"] - exact["psnr"]) > 1e-4
 
 
-def test_counts_and_degrees_at_the_end(finished, source):
+def test_final_counts_and_degrees(finished, source):
     count = len(read(source))
     model = read(finished.out / "point_cloud.ply")
     assert len(model) == round(0.8 * round(count / 2)) == finished.model.gaussians.count
@@ -149,7 +149,7 @@ def test_counts_and_degrees_at_the_end(finished, source):
     assert (model.parameters["sh_rest"] == 0).all(axis=1).sum() == round(0.4 * len(model))
 
 
-def test_an_interruption_between_edits_changes_no_bit(finished, tiny_scene, pipeline, tmp_path):
+def test_interruption_between_edits_changes_no_bits(finished, tiny_scene, pipeline, tmp_path):
     checked = load_pipeline(pipeline, [f"scene.path='{tiny_scene}'", "optimize.log_every=1"])
     for stop_at in (2, 4, 5):
         run = opening.open_run(checked, tmp_path, None)
@@ -174,21 +174,21 @@ def test_an_interruption_between_edits_changes_no_bit(finished, tiny_scene, pipe
         ("{remove: 0.5, score: weights}", "expected 'weight' or 'sensitivity'"),
     ],
 )
-def test_what_is_no_share_is_refused(tmp_path, fields, complaint):
+def test_invalid_fraction_is_refused(tmp_path, fields, complaint):
     path = tmp_path / "x.yaml"
     path.write_text(f"name: x\nstages:\n  - init\n  - prune_least: {fields}\n")
     with pytest.raises(ConfigError, match=complaint):
         load_pipeline(str(path))
 
 
-def test_a_measured_file_lies_in_the_run_folder(tmp_path):
+def test_measured_file_is_inside_the_run_folder(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - evaluate: {file: ../model.ply}\n")
     with pytest.raises(ConfigError, match="inside the run folder"):
         load_pipeline(str(path))
 
 
-def test_a_quality_is_of_formats_that_have_one(tmp_path):
+def test_quality_is_refused_for_formats_without_it(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - export: {file: a.glb, quality: small}\n")
     with pytest.raises(ConfigError, match=r"'quality' applies to SPZ and SOG; .* got 'a.glb'"):
@@ -218,7 +218,7 @@ def many(source: Path) -> Path:
     return file
 
 
-def test_a_sog_holds_the_harmonics_that_a_model_was_trained_with(many, tiny_scene, tmp_path):
+def test_sog_stores_the_trained_harmonics(many, tiny_scene, tmp_path):
     (tmp_path / "palette.yaml").write_text(PALETTE.replace("MODEL", json.dumps(str(many))))
     run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"))
     model, back = load(run.out / "point_cloud.ply"), load(run.out / "model.sog")
@@ -245,7 +245,7 @@ ROUNDED = PALETTE.replace(
 ).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")
 
 
-def test_rounded_tables_are_frozen_and_written_as_they_are(many, tiny_scene, tmp_path):
+def test_rounded_tables_are_frozen_and_written_exactly(many, tiny_scene, tmp_path):
     (tmp_path / "rounded.yaml").write_text(ROUNDED.replace("MODEL", json.dumps(str(many))))
     out = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "rounded.yaml")).out
     before, after, back = (load(out / name).tables() for name in ("before.ply", "point_cloud.ply", "model.sog"))
@@ -281,7 +281,7 @@ def learned(many: Path, tiny_scene: Path, tmp_path_factory) -> Path:
     return train(tiny_scene, out / "run", pipeline=str(out / "palette.yaml")).out
 
 
-def test_gaussians_that_share_a_vector_train_it_together(learned):
+def test_gaussians_train_their_shared_vector_together(learned):
     before, after = (load(learned / f"{name}.ply").sh_rest for name in ("before", "after"))
     vectors, labels = np.unique(before, axis=0, return_inverse=True)
     assert len(vectors) <= 1024 < len(before)
@@ -290,7 +290,7 @@ def test_gaussians_that_share_a_vector_train_it_together(learned):
     assert not np.array_equal(before, after)
 
 
-def test_a_trained_palette_is_rounded_to_what_a_sog_holds(learned):
+def test_trained_palette_is_rounded_to_sog_precision(learned):
     after, model, back = (load(learned / name) for name in ("after.ply", "point_cloud.ply", "model.sog"))
     assert len(np.unique(model.sh_rest)) <= 256 < len(np.unique(after.sh_rest))
     assert len(np.unique(model.sh_rest, axis=0)) <= 1024
@@ -300,7 +300,7 @@ def test_a_trained_palette_is_rounded_to_what_a_sog_holds(learned):
     np.testing.assert_array_equal(ours[1], theirs[1])
 
 
-def test_training_of_a_palette_goes_on_with_the_same_bits(learned, many, tiny_scene, tmp_path):
+def test_palette_training_resumes_with_the_same_bits(learned, many, tiny_scene, tmp_path):
     (tmp_path / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(many))))
     checked = load_pipeline(str(tmp_path / "palette.yaml"), [f"scene.path='{tiny_scene}'", "optimize.log_every=1"])
     run = opening.open_run(checked, tmp_path / "run", None)
@@ -315,7 +315,7 @@ def test_training_of_a_palette_goes_on_with_the_same_bits(learned, many, tiny_sc
         assert (tmp_path / "run" / name).read_bytes() == (learned / name).read_bytes()
 
 
-def test_vectors_are_shared_where_a_palette_is(tmp_path):
+def test_share_palette_needs_a_palette(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - share_palette\n")
     with pytest.raises(ConfigError, match=r"share_palette needs 'palette', .* \(palette_sh makes it\)"):

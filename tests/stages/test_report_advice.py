@@ -30,7 +30,7 @@ def measured(psnr: list[float], gained: float = 0.0) -> list[ViewMetrics]:
     return [ViewMetrics(f"{i}.jpg", one, 0.9, {}, {"psnr_color": one + gained}) for i, one in enumerate(psnr)]
 
 
-def test_views_far_below_the_median_are_named_the_worst_first():
+def test_views_far_below_the_median_are_named_worst_first():
     assert far_below({}) == []
     assert far_below({"a": 30.0, "b": 25.0, "c": 31.0}) == []
     assert far_below({"a": 30.0, "b": 24.9, "c": 31.0, "d": 12.0, "e": 30.0}) == ["d", "b"]
@@ -45,19 +45,19 @@ def test_training_photographs_that_disagree_are_named():
 
 
 @pytest.mark.parametrize(("gained", "has_exposures", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
-def test_colors_that_differ_are_said_where_none_are_trained(gained, has_exposures, said):
+def test_differing_colors_are_reported_if_none_are_trained(gained, has_exposures, said):
     texts = [*from_training_views(measured([30, 30, 31], gained), has_exposures)]
     assert len(texts) == said
     assert all("would gain 1.5 dB" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
-def test_photographs_whose_colors_cannot_be_fitted_are_ignored():
+def test_images_without_fitted_colors_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
     assert "would gain 1.5 dB" in "".join(from_training_views(found, has_exposures=False))
     assert not [*from_training_views(found[2:], has_exposures=False)]
 
 
-def test_test_views_that_are_much_worse_are_named():
+def test_much_worse_test_views_are_named():
     (text,) = from_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
     assert text.startswith("b: much worse")
 
@@ -66,7 +66,7 @@ def run_with(background: Backdrop | None) -> SimpleNamespace:
     return SimpleNamespace(model_settings=SimpleNamespace(background=background))
 
 
-def test_a_sky_that_was_added_is_said_with_its_reason():
+def test_added_sky_is_reported_with_its_reason():
     added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
     (text,) = sky_advice(run_with(added))
     assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
@@ -74,7 +74,7 @@ def test_a_sky_that_was_added_is_said_with_its_reason():
     assert not [text for other in others for text in sky_advice(run_with(other))]
 
 
-def test_few_photographs_are_said():
+def test_few_images_are_reported():
     assert "only 1 training photograph" in "".join(from_capture(around([0]), around([0])))
     many = around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
     assert not [*from_capture(many, many)]
@@ -99,9 +99,9 @@ def test_the_widest_gap_around_a_scene_is_found(turn):
     ],
     ids=["two", "all around", "one side", "evenly", "outward"],
 )
-def test_no_gap_is_told_where_none_stands_out(views):
+def test_even_coverage_has_no_gap(views):
     assert widest_gap(views) is None
 
 
-def test_cameras_at_one_place_have_no_gap():
+def test_coincident_cameras_have_no_gap():
     assert widest_gap([around([0])[0]] * 5) is None

@@ -43,7 +43,7 @@ def test_each_row_becomes_the_weighted_mean_of_its_cluster(device, rng, count, c
 
 
 @on_one_setting
-def test_rows_that_are_equal_stay_as_they_are(device, rng):
+def test_equal_rows_do_not_change(device, rng):
     gaussians, _, _ = clustered(device, rng, 70, 6)
     share(gaussians, "sh_rest")
     before = gaussians.get("sh_rest")

@@ -35,7 +35,7 @@ def shown(seen: SimpleNamespace, i: int, error: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("coefficients", [3, 8, 15])
-def test_the_form_is_the_error_that_the_views_show(seen, rng, coefficients):
+def test_quadratic_form_is_the_error_visible_in_the_views(seen, rng, coefficients):
     found, errors = error_of(seen, coefficients), rng.normal(size=(60, 3 * coefficients))
     forms = (found.gradient(errors) * errors).sum(axis=1)
     everywhere = UNSEEN / (4 * np.pi) * (found.weights + FAINT * found.weights.mean())
@@ -46,7 +46,7 @@ def test_the_form_is_the_error_that_the_views_show(seen, rng, coefficients):
     assert forms[59] > 0, "a Gaussian that no view shows has a form"
 
 
-def test_the_base_color_takes_up_the_mean_of_an_error(seen, rng):
+def test_base_color_absorbs_the_mean_error(seen, rng):
     found, error = error_of(seen, 15), rng.normal(size=(60, 45))
     change = found.base_change(error)
     directions = seen.means[7] - POSITIONS
@@ -56,7 +56,7 @@ def test_the_base_color_takes_up_the_mean_of_an_error(seen, rng):
     np.testing.assert_allclose(change[7] * 0.28209479177387814, mean, rtol=1e-6)
 
 
-def test_palette_shows_less_error_than_the_one_it_began_with(seen, rng):
+def test_palette_refinement_lowers_the_visible_error(seen, rng):
     found, rest = error_of(seen, 15), rng.normal(0, 0.1, (60, 45)).astype(np.float32)
 
     def error_with(vectors: np.ndarray) -> float:

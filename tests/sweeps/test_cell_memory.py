@@ -18,7 +18,7 @@ def states(store, options, engine, is_same=True, costs=(1,)):
     return found
 
 
-def test_longest_cell_has_the_largest_device(store, options):
+def test_longest_cell_gets_the_largest_device(store, options):
     engine = Fake(DONE, DONE, slots=(SMALL, LARGE))
     assert states(store, options, engine, costs=(1, 2)) == ["published"] * 2
     assert engine.started == [("2", "l", "x"), ("1", "s", "x")]

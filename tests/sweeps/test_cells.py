@@ -42,7 +42,7 @@ def told(store: Store) -> list[str]:
     return [event["event"] for event in store.events()]
 
 
-def test_a_key_has_no_place_and_all_that_decides_over_the_bits(tiny_scene, tmp_path):
+def test_key_has_no_paths_and_all_inputs_that_change_bits(tiny_scene, tmp_path):
     moved, notes = tmp_path / "moved", tmp_path / "notes"
     shutil.copytree(tiny_scene, moved)
     key = keys("smoke", tiny_scene, notes)
@@ -59,7 +59,7 @@ def test_a_key_has_no_place_and_all_that_decides_over_the_bits(tiny_scene, tmp_p
     assert keys("smoke", moved, notes) != key, "a photograph has changed"
 
 
-def test_a_fingerprint_is_what_a_run_writes_of_its_scene(few_steps, tiny_scene, tmp_path):
+def test_fingerprint_matches_the_runs_record_of_its_scene(few_steps, tiny_scene, tmp_path):
     checked = load("smoke", [f"scene.path={tiny_scene}"])
     expected = json.loads((few_steps / "inputs.json").read_text())["digest"]
     assert Scenes(tmp_path).known(checked).digest == expected
@@ -77,7 +77,7 @@ def test_a_cell_is_published_once_and_then_skipped(store, options):
     assert json.loads((store.folder(CELL.key).path / "spec.json").read_text()) == SPEC
 
 
-def test_a_result_that_was_damaged_is_run_again(store, options):
+def test_damaged_result_is_run_again(store, options):
     run_cell(CELL, store, command(WRITES), options)
     (store.folder(CELL.key).result / "point_cloud.ply").write_bytes(b"bitz")
     assert run_cell(CELL, store, command(WRITES), options).state == "published"
@@ -109,7 +109,7 @@ def test_first_of_two_writers_publishes_and_the_second_compares(store, options, 
 @pytest.mark.parametrize(
     ("code", "starts"), [(2, 1), (3, 1), (5, 1), (1, 3), (4, 3), (6, 3), (7, 3), (130, 0), (-9, 3)], ids=str
 )
-def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, options, code, starts):
+def test_exit_code_decides_whether_a_cell_is_retried(store, options, code, starts):
     end = f"import os, sys; sys.stderr.write('error: as it is\\n'); sys.stderr.flush(); os._exit({code})"
     if code == -9:
         end = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
@@ -131,7 +131,7 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, options, code
 
 
 @pytest.mark.parametrize("times", [1, 9])
-def test_a_result_that_cannot_be_written_counts_as_a_failure(store, options, monkeypatch, times):
+def test_unwritable_result_counts_as_a_failure(store, options, monkeypatch, times):
     faults = [OSError(errno.ENOSPC, "No space left on device")] * times
 
     def sync(path):
@@ -159,7 +159,7 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, opt
     assert told(store).count("start") == count + 2
 
 
-def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, options):
+def test_failure_with_a_newer_damaged_checkpoint_counts(few_steps, store, options):
     old = CellAttempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
     newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
@@ -198,7 +198,7 @@ def test_cancelled_cell_saves_and_stops_and_a_later_call_resumes(store, options)
     assert run_cell(CELL, store, command(WRITES), CellOptions(store.now())).state == "published"
 
 
-def test_cell_is_cancelled_by_name_or_start_of_its_key(store, options):
+def test_cell_is_cancelled_by_name_or_key_prefix(store, options):
     other = replace(CELL, spec={**SPEC, "scene": "t"})
     store.add(CELL)
     store.add(other)
@@ -210,7 +210,7 @@ def test_cell_is_cancelled_by_name_or_start_of_its_key(store, options):
         store.cancel("x")
 
 
-def test_matrices_of_one_name_keep_their_cells(store, options):
+def test_matrices_of_equal_name_keep_their_cells(store, options):
     changed = replace(CELL, spec={**SPEC, "scene": "t"})
     for cell in (CELL, changed):
         store.add(cell)
@@ -222,7 +222,7 @@ def test_matrices_of_one_name_keep_their_cells(store, options):
     assert store.cancel("first") == changed.key
 
 
-def test_a_run_that_does_not_stop_is_killed(store, options, monkeypatch):
+def test_run_that_ignores_its_stop_is_killed(store, options, monkeypatch):
     monkeypatch.setattr(child, "STOP_TIMEOUT_S", 0.1)
     deaf = "import time\ntime.sleep(60)"
     began = time.monotonic()
@@ -230,7 +230,7 @@ def test_a_run_that_does_not_stop_is_killed(store, options, monkeypatch):
     assert store.folder(CELL.key).attempts()[0].exit_code == -9
 
 
-def test_an_attempt_that_was_removed_ends_its_run(store, options, monkeypatch):
+def test_removed_attempt_ends_its_run(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     removes = "import shutil, sys, time; shutil.rmtree(sys.argv[2]); time.sleep(60)"
     outcome = run_cell(CELL, store, command(removes), options)
@@ -238,7 +238,7 @@ def test_an_attempt_that_was_removed_ends_its_run(store, options, monkeypatch):
     assert "was removed during its run" in outcome.message
 
 
-def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, options, monkeypatch):
+def test_process_frozen_past_its_attempt_uses_the_result(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     folder = store.add(CELL)
     other = folder.begin("other", options.since)
@@ -250,7 +250,7 @@ def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, options,
     assert told(store) == ["start", "skip"]
 
 
-def test_process_frozen_after_its_run_takes_the_result(store, options, monkeypatch):
+def test_process_frozen_after_its_run_uses_the_result(store, options, monkeypatch):
     folder = store.add(CELL)
     other = folder.begin("other", options.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
@@ -267,7 +267,7 @@ def test_process_frozen_after_its_run_takes_the_result(store, options, monkeypat
     assert not folder.attempts()
 
 
-def test_a_copy_of_a_result_gets_its_manifest_last(store, options, tmp_path, monkeypatch):
+def test_copied_result_gets_its_manifest_last(store, options, tmp_path, monkeypatch):
     run_cell(CELL, store, command(WRITES), options)
     result, copied = store.folder(CELL.key).result, []
     for name in "abcdefgh":
@@ -278,7 +278,7 @@ def test_a_copy_of_a_result_gets_its_manifest_last(store, options, tmp_path, mon
     assert copied[-1] == MANIFEST != copied[-2]
 
 
-def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, options):
+def test_attempts_are_removed_only_by_lease_age(store, options):
     folder = store.add(CELL)
     old, young = folder.begin("a", options.since), folder.begin("b", options.since)
     folder.collect(store.now() + 1e6)
@@ -292,7 +292,7 @@ def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, options):
     assert not young.path.exists(), "the next call finds the result, and that"
 
 
-def test_a_damaged_spec_is_written_again(store, options):
+def test_damaged_spec_is_rewritten(store, options):
     folder = store.add(CELL)
     (folder.path / "spec.json").write_text('{"pipe')
     assert run_cell(CELL, store, command(WRITES), options).state == "published"
@@ -305,7 +305,7 @@ def test_a_spec_is_never_changed(store):
         folder.write_spec({**SPEC, "seed": 1})
 
 
-def test_a_store_that_moved_goes_on(few_steps, store, options, tmp_path):
+def test_moved_store_can_be_resumed(few_steps, store, options, tmp_path):
     folder = store.add(CELL)
     shutil.copytree(few_steps / CHECKPOINTS, folder.begin("a", options.since).path / CHECKPOINTS)
     moved = Store(tmp_path / "moved")
@@ -324,7 +324,7 @@ def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, options):
     assert undistorted_folder(store.root / "run") == store.root / "run" / "undistorted", "that is no link"
 
 
-def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, options):
+def test_longest_cell_is_first_and_a_lost_one_restarts(store, options):
     done = Outcome("published")
     engine = Fake(CellLost, done, done, done)
     ended = []
@@ -342,7 +342,7 @@ def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, options):
     assert {bits for *_, bits in engine.started} == {"y"}
 
 
-def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, options):
+def test_cell_stays_in_the_class_it_started_in(store, options):
     (one,) = wanted(9)
     store.add(one.on("x"))
     engine = Fake(*[Outcome("published")] * 4, slots=SLOTS)
@@ -352,7 +352,7 @@ def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, options):
 
 
 @pytest.mark.parametrize("published", ["x", "y", None])
-def test_of_equal_classes_that_with_most_results_is_taken(store, options, published):
+def test_class_with_most_results_breaks_ties(store, options, published):
     for one in wanted(1, 2) if published else []:
         run_cell(one.on(published), store, command(WRITES), options)
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS[1::-1])
@@ -369,7 +369,7 @@ def test_sweep_whose_class_has_no_device_left_names_the_others(store, options, m
         drive.run(wanted(1))
 
 
-def test_what_runs_costs_no_look_at_the_cells_that_wait(store, options, monkeypatch):
+def test_running_cells_do_not_rescan_waiting_ones(store, options, monkeypatch):
     looks = []
     suits = Dispatcher._fits
     monkeypatch.setattr(Dispatcher, "_fits", lambda *values: looks.append(1) or suits(*values))
@@ -384,7 +384,7 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, options, monkeypa
     assert len(looks) == 5
 
 
-def test_a_device_that_suits_no_cell_is_asked_once(store, options, monkeypatch):
+def test_device_that_suits_no_cell_is_checked_once(store, options, monkeypatch):
     looks = []
     suits = Dispatcher._fits
     monkeypatch.setattr(
@@ -409,14 +409,14 @@ def test_a_signal_stops_a_sweep(store, options):
         Dispatcher(store, Fake(), True, options, is_stopped=lambda: True).run(wanted(1))
 
 
-def test_the_engine_of_this_process_runs_a_cell(store, options, monkeypatch):
+def test_inline_engine_runs_a_cell(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.engines.run_command", lambda device, plugins: command(WRITES))
     engine = InlineEngine(store, SLOTS[0], lambda: False)
     ticket = engine.start(CELL, SLOTS[0], options)
     assert ticket.outcome().state == "published"
 
 
-def test_the_state_of_a_store_is_in_its_files(store, options):
+def test_store_state_is_read_from_files(store, options):
     cells = [replace(CELL, name=name, spec={**SPEC, "scene": name}) for name in ("done", "bad", "on", "new")]
     run_cell(cells[0], store, command(WRITES), options)
     run_cell(cells[1], store, command("raise SystemExit(2)"), options)

@@ -85,7 +85,7 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     assert "LPIPS" not in page, "it was not measured"
 
 
-def test_costs_are_shown_where_runs_have_noted_them(make_run, tmp_path):
+def test_costs_are_shown_if_recorded(make_run, tmp_path):
     def with_records(folder: Path, *lines: dict[str, object]) -> Path:
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         return folder
@@ -110,7 +110,7 @@ def test_costs_are_shown_where_runs_have_noted_them(make_run, tmp_path):
 PUBLISHED = Path(__file__).parents[2] / "examples/published/blender.yaml"
 
 
-def test_published_figures_stand_apart_with_their_source(make_run, tmp_path):
+def test_published_results_are_separate_and_have_a_source(make_run, tmp_path):
     tables = read_published(PUBLISHED)
     for table in tables:
         assert list(table.rows) == ["Mip-NeRF", "3DGS", "3DGS + EWA", "Mip-Splatting"]
@@ -140,13 +140,13 @@ def test_published_figures_stand_apart_with_their_source(make_run, tmp_path):
         ("tables: [{title: a, protocol: c, columns: [d], rows: {e: [1.0]}}]", "'source' is missing"),
     ],
 )
-def test_a_file_of_published_figures_that_is_wrong_is_refused(text, complaint, tmp_path):
+def test_invalid_file_of_published_results_is_refused(text, complaint, tmp_path):
     (tmp_path / "p.yaml").write_text(text)
     with pytest.raises(ConfigError, match=rf"p\.yaml:1: .*{complaint}"):
         read_published(tmp_path / "p.yaml")
 
 
-def test_what_sizes_mean_is_said_where_the_training_saw_others(make_run, tmp_path):
+def test_sizes_unseen_in_training_are_explained(make_run, tmp_path):
     assert "sizes are relative" not in page_of(tmp_path, make_run("whole"))
     halves = make_run("halves", "scene.downscale=2", "scene.levels=2")
     assert "sizes are relative to the original photographs; trained at 1/2, 1/4" in page_of(tmp_path, halves)
@@ -165,7 +165,7 @@ def test_curves_of_runs_with_one_seed_are_named_by_folder(make_run, tmp_path):
     assert "training PSNR over steps, mean of 5 views, dB" in alike
 
 
-def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
+def test_each_scene_and_size_has_a_table(make_run, tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "second")
     one, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)
     half = make_run("half", "scene.downscale=2", psnr=40)
@@ -179,7 +179,7 @@ def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     assert page.count("No crops: ") == 1, "only the run without renders has none"
 
 
-def test_differing_settings_are_found_by_name_not_by_place():
+def test_differing_settings_are_matched_by_name():
     one = flat(load("splat").resolved())
     assert one["optimize.steps"] == "30000"
     assert one["optimize.densify.clone.gradient_above"] == "0.0002"
@@ -192,7 +192,7 @@ def test_differing_settings_are_found_by_name_not_by_place():
     assert "optimize.densify.prune_large.start" in differing([one, short]), "a rule that only one has"
 
 
-def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
+def test_page_shows_only_differing_settings(make_run, tmp_path):
     page = page_of(tmp_path, make_run("a"), make_run("b", "optimize.densify.every=20"))
     table = page[page.index("Settings that differ (1)") : page.index("<h2>Runs")]
     rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", table)
@@ -238,7 +238,7 @@ def crops_of(*folders: Path) -> list[crops.ImageCrop]:
     return crops.find_crops(runs, *runs[0].scene.read(runs[0].photographs))
 
 
-def test_crops_are_where_the_runs_differ(make_run, monkeypatch):
+def test_crops_show_where_runs_differ(make_run, monkeypatch):
     """One run is the photograph, the other is darker in the lower right quarter."""
     monkeypatch.setattr(crops, "MIN_SIDE", 12)
     found = crops_of(make_run("equal", error=0), make_run("darker", error=60))
@@ -252,7 +252,7 @@ def test_crops_are_where_the_runs_differ(make_run, monkeypatch):
         np.testing.assert_array_equal(crop.renders[0], crop.photograph)
 
 
-def test_a_single_run_is_held_against_the_photograph(make_run):
+def test_single_run_is_compared_with_the_photograph(make_run):
     found = crops_of(make_run("alone", error=60))
     assert len(found) == 2
     assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in found)
@@ -273,7 +273,7 @@ def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
     assert [crop.psnrs for crop in found] == [[100.0]] * 2
 
 
-def test_the_page_of_a_single_run_speaks_of_no_best_and_no_seeds(make_run, tmp_path):
+def test_page_of_a_single_run_has_no_best_and_no_seeds(make_run, tmp_path):
     page = page_of(tmp_path, make_run("alone"))
     assert "Where the run differs most from the photograph" in page
     assert page.count('<input type="range"') == 2, "one of each test view"
@@ -292,13 +292,13 @@ def test_without_records_there_are_no_curves(make_run, tmp_path):
     assert "20.00" in page
 
 
-def test_remarks_stand_at_the_top(make_run, tmp_path):
+def test_remarks_are_at_the_top(make_run, tmp_path):
     write_comparison([make_run("run")], tmp_path / "page.html", "ablation", ["one failed", HOSTILE])
     text = Page((tmp_path / "page.html").read_text()).text
     assert text.index("ablation: 1 run") < text.index("one failed") < text.index(HOSTILE) < text.index("tiny")
 
 
-def test_the_page_needs_nothing_else(make_run, tmp_path):
+def test_page_is_self_contained(make_run, tmp_path):
     page = page_of(tmp_path, make_run("a"), make_run("b", "init.opacity=0.3"))
     assert not re.search(r"https?://|<link|src=\"(?!data:)|@import", page)
     first = re.search(r'class="slider tagged"><img src="data:image/png;base64,([^"]+)', page)
@@ -405,7 +405,7 @@ def test_the_same_run_twice_is_refused(make_run, tmp_path):
         write_comparison([folder, tmp_path / "." / "run"], tmp_path / "page.html")
 
 
-def test_without_the_photographs_the_rest_is_shown(make_run, tmp_path):
+def test_page_without_photographs_shows_other_parts(make_run, tmp_path):
     folder = make_run("run")
     text = (folder / "pipeline.yaml").read_text()
     (folder / "pipeline.yaml").write_text(re.sub(r"path: .*tiny.*?,", "path: /nowhere,", text))

@@ -29,7 +29,7 @@ def from_model(model: Path | str, scene: Path, notes: Path) -> str:
     return keys("smoke", scene, notes, "init.source=model", f"init.file='{model}'")
 
 
-def test_a_key_has_the_content_of_the_model_that_a_folder_holds(few_steps, tiny_scene, tmp_path):
+def test_key_includes_the_content_of_a_folders_model(few_steps, tiny_scene, tmp_path):
     one, other = (tmp_path / name for name in ("one", "other"))
     for folder in (one, other):
         folder.mkdir()
@@ -46,7 +46,7 @@ def test_a_key_has_the_content_of_the_model_that_a_folder_holds(few_steps, tiny_
         from_model(one, tiny_scene, tmp_path / "notes")
 
 
-def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatch):
+def test_unreadable_input_is_reported(few_steps, tiny_scene, tmp_path, monkeypatch):
     assert content_of(tmp_path / ("m" * 300)) == ""
 
     def refuse(path):
@@ -58,7 +58,7 @@ def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatc
     assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
 
 
-def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp_path, monkeypatch):
+def test_list_of_names_is_read_from_the_dataset_folder(tiny_scene, tmp_path, monkeypatch):
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     (scene / "list.txt").write_text("train/r_000\n")
@@ -71,19 +71,19 @@ def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp
     assert cell.files.keys() == {str(scene / "list.txt")}
 
 
-def test_the_name_of_a_camera_path_is_no_file(tmp_path, monkeypatch):
+def test_camera_path_name_is_not_a_file(tmp_path, monkeypatch):
     write(tmp_path / "ellipse", "a file of that name")
     monkeypatch.chdir(tmp_path)
     assert Video().input_path("path", None) is None
     assert Video(path="mine.json").input_path("path", None) == Path("mine.json")
 
 
-def test_a_sweep_names_its_cells_as_they_are_named_here(tiny_scene, store, tmp_path):
+def test_sweep_computes_the_expected_keys(tiny_scene, store, tmp_path):
     found = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
     assert found.on("b").key == keys("smoke", tiny_scene, tmp_path)
 
 
-def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, store, options, tmp_path, monkeypatch):
+def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     for folder, text in ((tmp_path, b"of the sweep"), (tmp_path / "elsewhere", b"of the worker")):
         (folder / "m.ply").write_bytes(text)

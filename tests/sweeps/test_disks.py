@@ -53,7 +53,7 @@ def finish(sweep: Sweep, expected: dict[str, str]) -> None:
     assert sweep.events("publish") == CELLS
 
 
-def test_full_disk_ends_a_sweep_that_resumes_when_there_is_space(tiny_scene, tmp_path, expected):
+def test_sweep_resumes_after_a_full_disk(tiny_scene, tmp_path, expected):
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     with mounted(sweep.store.root, "-t", "tmpfs", "-o", "size=1m", "tmpfs"):
         process = sweep.start()
@@ -66,7 +66,7 @@ def test_full_disk_ends_a_sweep_that_resumes_when_there_is_space(tiny_scene, tmp
         finish(sweep, expected)
 
 
-def test_a_newest_checkpoint_that_is_cut_off_is_left_out(tiny_scene, tmp_path, expected):
+def test_truncated_newest_checkpoint_is_skipped(tiny_scene, tmp_path, expected):
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     stopped_by(sweep, signal.SIGKILL)
     newest = Path(max(sweep.saved()))
@@ -75,7 +75,7 @@ def test_a_newest_checkpoint_that_is_cut_off_is_left_out(tiny_scene, tmp_path, e
     assert any(event.get("from") for event in sweep.store.events()), "it went on from the one before"
 
 
-def test_a_store_goes_on_under_another_mount_point(tiny_scene, tmp_path, expected):
+def test_store_resumes_under_another_mount_point(tiny_scene, tmp_path, expected):
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     sweep.store.root.mkdir()
     elsewhere = tmp_path / "elsewhere"
@@ -86,7 +86,7 @@ def test_a_store_goes_on_under_another_mount_point(tiny_scene, tmp_path, expecte
         assert any(event.get("from") for event in sweep.store.events()), "it went on from a checkpoint"
 
 
-def test_a_cancelled_sweep_goes_on(tiny_scene, tmp_path, expected):
+def test_cancelled_sweep_resumes(tiny_scene, tmp_path, expected):
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     process = sweep.start()
     until(lambda: bool(sweep.saved()))

@@ -29,7 +29,7 @@ def outside(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("key", ["../../outside/flag", "/tmp/flag", "A" * 20, "a" * 300, 3, ["a"]])
-def test_what_is_not_a_key_names_no_cell(store, outside, key):
+def test_folder_that_is_not_a_key_is_no_cell(store, outside, key):
     (store.root / "cells").mkdir(parents=True)
     (store.root / "sweeps").mkdir()
     (store.root / "sweeps" / "x.json").write_text(json.dumps({"name": "s", "cells": {"c": key}}))
@@ -68,7 +68,7 @@ def test_an_attempt_that_is_a_link_is_no_attempt(store, options, outside):
     assert folder.attempts() == []
 
 
-def test_undistorted_photos_go_to_no_link_of_somebody_else(store, options, outside):
+def test_undistorted_photos_are_not_written_through_a_link(store, options, outside):
     attempts = store.add(CELL).path / "attempts"
     attempts.mkdir()
     (attempts / "undistorted").symlink_to(outside, target_is_directory=True)

@@ -38,7 +38,7 @@ def left_behind(folder: Path) -> "list[psutil.Process]":
     return [one for one, own in words if "--attended" in own and any(str(folder) in word for word in own)]
 
 
-def test_kills_of_workers_runs_and_drivers_lose_nothing(tiny_scene, tmp_path, expected):
+def test_killing_workers_runs_and_drivers_loses_nothing(tiny_scene, tmp_path, expected):
     """A new checkpoint is waited for before each kill, so that all of them meet a training."""
     sweep, generator, killed = Sweep(tmp_path, tiny_scene, CELLS), random.Random(0), 0
     process, known = sweep.start(), set()
@@ -63,7 +63,7 @@ def test_kills_of_workers_runs_and_drivers_lose_nothing(tiny_scene, tmp_path, ex
     print(f"{killed} kills, {sweep.events('start')} starts, {sweep.events('publish')} published, hashes as undisturbed")
 
 
-def test_a_frozen_supervisor_that_wakes_finds_the_same_bits(tiny_scene, tmp_path, expected):
+def test_frozen_supervisor_wakes_to_the_same_bits(tiny_scene, tmp_path, expected):
     """Another one has run the cell meanwhile: there are two writers."""
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     words = [sys.executable, "-m", "clsplat", "cell", str(sweep.file), "--index", "0", "--store", str(sweep.store.root)]
@@ -79,7 +79,7 @@ def test_a_frozen_supervisor_that_wakes_finds_the_same_bits(tiny_scene, tmp_path
 
 
 @pytest.mark.parametrize("engine", ["inline", "local"])
-def test_a_signal_saves_and_the_same_command_goes_on_elsewhere(tiny_scene, tmp_path, expected, engine):
+def test_signal_saves_and_the_command_resumes_elsewhere(tiny_scene, tmp_path, expected, engine):
     """SIGTERM for the command alone, Ctrl-C for all processes of the terminal; then the store has moved."""
     sweep = Sweep(tmp_path, tiny_scene, CELLS, engine)
     process = sweep.start()
@@ -127,7 +127,7 @@ def offer(port: int) -> "subprocess.Popen[str]":
     return subprocess.Popen(words, text=True)
 
 
-def test_cells_resume_when_a_worker_is_lost_and_another_comes(tiny_scene, tmp_path, expected):
+def test_cells_resume_on_another_worker(tiny_scene, tmp_path, expected):
     port, processes = free_port(), []
     sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
     with scheduler(port, processes):
@@ -141,7 +141,7 @@ def test_cells_resume_when_a_worker_is_lost_and_another_comes(tiny_scene, tmp_pa
         assert sweep.events("publish") == CELLS
 
 
-def test_killed_scheduler_ends_a_sweep_that_resumes_with_another(tiny_scene, tmp_path, expected):
+def test_sweep_resumes_after_its_scheduler_is_killed(tiny_scene, tmp_path, expected):
     port, processes = free_port(), []
     sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
     with scheduler(port, processes) as first:

@@ -35,7 +35,7 @@ def finished(tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     return str(folder / "x.yaml"), folder / "run"
 
 
-def test_every_cell_is_a_run_of_its_own(finished):
+def test_every_cell_is_a_separate_run(finished):
     _, out = finished
     folders = sorted(path.parent.name for path in out.glob("*/metrics.json"))
     assert folders == sorted(names(load_experiment(finished[0])))
@@ -53,7 +53,7 @@ def test_every_cell_is_a_run_of_its_own(finished):
     assert "<td>optimize.steps</td><td>4</td><td>6</td>" in page
 
 
-def test_the_folder_of_a_matrix_stands_for_its_cells(finished, tmp_path):
+def test_matrix_folder_is_accepted_for_its_cells(finished, tmp_path):
     clsplat("compare", finished[1], "--out", tmp_path / "c.html")
     assert "sweep: 4 runs" in (tmp_path / "c.html").read_text()
     (tmp_path / "empty").mkdir()
@@ -80,7 +80,7 @@ def test_a_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypa
     assert not (tmp_path / "run").exists()
 
 
-def test_resume_runs_what_is_missing_only(finished, tmp_path):
+def test_resume_runs_only_missing_cells(finished, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(finished[1], out)
     bits = {path.parent.name: path.read_bytes() for path in out.glob("*/point_cloud.ply")}
@@ -117,7 +117,7 @@ def test_a_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
     assert options.count("optimize.steps") == options.count("init.count") == options.count("scene.path") == 1
 
 
-def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
+def test_matrix_without_its_status_resumes(finished, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(finished[1], out)
     (out / "status.json").unlink()
@@ -130,7 +130,7 @@ def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(mine), None, "restart")
 
 
-def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypatch):
+def test_failing_cell_does_not_stop_other_cells(finished, tmp_path, monkeypatch):
     execute = runner.execute
 
     def failing(pipeline, run, start, show):
@@ -151,7 +151,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypa
     assert "steps=4-opacity=0.1-seed=1 failed and is not shown: no photograph" in page
 
 
-def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypatch):
+def test_matrix_always_ends_with_a_status(finished, tmp_path, monkeypatch):
     def broken(*arguments):
         raise AssertionError
 
@@ -163,7 +163,7 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
     assert (status["state"], status["exit_code"], status["message"]) == ("failed", 1, str(error.value))
 
 
-def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
+def test_interrupt_stops_the_matrix(finished, tmp_path, monkeypatch):
     cells = []
 
     def interrupted(pipeline, run, start, show):
@@ -180,7 +180,7 @@ def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
     assert not (tmp_path / "run" / "compare.html").exists()
 
 
-def test_cells_run_with_other_settings_are_not_taken_for_done(finished, tmp_path):
+def test_cells_with_other_settings_are_not_reused(finished, tmp_path):
     shutil.copytree(finished[1], tmp_path / "run")
     changed = tmp_path / "changed.yaml"
     changed.write_text(Path(finished[0]).read_text().replace("count: 300", "count: 301"))
@@ -190,7 +190,7 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, tmp_path
         experiment.run_matrix(load_experiment(str(changed)), RunState.read(tmp_path / "run"), None, "resume")
 
 
-def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
+def test_folders_of_matrices_and_runs_are_not_mixed(finished, tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="already has a run"):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(finished[1]), None, "new")
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
@@ -237,7 +237,7 @@ CAUSES: dict[str, tuple[int, str, str, Callable[[Path, Path], None] | None]] = {
 
 
 @pytest.mark.parametrize("name", CAUSES)
-def test_a_dry_run_is_refused_as_the_run_is(name, tiny_scene, tmp_path):
+def test_dry_run_is_refused_like_the_run(name, tiny_scene, tmp_path):
     code, asked, setting, damage = CAUSES[name]
     scene, out = shutil.copytree(tiny_scene, tmp_path / "scene"), tmp_path / "run"
     file = tmp_path / "x.yaml"

@@ -20,7 +20,7 @@ CPU = DeviceInfo("a", "b", "CPU", "1", 4, 1 << 30, 1 << 29, 1 << 15, 64, 8, (0, 
 GPU = replace(CPU, name="g", kind="GPU")
 
 
-def test_cores_are_shared_in_equal_parts_of_neighbors():
+def test_cores_are_split_into_equal_contiguous_parts():
     assert machine.split_cores((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
     assert machine.split_cores(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
 
@@ -34,7 +34,7 @@ def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
     assert code_variables() == before
 
 
-def test_only_cpus_are_shared_by_as_many_runs_as_cores(monkeypatch):
+def test_only_cpus_run_one_cell_per_core(monkeypatch):
     monkeypatch.setattr(machine, "usable_cores", lambda: tuple(range(4)))
     assert split_device_cores([CPU, GPU], 4) == [machine.split_cores(range(4), 4), [()]]
     assert split_device_cores([CPU], 1) == [[()]], "kept to no cores"
@@ -42,7 +42,7 @@ def test_only_cpus_are_shared_by_as_many_runs_as_cores(monkeypatch):
         split_device_cores([CPU], 5)
 
 
-def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
+def test_runs_sharing_a_device_get_separate_slots(monkeypatch):
     monkeypatch.setattr(machine, "usable_cores", lambda: (0, 1, 2, 3))
     monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
     monkeypatch.setattr(devices, "choose", lambda name: CPU)
@@ -54,7 +54,7 @@ def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")
-def test_the_run_of_a_cell_is_kept_to_its_cores(tmp_path):
+def test_run_of_a_cell_is_limited_to_its_cores(tmp_path):
     attempt, own = CellAttempt(tmp_path / "attempt"), (machine.usable_cores()[-1],)
     attempt.path.mkdir()
     attempt.take_lease("a", 0.0)

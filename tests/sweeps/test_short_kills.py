@@ -34,9 +34,7 @@ main()
 """
 
 
-def test_killed_run_resumes_and_its_cell_has_undisturbed_bits(
-    tiny_scene: Path, few_steps: Path, store: Store, options: CellOptions
-):
+def test_killed_run_resumes_to_the_same_bits(tiny_scene: Path, few_steps: Path, store: Store, options: CellOptions):
     """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
     cell = pending_cell(Cell("few", checked), Scenes(store.prepared), store).on("b")

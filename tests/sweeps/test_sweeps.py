@@ -67,7 +67,7 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return ends
 
 
-def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, on, runs, few_steps, tmp_path):
+def test_matrix_folder_is_the_same_with_a_store(file, on, runs, few_steps, tmp_path):
     out = commands.run(file, out=tmp_path / "out", on=on)
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["tiny-seed=0", "tiny-seed=1"]
     assert "sweep: 2 runs" in (out / "compare.html").read_text()
@@ -90,7 +90,7 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, on, runs, 
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_the_tasks_of_a_job_array_run_the_cells_of_a_matrix(file, runs, tmp_path):
+def test_job_array_tasks_run_the_cells_of_a_matrix(file, runs, tmp_path):
     """With a stand-in for sbatch, which runs the tasks in turn, and one for the command, which notes its arguments."""
     programs, calls, store = tmp_path / "bin", tmp_path / "calls", tmp_path / "store"
     programs.mkdir()
@@ -107,7 +107,7 @@ def test_the_tasks_of_a_job_array_run_the_cells_of_a_matrix(file, runs, tmp_path
     assert [cell["state"] for cell in store_status(store)["cells"]] == ["published"] * 2
 
 
-def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, on, runs, few_steps, tmp_path):
+def test_run_continued_in_a_matrix_folder_is_no_cell(file, on, runs, few_steps, tmp_path):
     out = commands.run(file, out=tmp_path / "out", on=on)
     one = out / "tiny-seed=0"
     model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
@@ -130,7 +130,7 @@ def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, on, runs, f
     assert not (one / "checkpoints" / "step_000020.npz").exists()
 
 
-def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, on, runs, tmp_path):
+def test_failing_cell_keeps_the_others_and_sets_the_exit_code(file, on, runs, tmp_path):
     runs["seed: 1"] = 3
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:
         commands.run(file, out=tmp_path / "out", on=on)
@@ -139,7 +139,7 @@ def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, on, runs, t
     assert commands.status(tmp_path / "store")["counts"] == {"failed": 1, "published": 1}
 
 
-def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, on, runs, tmp_path):
+def test_unreadable_scene_fails_only_its_cells(file, on, runs, tmp_path):
     (tmp_path / "empty").mkdir()
     file.write_text(file.read_text().replace("scenes: [", f"scenes: ['{tmp_path / 'empty'}', "))
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, empty-seed=0: ") as error:
@@ -149,7 +149,7 @@ def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, on, runs, tmp_p
     assert commands.status(tmp_path / "store")["counts"] == {"published": 2}
 
 
-def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
+def test_cell_command_runs_a_cell_by_number(file, runs, tmp_path):
     result = sweeps.run_cell(file, tmp_path / "store", index=1)
     assert sweeps.run_cell(file, tmp_path / "store", index=1) == result
     spec = json.loads((result.parent / "spec.json").read_text())
@@ -162,7 +162,7 @@ def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
     assert error.value.exit_code == 6
 
 
-def test_on_replaces_the_execution_of_a_file_and_is_not_noted(file, tmp_path):
+def test_on_option_replaces_the_execution_of_a_file(file, tmp_path):
     on = tmp_path / "lab.yaml"
     file.write_text(f"execution: {{engine: local}}\n{file.read_text()}")
     job = Job.open(str(file), out=tmp_path / "out")
@@ -175,7 +175,7 @@ def test_on_replaces_the_execution_of_a_file_and_is_not_noted(file, tmp_path):
         Job.open("smoke", execution=read_execution(on))
 
 
-def test_a_sweep_that_has_begun_elsewhere_resumes_there_alone(file, on, runs, tmp_path):
+def test_sweep_resumes_only_in_its_first_store(file, on, runs, tmp_path):
     out = tmp_path / "out"
     runs["seed: 1"] = 6
     with pytest.raises(ClsplatError, match="1 of 2 cells failed"):
@@ -186,7 +186,7 @@ def test_a_sweep_that_has_begun_elsewhere_resumes_there_alone(file, on, runs, tm
         commands.resume(out)
 
 
-def test_a_result_in_the_run_folder_is_not_run_again(file, on, runs, tmp_path, monkeypatch):
+def test_existing_result_is_not_run_again(file, on, runs, tmp_path, monkeypatch):
     monkeypatch.setattr(RunState, "is_whole", lambda state, pipeline: state.out.name == "tiny-seed=0")
     out = commands.run(file, out=tmp_path / "out", on=on)
     shutil.rmtree(tmp_path / "store")
@@ -196,7 +196,7 @@ def test_a_result_in_the_run_folder_is_not_run_again(file, on, runs, tmp_path, m
     assert json.loads((out / "status.json").read_text())["done"] == 2
 
 
-def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
+def test_cells_run_unchanged_without_a_store(file, tmp_path, monkeypatch):
     ran = []
     monkeypatch.setattr(Job, "run", lambda job, *options: ran.append(options))
     on = tmp_path / "lab.yaml"
@@ -222,7 +222,7 @@ ONLY_ON = "a pipeline file may not set this; give it in a file with --on"
         ("engine: 'dask://127.0.0.1:1'", "execution.engine: expected inline or local; .* with --on, got 'dask://127"),
     ],
 )
-def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
+def test_invalid_execution_is_refused_with_its_line(tmp_path, text, words):
     file = tmp_path / "x.yaml"
     file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution:\n  {text}\n{STAGES}")
     for call in (commands.check, commands.run):
@@ -250,14 +250,14 @@ def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
         ("engine: dask://h:99999", "engine: expected inline, local, or the address of a scheduler"),
     ],
 )
-def test_a_wrong_file_for_on_is_refused_with_its_line(tmp_path, text, words):
+def test_invalid_file_for_on_is_refused_with_its_line(tmp_path, text, words):
     on = tmp_path / "lab.yaml"
     on.write_text(f"{{{text}}}\n")
     with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words}"):
         read_execution(on)
 
 
-def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
+def test_schema_has_the_execution_keys():
     assert json_schema()["properties"]["execution"] == {"$ref": "#/$defs/LocalExecution"}
     assert {"LocalExecution", "Placement"} <= json_schema()["$defs"].keys()
 
@@ -271,7 +271,7 @@ def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
         ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(tcp:// in Dask\)"),
     ],
 )
-def test_a_wrong_option_of_a_worker_is_named(given, words):
+def test_invalid_worker_option_is_named(given, words):
     with pytest.raises(ConfigError, match=words):
         from_options(given)
 
@@ -301,7 +301,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
         ({"cert": "b.pem", "key": "b.key"}, "b.pem, .*b.key: expected .*, without a password"),
     ],
 )
-def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
+def test_unusable_certificates_are_named(authority, changed, words):
     library = pytest.importorskip("clsplat.sweeps.dask")
     folder = Path(authority.ca).parent
     assert library.security(authority).require_encryption
@@ -323,7 +323,7 @@ def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
         commands.run(file, out=tmp_path / "out", on=on, device="pocl")
 
 
-def test_a_scheduler_of_this_machine_needs_no_tls():
+def test_local_scheduler_needs_no_tls():
     for address in ("dask://127.0.0.1:1", "dask://localhost:1"):
         assert Execution(engine=address).is_local
 
@@ -348,7 +348,7 @@ class FakeClient:
         raise RuntimeError("the client is closed")
 
 
-def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
+def test_sweep_ends_if_all_workers_have_another_version(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     monkeypatch.setattr(scheduler, "NO_DEVICE_TIMEOUT_S", -1.0)
     with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
@@ -367,7 +367,7 @@ def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, start
     assert sent == [None if found else [SLOT.worker]], "the workers of this machine have the same devices"
 
 
-def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
+def test_lost_worker_gets_no_cell(tmp_path):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client = FakeClient(one=code_digest())
     cluster = scheduler.Cluster(client, Store(tmp_path))
@@ -377,7 +377,7 @@ def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
     assert cluster.slots() == []
 
 
-def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
+def test_stopped_scheduler_is_reported_with_a_remedy(tmp_path):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client = FakeClient()
     cluster = scheduler.Cluster(client, Store(tmp_path))
@@ -396,7 +396,7 @@ def listening() -> set[str]:
     return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
 
 
-def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
+def test_local_engine_runs_cells_in_parallel_on_loopback(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     library = pytest.importorskip("clsplat.sweeps.dask")
     slots = [DeviceSlot("local", "one", "b"), DeviceSlot("local", "two", "b")]
@@ -418,7 +418,7 @@ def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeyp
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
 
 
-def test_a_cell_whose_spec_was_changed_fails_alone(file, on, runs, tmp_path):
+def test_only_the_cell_with_a_changed_spec_fails(file, on, runs, tmp_path):
     commands.run(file, out=tmp_path / "out", on=on)
     store = Store(tmp_path / "store")
     (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
@@ -428,7 +428,7 @@ def test_a_cell_whose_spec_was_changed_fails_alone(file, on, runs, tmp_path):
         commands.run(file, out=tmp_path / "out", start="resume", on=on)
 
 
-def test_damaged_records_of_a_store_do_not_stop_who_looks(file, on, runs, tmp_path):
+def test_damaged_store_records_do_not_stop_status(file, on, runs, tmp_path):
     commands.run(file, out=tmp_path / "out", on=on)
     store = Store(tmp_path / "store")
     before = store_status(store.root)
@@ -441,6 +441,6 @@ def test_damaged_records_of_a_store_do_not_stop_who_looks(file, on, runs, tmp_pa
         assert store_status(store.root)["counts"] == before["counts"]
 
 
-def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
+def test_cell_number_is_refused_for_a_single_pipeline(runs, tmp_path):
     with pytest.raises(ConfigError, match="remove --index"):
         single.run_one("smoke", tmp_path / "store", index=1)

@@ -25,7 +25,7 @@ print(json.dumps(tally))
 """
 
 
-def test_a_kill_at_a_random_moment(tiny_scene, tmp_path):
+def test_kill_at_a_random_time(tiny_scene, tmp_path):
     """In a process that has opened no device: one that has cannot be forked."""
     command = [sys.executable, "-c", SCRIPT, tiny_scene, tmp_path / "runs"]
     root = Path(__file__).parents[2]
@@ -37,7 +37,7 @@ def test_a_kill_at_a_random_moment(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [kills.Attempt, each_file.AtFile])
-def test_no_attempt_proves_the_device_again(kind, tmp_path):
+def test_device_is_checked_only_once(kind, tmp_path):
     class Seen(kind):
         def _train(self, scene: Path, out: Path, recipe: str) -> None:
             out.write_text(quick.forget_after_sudden_ends.__module__)
@@ -47,7 +47,7 @@ def test_no_attempt_proves_the_device_again(kind, tmp_path):
     assert out.read_text() == kills.__name__
 
 
-def test_a_file_that_an_earlier_kill_has_left_counts_once(monkeypatch, tmp_path):
+def test_leftover_file_counts_once(monkeypatch, tmp_path):
     class Attempt:
         """The first kill meets a write; the second comes before the sweep."""
 
@@ -70,7 +70,7 @@ def test_a_file_that_an_earlier_kill_has_left_counts_once(monkeypatch, tmp_path)
     assert (tally["killed"], tally["in a write"]) == (2, 1)
 
 
-def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
+def test_row_counts_the_tested_cases(tmp_path):
     """And not the number of examples that was asked for, where there are as many as there are writes."""
     (tmp_path / "test_three.py").write_text(
         "def test_three(record_property):\n    record_property('cases', 3)\ndef test_two(record_property):\n"
@@ -84,7 +84,7 @@ def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
 CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 1  # of each moment; `make torture` tries every file
 
 
-def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, record_property):
+def test_kill_during_any_write_loses_nothing(tiny_scene, tmp_path, record_property):
     """In a process that has opened no device: one that has cannot be forked."""
     command = [sys.executable, "-m", "tests.torture.each_file", tiny_scene, tmp_path / "runs", str(CASES)]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)

@@ -85,7 +85,7 @@ def test_steps(device, rng, count):
         [64, 17, 150, 1],
     ),
 )
-def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree, sh_rest, rows):
+def test_fused_update_equals_stored_gradients(device, rng, count, degree, sh_rest, rows):
     """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
     case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
     weights = rng.normal(size=(3, 32, 48)).astype(np.float32)
@@ -115,7 +115,7 @@ def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree
 
 
 @on_one_setting
-def test_bands_above_the_active_degree_stay(device, rng):
+def test_bands_above_the_active_degree_do_not_change(device, rng):
     case = random_case(rng, 20, degree=1)
     model = case.model(device)
     adam, gradients = Adam(model.gaussians), GaussianGradients(model.gaussians)
@@ -127,7 +127,7 @@ def test_bands_above_the_active_degree_stay(device, rng):
 
 
 @on_devices("count", [1, 17, 150])
-def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
+def test_bands_with_rate_0_keep_values_and_moments(device, rng, count):
     """Their number of updates too, so that the next one is corrected as it must be; all else is as with a rate."""
     case = random_case(rng, count)
     tables, updates = [], []
@@ -151,7 +151,7 @@ def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
 
 
 @on_one_setting
-def test_parameters_left_out_stay(device, rng):
+def test_omitted_parameters_do_not_change(device, rng):
     case = random_case(rng, 20)
     model = case.model(device)
     adam, gradients = Adam(model.gaussians), GaussianGradients(model.gaussians)
@@ -175,7 +175,7 @@ def test_rate_of_the_means_decays():
 
 
 @on_devices("count", [0, 16, 63, 64, 150])
-def test_seen_rows(device, rng, count):
+def test_visible_rows(device, rng, count):
     assert_within_bounds(check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians"))
 
 
@@ -183,7 +183,7 @@ def test_seen_rows(device, rng, count):
     "seen, from_memory",
     each_once(product([(), (0,), (16,), (63, 64), (149,), range(16, 32), range(150)]), [False, True]),
 )
-def test_rows_change_that_are_seen_and_no_others(device, rng, seen, from_memory):
+def test_only_visible_rows_change(device, rng, seen, from_memory):
     """Alone, at the edges of vectors and blocks, a whole vector; gradients of penalties change nothing of it."""
     case = random_case(rng, 150)
     case.parameters["log_scales"] += 1
@@ -200,7 +200,7 @@ def test_rows_change_that_are_seen_and_no_others(device, rng, seen, from_memory)
 
 
 @on_one_setting
-def test_what_has_a_pixel_is_seen(device, rng):
+def test_gaussian_with_a_pixel_is_visible(device, rng):
     """By the slow formula; of those without a pixel, the few whose extent reaches the photograph change too."""
     case = random_case(rng, 300)
     case.parameters["means"][::2] *= [3, 3, 1]
@@ -212,7 +212,7 @@ def test_what_has_a_pixel_is_seen(device, rng):
 
 
 @on_devices("from_memory", [False, True])
-def test_rows_that_cannot_be_drawn_keep_their_bits(device, rng, from_memory):
+def test_degenerate_rows_keep_their_bits(device, rng, from_memory):
     """Behind the camera, huge, faint or not numbers."""
     case = not_drawable(rng)
     undrawn = case.model(device)
@@ -233,12 +233,12 @@ def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows
 
 
 @on_devices("count", [16, 64, 150])
-def test_the_average_of_three_steps(device, rng, count):
+def test_average_of_three_steps(device, rng, count):
     assert_within_bounds(check_average(device, rng, count))
 
 
 @on_one_setting
-def test_rows_without_an_average_keep_values_and_tables_go(device, rng):
+def test_rows_without_an_average_keep_their_values(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
     average.attach(gaussians)
@@ -249,7 +249,7 @@ def test_rows_without_an_average_keep_values_and_tables_go(device, rng):
 
 
 @on_one_setting
-def test_no_gaussian(device, rng):
+def test_empty_model(device, rng):
     gaussians = random_case(rng, 0).model(device).gaussians
     average.attach(gaussians)
     average.add(gaussians)
@@ -270,7 +270,7 @@ def test_an_average_of_equal_values_is_the_value(device, rng):
         np.testing.assert_array_equal(gaussians.get(name), before[name])
 
 
-def test_what_is_not_a_number_stays_in_its_row(device, rng):
+def test_nan_stays_in_its_row(device, rng):
     gaussians = random_case(rng, 17).model(device).gaussians
     means = gaussians.get("means")
     means[3] = np.nan

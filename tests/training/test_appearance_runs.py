@@ -34,7 +34,7 @@ def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return out
 
 
-def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):
+def test_visits_are_counted_per_image_and_the_mean_is_zero(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *GAIN)
     names = [view.name for view in run.scene.split("train")]
     scalars = run.modules["exposure"].scalars
@@ -48,7 +48,7 @@ def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp
     assert digest(tmp_path / "run") != digest(few_steps)
 
 
-def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few_steps):
+def test_color_table_and_metrics_are_written(with_gains, few_steps):
     data = json.loads((with_gains / "view_colors.json").read_text())
     assert (data["type"], data["model"]) == ("exposure", "gain")
     assert len(data["photographs"]) == 8
@@ -64,7 +64,7 @@ def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few
     assert "psnr_color" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
 
 
-def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
+def test_comparison_has_a_color_column(with_gains, few_steps):
     tables = [
         main_table(next(iter(RunComparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
     ]
@@ -72,7 +72,7 @@ def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
     assert ["PSNR, colors fitted ↑" in found for found in headings] == [True, False]
 
 
-def test_a_run_folder_is_measured_in_the_photographs_colors_too(with_gains, few_steps, tmp_path):
+def test_run_folder_is_also_measured_in_image_colors(with_gains, few_steps, tmp_path):
     measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
     again = evaluate(with_gains)["test"]["1"]
     assert again["psnr_color"] == pytest.approx(measured["psnr_color"], abs=1e-6)
@@ -83,7 +83,7 @@ def test_a_run_folder_is_measured_in_the_photographs_colors_too(with_gains, few_
             read_color_model(tmp_path / "point_cloud.ply")
 
 
-def test_where_colors_began_is_kept_with_them(rng, tmp_path):
+def test_color_start_step_is_saved(rng, tmp_path):
     """The rate depends on it, also where the file that told it is gone."""
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
@@ -99,7 +99,7 @@ def test_where_colors_began_is_kept_with_them(rng, tmp_path):
     assert again.modules["exposure"].scalars == run.modules["exposure"].scalars
 
 
-def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path):
+def test_best_model_has_the_colors_of_its_step(tiny_scene, tmp_path):
     wild = "optimize.rates.means=[[8, 1.0e-3], [9, 0.9]]"
     kept = (
         "scene.validation=2",
@@ -115,7 +115,7 @@ def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path
     assert row[1]["exposure"] == then.modules["exposure"][f"colors/{row[0]}/exposure"]
 
 
-def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
+def test_decision_is_recorded_and_off_keeps_the_bits(tiny_scene, tmp_path, few_steps):
     """The synthetic scene has points without tracks."""
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.modules.exposure.when=auto"])
     run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
@@ -127,7 +127,7 @@ def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_pa
     assert RunState.read(tmp_path / "run").is_whole(asked), "the same command finds it up to date"
 
 
-def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
+def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
     settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.modules.exposure.when=auto"]
@@ -152,14 +152,14 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
         (0.133, 0.7, "on", "; more than 3.0%, and than 33% of what differs"),
     ],
 )
-def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
+def test_reason_names_the_deciding_bound(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), cache={("colors", ()): exposures})
     found = Exposure(when="auto").resolve_auto(run)
     assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 
 
-def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+def test_decision_is_not_written_as_a_setting():
     asked = load("smoke", ["optimize.modules.exposure.when=auto"]).resolved()
     chosen = load("smoke", ["optimize.modules.exposure={when: auto, chosen: on, reason: they differ}"]).resolved()
     assert asked != chosen

@@ -61,7 +61,7 @@ def test_run_ends_with_the_average_of_the_added_steps(averaged):
     assert not [table for table in run.model.gaussians.tables if table.startswith("average/")]
 
 
-def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, averaged):
+def test_resumed_run_has_the_same_bits(tiny_scene, tmp_path, pipeline, averaged):
     whole = averaged.out
     expected = (whole / "point_cloud.ply").read_bytes()
     again = tmp_path / "again"
@@ -77,14 +77,14 @@ def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, averaged):
     assert (again / "point_cloud.ply").read_bytes() == expected
 
 
-def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline, averaged):
+def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, averaged):
     longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=40", pipeline=pipeline).out
     run = shutil.copytree(averaged.out, tmp_path / "run")
     train(tiny_scene, run, "optimize.steps=40", pipeline=pipeline, resume=True)
     assert (run / "point_cloud.ply").read_bytes() == (longer / "point_cloud.ply").read_bytes()
 
 
-def test_training_that_ends_before_its_average_keeps_the_last_step(tiny_scene, tmp_path, pipeline, caplog):
+def test_training_without_an_average_keeps_the_last_step(tiny_scene, tmp_path, pipeline, caplog):
     caplog.set_level("INFO", "clsplat")
     run = train(tiny_scene, tmp_path / "run", "optimize.average.start=30", pipeline=pipeline)
     last = checkpoint.load(checkpoint.saved(run.out)[-1])[1]["gaussians/means"]
@@ -92,7 +92,7 @@ def test_training_that_ends_before_its_average_keeps_the_last_step(tiny_scene, t
     assert "average: the training ended before its first step" in caplog.text
 
 
-def test_a_trainer_takes_the_average_with_its_last_step(tiny_scene, tmp_path, pipeline, averaged):
+def test_trainer_averages_after_its_last_step(tiny_scene, tmp_path, pipeline, averaged):
     trainer = Trainer(tiny_scene, pipeline)
     for _ in range(STEPS):
         trainer.step()

@@ -19,14 +19,14 @@ from tests.support.runs import digest, train
 RANDOM = "optimize.modules.random_background={}"
 
 
-def test_colors_depend_on_the_seed_and_the_step_alone():
+def test_colors_depend_only_on_seed_and_step():
     device = Device(choose())
     drawn = [tuple(random_color(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
 
-def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
+def test_transparent_pixels_get_the_drawn_color(tiny_scene):
     device, scene = Device(choose()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
     behind = random_color(device, 0, 3)
@@ -45,7 +45,7 @@ def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
 
 
 @pytest.mark.slow
-def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
+def test_run_repeats_bit_for_bit(tiny_scene, tmp_path):
     steps = "optimize.steps=12", "init.count=60", "checkpoint.every=4", "checkpoint.keep=9"
     whole = digest(train(tiny_scene, tmp_path / "whole", *steps, RANDOM).out)
     assert digest(train(tiny_scene, tmp_path / "again", *steps, RANDOM).out) == whole

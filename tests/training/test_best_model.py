@@ -109,7 +109,7 @@ def test_training_leaves_the_best_model_on_validation_views(best):
     )
 
 
-def test_its_metrics_are_those_of_that_model(best):
+def test_metrics_are_those_of_the_best_model(best):
     found = metrics(best)
     assert found["kept"]["step"] == BEST
     assert found["kept"]["ended"] == found["steps"] == STEPS
@@ -123,14 +123,14 @@ def test_its_metrics_are_those_of_that_model(best):
     assert summary(best)[-1].endswith("in a browser"), "more steps were no better"
 
 
-def test_its_page_shows_the_three_splits_and_the_best_step(best):
+def test_report_shows_three_splits_and_the_best_step(best):
     page = (best / "report.html").read_text()
     for text in (*NAMES.values(), f"the model of step {BEST} is the best", "That model is kept"):
         assert text in page
 
 
 @pytest.mark.parametrize("last", [2, BEST, STEPS])
-def test_a_run_that_goes_on_from_any_checkpoint_ends_the_same(tiny_scene, tmp_path, pipeline, best, last):
+def test_run_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, best, last):
     out = shutil.copytree(best, tmp_path / "run")
     for path in checkpoint.saved(out):
         if int(path.stem.removeprefix("step_")) > last:
@@ -157,7 +157,7 @@ def grown(out: Path) -> dict[int, bool]:
     return {line["step"]: line["after"] > line["before"] for line in lines(out) if line["kind"] == "densify"}
 
 
-def test_growth_ends_where_validation_finds_no_better_model(tiny_scene, tmp_path, pipeline, best):
+def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeline, best):
     assert grown(best) == {9: True, 12: True, 15: True, 18: True}
     out = train(tiny_scene, tmp_path / "1", "densify.patience=1", pipeline=pipeline).out
     assert grown(out) == {9: True, 12: False, 15: False, 18: False}
@@ -194,7 +194,7 @@ def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     assert (training.steps, density.patience, density.grow_until) == (30, None, 20)
 
 
-def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline, best):
+def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, best):
     longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=24", pipeline=pipeline)
     out = shutil.copytree(best, tmp_path / "run")
     train(tiny_scene, out, "optimize.steps=24", pipeline=pipeline, resume=True)
@@ -236,7 +236,7 @@ def test_training_ended_by_patience_has_a_final_checkpoint(tiny_scene, tmp_path,
     assert checkpoint.saved(tmp_path / "run")[-1].name == f"step_{run.step:06d}.npz"
 
 
-def test_without_a_measurement_of_ones_own_there_are_twenty(pipeline):
+def test_twenty_measurements_are_added_by_default(pipeline):
     training = load("splat_7k", ["scene.validation=auto", "optimize.keep=best"]).settings.training
     train_, validation, *others = training.inner
     assert others == training.during
@@ -268,7 +268,7 @@ def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pi
 
 
 @pytest.mark.parametrize("names", ["step_000016", "refit_000002", "refit_000008"])
-def test_a_refit_that_goes_on_from_any_checkpoint_ends_the_same(tiny_scene, tmp_path, pipeline, refit, names):
+def test_refit_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, refit, names):
     out = shutil.copytree(refit, tmp_path / "run")
     files = checkpoint.saved(out)
     assert [file.stem for file in files] == [f"step_{s:06d}" for s in range(2, 17, 2)] + [
@@ -284,14 +284,14 @@ def test_a_refit_that_goes_on_from_any_checkpoint_ends_the_same(tiny_scene, tmp_
     assert lines(out, "trial.jsonl") == lines(refit, "trial.jsonl")
 
 
-def test_a_refit_goes_on_in_no_other_number_of_steps(tiny_scene, tmp_path, pipeline, refit):
+def test_refit_does_not_resume_with_other_steps(tiny_scene, tmp_path, pipeline, refit):
     out = shutil.copytree(refit, tmp_path / "run")
     with pytest.raises(ConfigError, match="is of a refit, whose steps validation has found"):
         train(tiny_scene, out, *REFIT, "optimize.steps=80", pipeline=pipeline, resume=True)
 
 
 @pytest.mark.parametrize("settings", [(), REFIT], ids=["best", "refit"])
-def test_a_trainer_has_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, settings, best, refit):
+def test_trainer_gives_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, settings, best, refit):
     given = {"optimize.patience": 2, "optimize.refit": True}
     trainer = Trainer(tiny_scene, pipeline, set={key: given[key] for key in [*given][: len(settings)]})
     steps = [report.step for report in trainer.steps()]
@@ -305,7 +305,7 @@ def test_a_trainer_has_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, setting
 
 
 @pytest.mark.parametrize("split", ["validation", "test"])
-def test_photographs_that_are_kept_out_do_not_change_the_model(tiny_scene, tmp_path, pipeline, split, best):
+def test_validation_images_do_not_change_the_model(tiny_scene, tmp_path, pipeline, split, best):
     """Those for validation choose the step, and nothing else; those for testing nothing."""
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     settings = load(pipeline, [f"scene.path='{scene}'"]).settings.scene
@@ -330,7 +330,7 @@ def test_photographs_that_are_kept_out_do_not_change_the_model(tiny_scene, tmp_p
         (["optimize.keep=last", "optimize.refit=true"], "'refit' needs 'keep: best'"),
     ],
 )
-def test_what_has_nothing_to_choose_by_is_refused(pipeline, settings, fault):
+def test_best_model_without_validation_is_refused(pipeline, settings, fault):
     with pytest.raises(ConfigError, match=fault):
         load(pipeline, settings)
 
@@ -353,7 +353,7 @@ def test_a_training_is_measured_near_its_end(pipeline, steps, every):
     assert steps % every < 20
 
 
-def test_minutes_know_no_refit(tiny_scene, tmp_path, pipeline):
+def test_minutes_and_refit_are_incompatible(tiny_scene, tmp_path, pipeline):
     job = Job.open(pipeline, tiny_scene, tmp_path / "run", REFIT)
     with pytest.raises(ConfigError, match=r"a refit trains twice, .*; add --set optimize\.refit=false"):
         job.run(minutes=5)
@@ -403,7 +403,7 @@ def test_six_decibels_apart_is_overfit(train_, validation, expected):
     assert expected in Measured(step=8, train=train_, validation=validation).text("validation")
 
 
-def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, pipeline):
+def test_run_without_validation_reports_overfitting(tiny_scene, tmp_path, pipeline):
     plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
     run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
     assert overfitting_note(run) == ""

@@ -34,12 +34,12 @@ def test_a_fourth_plane_is_copied(device, rng):
 
 
 @on_devices("nodes", product([(16, 16, 8)]))
-def test_smoothness_updates_and_the_mean(device, rng, nodes):
+def test_smoothness_updates_and_mean(device, rng, nodes):
     assert_within_bounds(check_table(device, rng, nodes))
 
 
 @on_one_setting
-def test_no_change_cuts_white_alone(device, rng):
+def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     grids = GridState(BilateralGrid(), ("a",), device)
@@ -48,7 +48,7 @@ def test_no_change_cuts_white_alone(device, rng):
     assert not grids.smoothness(workspace, 0).get().any()
 
 
-def test_an_image_of_one_luminance_reads_the_levels_about_it(device):
+def test_constant_luminance_reads_the_adjacent_levels(device):
     """Beyond black and white the outer ones; only the gradient through the luminance is cut there."""
     camera, grids = camera_of(device, 20, 5), grids_of(device, np.random.default_rng(0), (2, 2, 3))
     values = np.zeros((3, 3, 4, 3, 2, 2), np.float32)
@@ -85,7 +85,7 @@ class Case:
 
 
 @on_devices("share", [None, 0.7])
-def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
+def test_step_gradient_is_that_of_its_losses(device, rng, share):
     """By finite differences of the loss; l2 is smooth.  Adam's first moment is a tenth of the gradient."""
     case, step = Case(device, rng, share=share), 2e-3
     places = rng.choice(case.values[1].size, 24, replace=False)
@@ -99,7 +99,7 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
 
 
 @on_one_setting
-def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
+def test_mean_over_images_and_cells_stays_at_identity(device, rng):
     case = Case(device, rng)
     for step in (1, 2, 3):
         case.trainer.step(case.photograph, step)
@@ -115,7 +115,7 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
 
 
 @on_one_setting
-def test_one_matrix_is_the_affine_kind(device, rng):
+def test_single_cell_equals_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
     values = rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
     grids = GridState(BilateralGrid(grid_shape=[1, 1, 1]), ("a", "b"), device)

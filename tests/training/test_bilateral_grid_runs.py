@@ -74,7 +74,7 @@ def with_grids(ended: Run) -> Path:
     return ended.out
 
 
-def test_the_key_takes_cells_of_each_axis():
+def test_key_accepts_cells_per_axis():
     def grid(setting: str):
         return load("smoke", [f"optimize.modules.bilateral_grid={setting}"]).settings.training.modules[0]
 
@@ -86,7 +86,7 @@ def test_the_key_takes_cells_of_each_axis():
             grid(f"{{grid_shape: {wrong}}}")
 
 
-def test_rate_warms_up_and_falls_as_unknown_exposures_need():
+def test_rate_warms_up_and_decays():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
         for known, expected in ((True, published), (False, Exposure().rate_of(steps, 50, False))):
@@ -99,7 +99,7 @@ def test_rate_warms_up_and_falls_as_unknown_exposures_need():
 
 
 @pytest.mark.slow
-def test_checkpoints_hold_grids_moments_and_counts(with_grids):
+def test_checkpoints_contain_grids_moments_and_counts(with_grids):
     state, tables = checkpoint.load(with_grids / "checkpoints" / "step_000012.npz")
     own, _ = archive.split(tables, "modules/bilateral_grid/")
     assert own.keys() == {"values", "moment1", "moment2"}
@@ -131,7 +131,7 @@ def test_one_core_gives_the_same_bits(info):
 
 
 @pytest.mark.slow
-def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
+def test_grids_are_written_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colors.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
     assert (data["type"], data["grid_shape"]) == ("bilateral_grid", [3, 2, 4])
@@ -149,7 +149,7 @@ def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps,
 
 
 @pytest.mark.slow
-def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path):
+def test_best_model_has_the_grids_of_its_step(tiny_scene, tmp_path):
     wild = "optimize.rates.means=[[8, 1.0e-3], [9, 0.9]]"
     kept = ("scene.validation=2", "optimize.keep=best", "optimize.evaluate.split=validation")
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
@@ -177,7 +177,7 @@ def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
 
 
 @pytest.mark.slow
-def test_memory_counts_them_before_the_first_gaussian(ended):
+def test_memory_plan_counts_grids_first(ended):
     views, tile = ended.scene.split("train"), int(ended.device.tuning["TILE"])
     width, height = (-(-side // tile) * tile for side in (views[0].camera.width, views[0].camera.height))
 
@@ -197,7 +197,7 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
 
 
 @pytest.mark.slow
-def test_a_dry_run_checks_them(tiny_scene, tmp_path):
+def test_dry_run_validates_grids(tiny_scene, tmp_path):
     def describe(shape: str) -> object:
         setting = [f"optimize.modules.bilateral_grid={{grid_shape: {shape}}}"]
         return commands.describe_run("smoke", tiny_scene, tmp_path / "run", set=setting)
@@ -229,7 +229,7 @@ def test_damaged_tables_are_refused():
 
 
 @pytest.mark.slow
-def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
+def test_checkpoint_without_its_grids_is_refused(with_grids, tmp_path):
     notes, tables = archive.read(with_grids / "checkpoints" / "step_000012.npz")
     left = {name: table for name, table in tables.items() if not name.startswith("modules/")}
     assert len(left) == len(tables) - 3
@@ -241,7 +241,7 @@ def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_plugins")
-def test_a_kind_of_a_plug_in_is_trained_with(tiny_scene, few_steps, tmp_path):
+def test_plugin_module_is_trained(tiny_scene, few_steps, tmp_path):
     """It makes what a training has of it; one that changes nothing leaves the bits of none."""
     (tmp_path / "mine.py").write_text(PLAIN)
     plugins.load_file(tmp_path / "mine.py")

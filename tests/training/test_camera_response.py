@@ -57,14 +57,14 @@ def ended(tiny_scene, tmp_path_factory) -> Run:
 
 
 @pytest.mark.slow
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(ended, tiny_scene, tmp_path):
+def test_resumed_run_has_the_same_bits(ended, tiny_scene, tmp_path):
     run = train(tiny_scene, killed(ended.out, tmp_path / "run"), *RESPONSE, resume=True)
     assert digest(run.out) == digest(ended.out)
     assert run.modules["camera_response"].scalars == ended.modules["camera_response"].scalars
 
 
 @pytest.mark.slow
-def test_test_views_are_measured_as_their_camera_takes_them(ended, tmp_path):
+def test_test_views_use_their_cameras_response(ended, tmp_path):
     measured = ended.metrics["test"]["1"]
     assert evaluate(ended.out)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
     rows = json.loads((ended.out / camera_response.FILE).read_text())["photographs"]
@@ -81,7 +81,7 @@ def test_test_views_are_measured_as_their_camera_takes_them(ended, tmp_path):
 
 
 @pytest.mark.slow
-def test_known_vignetting_is_found_again(tmp_path):
+def test_known_vignetting_is_recovered(tmp_path):
     """From photographs that move over a scene; those about an object do not tell it from darker surroundings."""
     write_dataset(tmp_path / "scene", City(size=48, train=12, test=2, lots=2), workers=1)
     for file in (tmp_path / "scene").rglob("*.png"):
@@ -103,7 +103,7 @@ def rewritten(text: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_plugins")
-def test_the_same_module_from_outside_gives_the_same_bits(ended, tiny_scene, tmp_path):
+def test_plugin_copy_of_the_module_gives_the_same_bits(ended, tiny_scene, tmp_path):
     """The shipped file with its imports from clsplat.plugin, another type, and its kernel next to it is the example."""
     shipped = Path(camera_response.__file__).read_text("utf-8")
     own = rewritten(shipped).replace(

@@ -16,7 +16,7 @@ NOTES = {"format": 4, "step": 7, "text": "é"}
 ARRAYS = {"gaussians/means": np.arange(6, dtype=np.float32).reshape(2, 3), "none": np.zeros((2, 0), np.float32)}
 
 
-def test_an_archive_returns_what_was_written_and_numpy_reads_it(tmp_path):
+def test_archive_round_trips_and_numpy_reads_it(tmp_path):
     (tmp_path / "a.npz").write_bytes(written(NOTES, ARRAYS))
     notes, arrays = archive.read(tmp_path / "a.npz")
     assert notes == NOTES
@@ -28,7 +28,7 @@ def test_an_archive_returns_what_was_written_and_numpy_reads_it(tmp_path):
 
 
 @pytest.mark.parametrize("mask", [0xFF, 0x01, 0x80])
-def test_every_changed_byte_is_noticed_or_harmless(mask, tmp_path):
+def test_every_changed_byte_is_detected_or_harmless(mask, tmp_path):
     data, file = written(NOTES, ARRAYS), tmp_path / "a.npz"
     noticed = 0
     for place in range(len(data)):
@@ -46,7 +46,7 @@ def test_every_changed_byte_is_noticed_or_harmless(mask, tmp_path):
     assert noticed > 0.7 * len(data)
 
 
-def test_every_cut_and_every_other_size_is_noticed(tmp_path):
+def test_every_truncation_and_size_change_is_detected(tmp_path):
     data, file = written(NOTES, ARRAYS), tmp_path / "a.npz"
     for size in range(len(data)):
         file.write_bytes(data[:size])

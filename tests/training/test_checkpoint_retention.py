@@ -53,7 +53,7 @@ def test_unremovable_older_checkpoint_stays_and_is_reported(run, stuck, caplog):
     assert "cannot be removed (in use); it stays" in record.getMessage()
 
 
-def test_a_failed_state_that_cannot_be_removed_hides_no_advice(run, stuck):
+def test_unremovable_failed_state_does_not_hide_the_advice(run, stuck):
     stuck.add("failed_000000.npz")
     (run.out / "checkpoints" / "failed_000000.npz").touch()
     run.model.gaussians["means"].fill(np.nan)

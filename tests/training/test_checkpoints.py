@@ -44,7 +44,7 @@ CRAFTED = {
 
 
 @pytest.mark.parametrize("name", CRAFTED)
-def test_a_checkpoint_that_no_run_has_saved_is_passed_over(name, killed_run, tiny_scene, few_steps, caplog):
+def test_foreign_checkpoint_is_skipped(name, killed_run, tiny_scene, few_steps, caplog):
     crafted(killed_run / "checkpoints" / "step_000008.npz", CRAFTED[name])
     (killed_run / "checkpoints" / "step_000004.npz").write_bytes(b"")
     with pytest.raises(OutputError, match=r"step_000004.npz is damaged .*--restart` starts over"):
@@ -87,7 +87,7 @@ def test_momentarily_unreadable_checkpoint_is_not_damaged(error, code, killed_ru
     assert steps_saved(killed_run) == before
 
 
-def test_checkpoint_before_one_on_a_bad_disk_block_is_used(killed_run, tiny_scene, few_steps, monkeypatch, caplog):
+def test_checkpoint_before_an_unreadable_one_is_used(killed_run, tiny_scene, few_steps, monkeypatch, caplog):
     shutil.copy(killed_run / "checkpoints" / "step_000008.npz", killed_run / "checkpoints" / "step_000009.npz")
     read = zipfile.ZipFile.read
 
@@ -102,7 +102,7 @@ def test_checkpoint_before_one_on_a_bad_disk_block_is_used(killed_run, tiny_scen
     assert digest(killed_run) == digest(few_steps)
 
 
-def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_scene, few_steps):
+def test_run_without_its_checkpoints_does_not_restart(killed_run, tiny_scene, few_steps):
     before = (killed_run / "metrics.jsonl").read_bytes()
     shutil.rmtree(killed_run / "checkpoints")
     status = json.loads((killed_run / "status.json").read_text())
@@ -113,7 +113,7 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_
 
 
 @pytest.mark.parametrize("status", [None, ""])
-def test_a_run_that_has_lost_its_status_too_does_not_begin_again(killed_run, tiny_scene, few_steps, status):
+def test_run_without_its_status_does_not_restart(killed_run, tiny_scene, few_steps, status):
     before = (killed_run / "metrics.jsonl").read_bytes()
     shutil.rmtree(killed_run / "checkpoints")
     (killed_run / "status.json").unlink()
@@ -124,7 +124,7 @@ def test_a_run_that_has_lost_its_status_too_does_not_begin_again(killed_run, tin
     assert (killed_run / "metrics.jsonl").read_bytes() == before
 
 
-def test_a_run_without_a_checkpoint_so_far_begins_from_the_start(tiny_scene, tmp_path, caplog, few_steps):
+def test_run_before_its_first_checkpoint_restarts(tiny_scene, tmp_path, caplog, few_steps):
     caplog.set_level("INFO", "clsplat")
     train(tiny_scene, tmp_path / "run", *FEW, resume=True)
     assert "nothing to resume; starting from the beginning" in caplog.text
@@ -140,7 +140,7 @@ def test_restoring_reads_no_other_run(few_steps, tmp_path):
     assert CHECKSUMS in {path.name for path in out.iterdir()}
 
 
-def test_a_run_whose_scene_has_moved_goes_on_where_it_is_now(killed_run, few_steps, tiny_scene, tmp_path):
+def test_run_with_a_moved_scene_resumes(killed_run, few_steps, tiny_scene, tmp_path):
     pipeline, moved = killed_run / "pipeline.yaml", shutil.copytree(tiny_scene, tmp_path / "moved" / tiny_scene.name)
     pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
     remedy = (
@@ -152,7 +152,7 @@ def test_a_run_whose_scene_has_moved_goes_on_where_it_is_now(killed_run, few_ste
     assert (killed_run / "point_cloud.ply").read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
 
 
-def test_checkpoints_by_time_come_in_between_and_keep_the_bits(tiny_scene, few_steps, tmp_path):
+def test_checkpoints_by_time_do_not_change_the_bits(tiny_scene, few_steps, tmp_path):
     train(tiny_scene, tmp_path / "run", *FEW, "checkpoint.every_seconds=1e-6", "checkpoint.keep=20")
     assert steps_saved(tmp_path / "run") == [f"step_{step:06d}.npz" for step in range(1, 13)]
     assert digest(tmp_path / "run") == digest(few_steps)

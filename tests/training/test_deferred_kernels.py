@@ -60,7 +60,7 @@ def assert_equal(device: Device, case: Case, **settings: object) -> None:
 
 
 @on_devices("count", [0, 16, 64])
-def test_updates_that_wait(device, rng, count):
+def test_deferred_updates(device, rng, count):
     assert_within_bounds(check_deferred(device, rng, count))
 
 
@@ -71,7 +71,7 @@ def test_updates_that_wait(device, rng, count):
         [False, True],
     ),
 )
-def test_bits_are_those_of_updates_at_once(device, rng, count, degree, sh_rest, from_memory):
+def test_deferred_updates_give_the_bits_of_immediate_ones(device, rng, count, degree, sh_rest, from_memory):
     case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
     assert_equal(device, case, sh_rest=sh_rest, from_memory=from_memory)
 
@@ -107,7 +107,7 @@ def drop_bands(model: DeviceModel, adam: Adam, step: int) -> None:
 
 
 @on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
-def test_who_changes_rows_finds_them_up_to_date(device, rng, edit):
+def test_edits_apply_deferred_updates_first(device, rng, edit):
     assert_equal(device, behind_each_fifth(random_case(rng, 100)), edit=edit)
 
 
@@ -125,7 +125,7 @@ def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
 
 
 @on_one_setting
-def test_rows_that_no_view_sees_wait(device, rng):
+def test_updates_of_invisible_rows_are_deferred(device, rng):
     """Their harmonics lie as they were, and whoever asks for them gets what they are."""
     case = random_case(rng, 150)
     model, seen = case.model(device), np.arange(150) < 16
@@ -146,7 +146,7 @@ def test_rows_that_no_view_sees_wait(device, rng):
 
 
 @on_one_setting
-def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
+def test_penalty_on_deferred_harmonics_is_refused(device, rng):
     gradients = GaussianGradients(random_case(rng, 5).model(device).gaussians)
     assert gradients.without_deferred()["means"] is gradients["means"]
     with pytest.raises(ConfigError, match="`update: all` with"):
@@ -157,7 +157,7 @@ def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
     "count, degree, rows, from_memory",
     each_once([(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)], product(["all", "seen"], [False, True])),
 )
-def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degree, rows, from_memory):
+def test_bits_do_not_depend_on_the_location_of_harmonics(device, rng, count, degree, rows, from_memory):
     case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
     on_device = bits_after(device, case, rows, from_memory=from_memory)
     on_host = bits_after(device, case, rows, from_memory=from_memory, on_host=True)
@@ -166,7 +166,7 @@ def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degre
 
 
 @on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
-def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
+def test_edits_see_rows_on_the_host(device, rng, edit):
     case = behind_each_fifth(random_case(rng, 100))
     on_device = bits_after(device, case, "all", edit=edit)
     for name, table in bits_after(device, case, "all", edit=edit, on_host=True).items():
@@ -174,7 +174,7 @@ def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
 
 
 @on_one_setting
-def test_needing_all_rows_explains_that_they_are_on_the_host(device, rng):
+def test_error_explains_that_rows_are_on_the_host(device, rng):
     model = random_case(rng, 20).model(device)
     before = model.gaussians.get("sh_rest")
     model.gaussians.move_to_host()

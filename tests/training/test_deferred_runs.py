@@ -59,7 +59,7 @@ def tables(out, step):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_the_bits_are_those_of_updates_at_once(way, spread, at_once, tiny_scene, tmp_path):
+def test_run_gives_the_bits_of_immediate_updates(way, spread, at_once, tiny_scene, tmp_path):
     """In the file, and in each checkpoint with the moments; Gaussians have been added; a run resumes."""
     out = train(tiny_scene, tmp_path / "run", *spread, *WAYS[way]).out
     for step in (4, 8, 12):
@@ -74,7 +74,7 @@ def test_the_bits_are_those_of_updates_at_once(way, spread, at_once, tiny_scene,
     assert digest(out) == digest(at_once)
 
 
-def test_a_run_goes_on_with_its_harmonics_elsewhere(spread, at_once, tiny_scene, tmp_path):
+def test_run_resumes_with_offloaded_harmonics(spread, at_once, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(at_once, out)
     for path in (*sorted((out / "checkpoints").iterdir())[1:], out / "point_cloud.ply"):
@@ -83,7 +83,7 @@ def test_a_run_goes_on_with_its_harmonics_elsewhere(spread, at_once, tiny_scene,
     assert digest(out) == digest(at_once)
 
 
-def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
+def test_too_large_plan_suggests_the_host(spread, tiny_scene, tmp_path):
     """The harmonics stay where the settings say; the plan of the host needs less of the device."""
     run = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
     count, own = run.model.gaussians.count, run.memory_plan()
@@ -102,7 +102,7 @@ def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(("more", "told"), [(("rasterizer.harmonics=device",), True), ((), False)])
-def test_what_makes_room_is_told_where_it_helps(more, told, tiny_scene, tmp_path, small):
+def test_offloading_is_suggested_only_if_it_helps(more, told, tiny_scene, tmp_path, small):
     """Where views see all Gaussians a training is refused before its first step, and the host is no remedy."""
     own = [f"scene.path='{tiny_scene}'", *FEW, *more]
     with pytest.raises(MemoryLimitError) as refused:
@@ -118,7 +118,7 @@ def small(spread, tiny_scene, info, tmp_path_factory):
     return lambda held: replace(info, memory=plan.needed(held), unified=False)
 
 
-def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once, tiny_scene, tmp_path, small, caplog):
+def test_harmonics_move_to_the_host_if_the_device_is_full(spread, at_once, tiny_scene, tmp_path, small, caplog):
     """2,000 Gaussians become more than 3,000; a resumed run moves them where it needs to, whatever it did before."""
     out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
     with caplog.at_level("INFO", "clsplat"):
@@ -134,7 +134,7 @@ def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once
     assert read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"] == "auto"
 
 
-def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene, tmp_path, small):
+def test_run_with_few_visible_rows_resumes_from_any_checkpoint(few_steps, tiny_scene, tmp_path, small):
     """Growth ends above what the estimate of the host allows, and below what the views that were looked at do."""
     own = [f"scene.path='{tiny_scene}'", *spread_of(few_steps, tmp_path / "few.ply", 200), "optimize.steps=16"]
     device, out = small(2050), tmp_path / "run"
@@ -154,7 +154,7 @@ def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene
         assert digest(out) == expected
 
 
-def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
+def test_too_large_model_starts_with_harmonics_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
     """As where the settings say it."""
     for name, more in (("auto", ()), ("host", (HOST,))):
         with caplog.at_level("INFO", "clsplat"):
@@ -166,7 +166,7 @@ def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tm
     assert digest(tmp_path / "auto") == digest(tmp_path / "host")
 
 
-def test_harmonics_stay_where_views_see_all_of_them(tiny_scene, tmp_path, info):
+def test_harmonics_stay_on_the_device_if_views_see_all(tiny_scene, tmp_path, info):
     """They would need more of the device than they do now; the estimate of the host does not know that."""
     run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.steps=1")
     own = run.memory_plan()
@@ -176,7 +176,7 @@ def test_harmonics_stay_where_views_see_all_of_them(tiny_scene, tmp_path, info):
     assert most_gaussians(run) == held < run.memory_plan(harmonics="host").limit
 
 
-def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
+def test_harmonics_stay_on_the_device_if_the_host_is_no_help(tiny_scene, info):
     """A stage needs them on the device, there are none, or the device's memory is the host's."""
     own = f"scene.path='{tiny_scene}'"
     average = "optimize.during=[{average: {every: 2}}]"
@@ -187,14 +187,14 @@ def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
     assert found == ["host", "device", "host"]
 
 
-def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):
+def test_dry_run_reports_offloaded_harmonics(tiny_scene, tmp_path):
     own = [f"scene.path='{tiny_scene}'", HOST]
     text = describe(load("smoke", own), RunState.read(tmp_path / "run"), None, "new")
     assert "harmonics on the host, in" in text
     assert "on the host" not in describe(load("smoke", own[:1]), RunState.read(tmp_path / "run"), None, "new")
 
 
-def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp_path):
+def test_device_holds_the_visible_part_of_host_harmonics(spread, tiny_scene, tmp_path):
     """Half of these Gaussians are far apart: the last view sees some of the blocks."""
     run = train(tiny_scene, tmp_path / "run", *spread, HOST)
     gaussians = run.model.gaussians
@@ -204,7 +204,7 @@ def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp
     assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
 
 
-def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
+def test_settings_that_need_all_harmonics_are_refused(tiny_scene):
     own = f"scene.path='{tiny_scene}'", "optimize.during=[{average: {every: 2}}]"
     assert load("smoke", own)
     with pytest.raises(
@@ -213,7 +213,7 @@ def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
         load("smoke", [*own, HOST])
 
 
-def test_harmonics_on_the_host_are_left_out(spread, tiny_scene, tmp_path):
+def test_harmonics_on_the_host_can_be_reduced(spread, tiny_scene, tmp_path):
     """After the training, where no band is left, and in it, as on the device."""
     during = "optimize.during=[{reduce_sh: {degree: 1, every: 4, stop: 5}}, {reduce_sh: {degree: 0, every: 8}}]"
     found = [
@@ -243,7 +243,7 @@ def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
             runner.execute(checked, run, "restart", lambda progress: None)
 
 
-def test_a_run_of_seen_rows_resumes_to_the_bit(tiny_scene, few_steps, tmp_path):
+def test_run_of_visible_rows_resumes_bit_for_bit(tiny_scene, few_steps, tmp_path):
     """From Gaussians of which each view sees a part."""
     spread = read_ply(few_steps / "point_cloud.ply").parameters
     spread["means"][::2] *= 6

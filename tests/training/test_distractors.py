@@ -70,7 +70,7 @@ class Pair:
 
 
 @pytest.mark.parametrize("cover", [0.0, 3.0])
-def test_a_layer_is_what_its_gaussians_would_be_before_the_scene(device, rng, cover):
+def test_layer_equals_its_gaussians_in_front_of_the_scene(device, rng, cover):
     """The image and the derivatives of both are those of one model with all of them."""
     pair = Pair(device, rng, cover)
     step = pair.layer(0)
@@ -97,7 +97,7 @@ def test_a_layer_is_what_its_gaussians_would_be_before_the_scene(device, rng, co
     np.testing.assert_array_equal(pair.own.adams[1].gaussians.get("means"), means[1])
 
 
-def test_they_are_in_their_photograph_alone(device, rng):
+def test_distractors_appear_only_in_their_image(device, rng):
     pair = Pair(device, rng)
     images = [pair.layer(number).image.get() for number in (0, 1)]
     assert (images[0] != images[1]).any()
@@ -108,7 +108,7 @@ def test_they_are_in_their_photograph_alone(device, rng):
         assert step.image is step.frame.image
 
 
-def test_what_covers_more_than_it_explains_fades(device, rng):
+def test_unhelpful_distractors_fade(device, rng):
     pair = Pair(device, rng, cover=1.0)
     before = pair.tables["logit_opacity"][:20]
     for _ in range(3):
@@ -123,13 +123,13 @@ def test_what_covers_more_than_it_explains_fades(device, rng):
 
 
 @pytest.mark.slow
-def test_before_their_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
+def test_distractors_change_no_bits_before_their_start(tiny_scene, tmp_path, few_steps):
     train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.distractors={count: 30, start: 12}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
 @pytest.mark.slow
-def test_they_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_steps):
+def test_distractors_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
     expected = digest(tmp_path / "run")
     assert expected != digest(few_steps)
@@ -161,7 +161,7 @@ def test_they_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_steps):
         ("scene.validation=auto", "optimize.keep=best", "optimize.refit=true", "rasterizer.harmonics=host"),
     ],
 )
-def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
+def test_distractors_combine_with_other_modules(tiny_scene, tmp_path, others):
     run = train(tiny_scene, tmp_path / "run", *ON, *others)
     assert "distractors" not in run.modules
     assert not run.not_finite()
@@ -169,7 +169,7 @@ def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
     assert split(tables, "modules/distractors/")[0]["updates"].sum() == 12 - 4
 
 
-def test_tables_that_are_not_theirs_are_refused(device, rng):
+def test_foreign_distractor_tables_are_refused(device, rng):
     tables = Pair(device, rng).own.tables()
     Distractors.check_saved({}, tables)
     damaged = [

@@ -28,12 +28,12 @@ def forecast_at(step: int) -> Forecast:
 
 
 @pytest.mark.parametrize(("step", "tolerance"), [(600, 0.25), (1500, 0.1), (2000, 0.01), (3000, 0)])
-def test_the_time_left_knows_of_the_growth_to_come(step, tolerance):
+def test_time_left_includes_future_growth(step, tolerance):
     true = sum(map(seconds_at, range(step + 1, LAST + 1)))
     assert forecast_at(step).seconds_left == pytest.approx(true, rel=tolerance)
 
 
-def test_before_the_growth_it_is_the_least():
+def test_time_left_is_a_lower_bound_before_growth():
     early = forecast_at(200)
     assert not early.growth_known
     assert early.seconds_left == pytest.approx(seconds_at(100) * (LAST - 200))
@@ -42,14 +42,14 @@ def test_before_the_growth_it_is_the_least():
     assert progress_line(progress).endswith("at least 0:34 left")
 
 
-def test_where_no_rule_grows_the_model_it_is_a_product():
+def test_time_left_without_growth_is_proportional():
     forecast = Forecast.of(0, 100, [])
     forecast.add(50, 20.0, 7, 0.5)
     assert forecast.growth_known
     assert forecast.seconds_left == 25
 
 
-def test_growth_ends_with_the_last_rule_before_the_last_step():
+def test_growth_ends_with_the_last_edit():
     assert Forecast.of(0, 1000, [lambda step: step % 100 == 0 and step < 700]).growth_end == 600
     assert Forecast.of(0, 1000, [lambda step: step % 100 == 0]).growth_end == 900, "no edit follows the last step"
     assert Forecast.of(950, 1000, [lambda step: step % 100 == 0]).growth_end == 950

@@ -50,13 +50,13 @@ def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
     assert other.camera.fx == 1.03 * lens.camera.fx
 
 
-def test_a_fisheye_has_no_other_focal_length():
+def test_fisheye_focal_length_is_not_trained():
     assert zoom_lens(FISHEYE, 1.0) is FISHEYE
     with pytest.raises(DataError, match=r"focal length of the OPENCV_FISHEYE lens cannot be changed.*undistort"):
         zoom_lens(FISHEYE, 1.01)
 
 
-def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
+def test_unwritable_focal_length_is_not_trained(tiny_scene):
     scene = read_scene(tiny_scene)
     with pytest.raises(DataError, match=r"camera_optimizer\.focal: the focal length of .*OPENCV_FISHEYE.*undistort"):
         require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
@@ -76,7 +76,7 @@ def _scene_of(views: list[View]) -> Scene:
     return Scene(Path(), tuple(views), tuple(range(len(views))), (), None, 1.0)
 
 
-def test_photographs_of_one_camera_share_a_number():
+def test_images_of_one_camera_share_a_parameter():
     one, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
     views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", one), ("b", other), ("c", one))]
     views.append(View("d", one, np.eye(3, 4), lens=STRONG))
@@ -120,7 +120,7 @@ def with_focals(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.mark.slow
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_focals, tiny_scene, tmp_path):
+def test_resumed_run_has_the_same_bits(with_focals, tiny_scene, tmp_path):
     out = killed(with_focals, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_focals)
@@ -155,7 +155,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
 
 
 @pytest.mark.slow
-def test_poses_alone_keep_their_files(with_focals, tiny_scene, tmp_path):
+def test_training_only_poses_writes_the_same_files(with_focals, tiny_scene, tmp_path):
     train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.camera_optimizer={start: 2}")
     assert digest(tmp_path / "run") != digest(with_focals)
     assert "focal_lengths" not in (tmp_path / "run" / "view_poses.json").read_text()

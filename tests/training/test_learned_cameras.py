@@ -18,7 +18,7 @@ RECIPE = ROOT / "examples" / "learned_cameras.yaml"
 FEW = "--set", "optimize.steps=8"
 
 
-def test_both_cameras_are_trained_on_afresh_and_compared_alike(rng, tmp_path, monkeypatch):
+def test_original_and_optimized_cameras_are_compared_fairly(rng, tmp_path, monkeypatch):
     """By the commands of the file's header; with names that have blanks, which COLMAP's text cannot hold."""
     monkeypatch.chdir(tmp_path)
     yard = Yard(rng)

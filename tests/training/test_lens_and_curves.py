@@ -41,7 +41,7 @@ class Case:
 
 @on_devices("seed", [(0,), (1,)])
 @pytest.mark.usefixtures("without_plugins")
-def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
+def test_step_gradients_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
     _, row, of_weight, (wait,) = view.step.saved(case.state)
@@ -66,7 +66,7 @@ def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
 
 @on_devices("seed", [(0,)])
 @pytest.mark.usefixtures("without_plugins")
-def test_it_begins_with_no_change_and_learns(device, rng, seed):
+def test_module_starts_at_identity_and_learns(device, rng, seed):
     case, images = Case(device, rng), []
     case.state.scalars = {}
     for modules in ([], [case.state]):
@@ -78,7 +78,7 @@ def test_it_begins_with_no_change_and_learns(device, rng, seed):
     assert len(changed) == 15, "without a falloff its center has no gradient"
 
 
-def test_it_is_small():
+def test_example_is_short():
     text = EXAMPLE.read_text("utf-8")
     assert python_lines(text) + other_lines(EXAMPLE.with_suffix(".cl").read_text("utf-8")) <= 120
     assert "from clsplat." not in text.replace("from clsplat.plugin import", "")

@@ -15,7 +15,7 @@ SMALL = MemoryPlan(
 )
 
 
-def test_bytes_come_from_the_tables(device, rng):
+def test_planned_bytes_match_the_tables(device, rng):
     def plan(gaussians, *numbers, **more):
         return memory.plan(device.info, gaussians.components, *numbers, **more)
 
@@ -32,14 +32,14 @@ def test_bytes_come_from_the_tables(device, rng):
     assert plan(gaussians, 0, 0).largest_table == 180
 
 
-def test_what_fits_fits_and_one_more_does_not():
+def test_limit_is_exact():
     assert SMALL.needed(SMALL.limit) <= SMALL.memory < SMALL.needed(SMALL.limit + 1)
     SMALL.check(SMALL.limit)
     with pytest.raises(MemoryLimitError, match=r"fit in 95 MiB.*start from fewer points"):
         SMALL.check(SMALL.limit + 1)
 
 
-def test_a_single_buffer_may_be_what_is_too_large():
+def test_single_buffer_may_be_too_large():
     narrow = MemoryPlan(gaussian=10, pair=88, fixed=0, largest_table=180, memory=10**12, allocation=27_000_000)
     assert narrow.limit == 84_375  # records of 5 pairs of 64 bytes
 
@@ -51,7 +51,7 @@ def test_training_that_cannot_fit_is_refused_before_it_starts(tiny_scene, tmp_pa
 
 
 @pytest.mark.parametrize("bytes_each", [500, 1e-6])
-def test_random_points_beyond_the_memory_are_not_made(bytes_each, info, tiny_scene, tmp_path, monkeypatch):
+def test_too_many_random_points_are_not_drawn(bytes_each, info, tiny_scene, tmp_path, monkeypatch):
     def made(*_):
         raise AssertionError("random points are made")
 
@@ -61,7 +61,7 @@ def test_random_points_beyond_the_memory_are_not_made(bytes_each, info, tiny_sce
         train(tiny_scene, tmp_path / "run", "init.source=random", f"init.count={count}")
 
 
-def test_points_beyond_the_memory_have_no_neighbors_looked_for(tiny_scene, tmp_path, monkeypatch):
+def test_too_many_points_are_refused_before_neighbor_search(tiny_scene, tmp_path, monkeypatch):
     def looked_for(*_):
         raise AssertionError("neighbors are looked for")
 
@@ -80,20 +80,20 @@ def test_the_first_plan_has_the_tables_that_training_adds(tiny_scene, tmp_path):
     assert run.memory_plan(first).limit >= run.memory_plan().limit
 
 
-def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):
+def test_growth_stops_at_the_memory_limit(tiny_scene, tmp_path, monkeypatch):
     free = train(tiny_scene, tmp_path / "free").model.gaussians.count
     fits = MemoryPlan(gaussian=0, pair=0, fixed=0, largest_table=1, memory=9000, allocation=10**9)
     monkeypatch.setattr("clsplat.training.run.plan", lambda *_: fits)
     assert 8000 < train(tiny_scene, tmp_path / "tight").model.gaussians.count <= 9000 < free
 
 
-def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, few_steps, tmp_path, monkeypatch):
+def test_uncached_images_train_to_the_same_bits(tiny_scene, few_steps, tmp_path, monkeypatch):
     monkeypatch.setattr("clsplat.photos.photographs.BUDGET_SHARE", 1e-10)
     assert train(tiny_scene, tmp_path / "tight", *FEW).photographs.budget < 100
     assert digest(tmp_path / "tight") == digest(few_steps)
 
 
-def test_a_run_says_what_fits(tiny_scene, tmp_path):
+def test_run_logs_how_many_gaussians_fit(tiny_scene, tmp_path):
     clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", "--set", "optimize.steps=1")
     log = (tmp_path / "run" / "log.txt").read_text()
     assert "memory: " in log

@@ -26,7 +26,7 @@ def types(*settings: str) -> list[str]:
     return [one.type for one in load("smoke", list(settings)).settings.training.modules]
 
 
-def test_nothing_but_its_check_knows_a_module_by_name():
+def test_code_outside_its_check_names_no_module():
     """Trainer, checkpoint, memory plan, evaluation, writer and reader of side files go through the base."""
     listed = variants(TrainingModule)
     homes = {kind.__module__ for kind in (*listed.values(), *implicit_modules().values())}
@@ -63,7 +63,7 @@ def test_modules_are_set_by_their_type():
         (["optimize.modules.camera_optimizer={}", "model.background=envmap"], "cannot be combined with sky"),
     ],
 )
-def test_lists_that_do_not_go_together_are_refused(settings, fault):
+def test_incompatible_modules_are_refused(settings, fault):
     with pytest.raises(ConfigError, match=fault):
         load("smoke", settings)
 
@@ -92,7 +92,7 @@ class Order(ModuleState):
         self.notes.append(f"skipped {self.name}")
 
 
-def test_a_step_goes_forward_in_order_and_back_in_reverse(device, rng):
+def test_modules_run_in_order_and_backward_in_reverse(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(weight=0.5), L2()])
     alone, notes = trainer.compare(photograph, 1), []
     trainer.modules = [Order("a", notes), Order("b", notes)]
@@ -108,7 +108,7 @@ def test_a_step_goes_forward_in_order_and_back_in_reverse(device, rng):
     np.testing.assert_array_equal(trainer.model.gaussians.get("means"), means)
 
 
-def test_a_module_that_is_not_known_is_named():
+def test_unknown_module_is_named():
     with pytest.raises(ConfigError, match="an unknown module 'nosuch'; load its plug-in"):
         class_of("nosuch")
 
@@ -147,7 +147,7 @@ def conflict(modules: list[TrainingModule]) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1], ids=["without a sky", "with a sky"])
-def test_a_run_that_was_killed_has_the_same_bits(tiny_scene, tmp_path, number):
+def test_killed_run_resumes_to_the_same_bits(tiny_scene, tmp_path, number):
     """Of the model, of all tables and numbers of all modules, and of their side files."""
     settings = (*FEW, f"optimize.modules={json.dumps(lists()[number])}")
     settings += ("model.background={type: envmap, side: 16}",) if number else ()

@@ -39,9 +39,7 @@ def breaks_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("step", "log_every"), [(6, 5), (8, 100), (7, 1)], ids=["between", "at a checkpoint", "at once"]
 )
-def test_a_state_that_is_not_finite_is_never_a_checkpoint(
-    step, log_every, tiny_scene, tmp_path, monkeypatch, few_steps
-):
+def test_nonfinite_state_is_never_a_checkpoint(step, log_every, tiny_scene, tmp_path, monkeypatch, few_steps):
     out, settings = tmp_path / "run", (*FEW, f"optimize.log_every={log_every}")
     breaks_at(step, monkeypatch)
     with pytest.raises(NumericError, match=r"not finite: means.*the state is in .*failed_0000\d\d.npz") as error:
@@ -59,7 +57,7 @@ def test_a_state_that_is_not_finite_is_never_a_checkpoint(
     assert digest(out) == digest(few_steps)
 
 
-def test_a_loss_that_is_not_finite_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
+def test_nonfinite_loss_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
     numbers = SimpleNamespace(isfinite=lambda value: False)
     monkeypatch.setattr("clsplat.training.checkpoint.math", numbers)
     with pytest.raises(NumericError, match=r"parameters not finite: none; .*resumes from step_000004.npz"):
@@ -67,7 +65,7 @@ def test_a_loss_that_is_not_finite_leaves_no_newer_checkpoint(tiny_scene, tmp_pa
     assert steps_saved(tmp_path) == ["failed_000005.npz", "step_000004.npz"]
 
 
-def test_the_advice_after_a_state_that_is_not_finite_works(tiny_scene, tmp_path, caplog):
+def test_advice_after_a_nonfinite_state_works(tiny_scene, tmp_path, caplog):
     settings = (*FEW, "optimize.rates.sh_base=[[4, 0.01], [5, 1e38]]")
     with pytest.raises(NumericError) as error:
         train(tiny_scene, tmp_path, *settings)
@@ -83,7 +81,7 @@ def test_the_advice_after_a_state_that_is_not_finite_works(tiny_scene, tmp_path,
     assert json.loads((tmp_path / "metrics.json").read_text())["changes"] == changes, "they stay with the run"
 
 
-def test_the_advice_names_the_stage_that_trains(tiny_scene, tmp_path, few_steps):
+def test_advice_names_the_training_stage(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path, *FEW)
     assert lower_rate(run, ["quats"]) == "optimize.rates.quats=0.0005"
     stages = run.pipeline["stages"]

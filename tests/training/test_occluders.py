@@ -50,7 +50,7 @@ def measure(scene: Path, out: Path, *overrides: str) -> float:
 
 
 @pytest.mark.slow
-def test_rectangles_cost_little_where_something_takes_them_up(tmp_path):
+def test_occluders_cost_little_with_a_matching_module(tmp_path):
     clean = tmp_path / "clean"
     write_dataset(clean, SyntheticOptions(size=SIZE, train=PHOTOGRAPHS, test=3, seed=0), workers=1)
     occluded = occlude(clean)

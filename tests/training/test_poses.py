@@ -36,7 +36,7 @@ def numeric(function) -> np.ndarray:
 
 @pytest.mark.parametrize("screen", [{"variance": 0.3}, {"variance": 0.1, "compensate": 1.0}], ids=["blur", "mip"])
 @pytest.mark.parametrize("outside", [False, True])
-def test_derivatives_by_a_pose_are_those_of_the_image(screen, outside):
+def test_pose_derivatives_match_those_of_the_image(screen, outside):
     """In float64, with rays beyond the limits of the linear projection too."""
     rng, camera, degree = np.random.default_rng(3), general_camera(), 3
     gaussians = random_gaussians(rng, camera, degree, count=4)
@@ -63,7 +63,7 @@ def test_derivatives_by_a_pose_are_those_of_the_image(screen, outside):
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.5])
-def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
+def test_parameter_derivatives_match_a_moved_scene(rng, depth):
     """A loss of points in the axes of the camera; the numbers are far from zero."""
     pose = np.column_stack([Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)])
     points, weights = rng.normal(size=(20, 3)), rng.normal(size=(20, 3))
@@ -88,7 +88,7 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
     assert small == pytest.approx(larger, rel=2e-3)
 
 
-def test_rates_begin_after_the_start_and_follow_the_visits():
+def test_rates_start_late_and_follow_the_visits():
     often, seldom = CameraOptimizer().rates(30_500, 50), CameraOptimizer().rates(2500, 50)
     assert [at_step(often[1], step) for step in (0, 500, 30_500)] == pytest.approx([2e-4, 2e-4, 2e-6])
     assert at_step(seldom[1], 500) == pytest.approx(1.16e-3, rel=0.01)
@@ -100,7 +100,7 @@ def test_rates_begin_after_the_start_and_follow_the_visits():
     assert load("smoke", ["optimize.modules.camera_optimizer={}"]).settings.training.modules == [CameraOptimizer()]
 
 
-def test_cameras_that_were_not_trained_on_move_as_the_others_do(tiny_scene):
+def test_other_cameras_follow_the_trained_ones(tiny_scene):
     scene = read_scene(tiny_scene, 5)
     poses = CameraState(CameraOptimizer(), scene.split("train"), scene.views)
     for table in poses.pose_tables:
@@ -124,7 +124,7 @@ def with_poses(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.mark.slow
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_scene, tmp_path):
+def test_resumed_run_has_the_same_bits(with_poses, tiny_scene, tmp_path):
     out = killed(with_poses, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_poses)
@@ -139,13 +139,13 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
 
 
 @pytest.mark.slow
-def test_before_the_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps, with_poses):
+def test_poses_change_no_bits_before_their_start(tiny_scene, tmp_path, few_steps, with_poses):
     train(tiny_scene, tmp_path / "late", *FEW, "optimize.modules.camera_optimizer={start: 12}")
     assert digest(tmp_path / "late") == digest(few_steps) != digest(with_poses)
 
 
 @pytest.mark.slow
-def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tiny_scene, tmp_path):
+def test_metrics_and_tables_use_the_optimized_cameras(with_poses, tiny_scene, tmp_path):
     measured = json.loads((with_poses / "metrics.json").read_text())["test"]["1"]
     assert evaluate(with_poses)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
     assert "view_poses.json" in json.loads((with_poses / "checksums.json").read_text())

@@ -29,9 +29,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.mark.parametrize("rendered", [3, 7], ids=["during", "after"])  # of two views: at 1/2, after 1/1 was measured
 @pytest.mark.parametrize("way", ["stopped", "failed"])
-def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
-    way, rendered, finished, tiny_scene, tmp_path, monkeypatch
-):
+def test_interrupted_evaluate_leaves_no_duplicate_line(way, rendered, finished, tiny_scene, tmp_path, monkeypatch):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
     run = opening.open_run(checked, tmp_path / "run", None)
     render, count = views.render_floats, []
@@ -55,7 +53,7 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
 
 
 @pytest.mark.parametrize(("damage", "left"), [("missing", 0), ("cut", 2), ("changed", 1)])
-def test_lines_that_cannot_be_read_are_told(damage, left, tmp_path, caplog):
+def test_unreadable_lines_are_reported(damage, left, tmp_path, caplog):
     records = Records(tmp_path)
     lines = [json.dumps({"step": step, "kind": "train"}) + "\n" for step in range(5)]
     text = {"missing": "", "cut": "".join(lines[:2]), "changed": lines[0] + "x" + "".join(lines[1:])}[damage]

@@ -72,13 +72,13 @@ CHANGES = {
 }
 
 
-def test_a_class_says_what_may_change(pipeline):
+def test_class_declares_which_keys_may_change(pipeline):
     found = {change: set(kinds(pipeline(TRAINING), pipeline(TRAINING, change)).values()) for change in CHANGES}
     faults = [f"{change}: {kind}" for change, kind in found.items() if kind != {CHANGES[change]}]
     assert not faults, "\n".join(faults)
 
 
-def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugins):
+def test_plugin_stage_declares_which_keys_may_change(pipeline, without_plugins):
     class Shake(Scheduled):
         stage: Literal["shake"] = "shake"
         training_keys: ClassVar[frozenset[str]] = frozenset({"strength"})

@@ -85,7 +85,7 @@ def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> l
         *((7, 0.3, 0.5, 0), (7, 0.3, 0.5, 0.4), (7, 0.3, 0.5, 1), (1, 0.1, 0.95, 0.4)),
     ],
 )
-def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
+def test_rule_matches_plain_sums(rng, least, views, noise, decay):
     skip = SkipBackward(start=0, warm_up=40, decay=decay, min_fraction=least)
     visits = made_up(rng, views, 160, noise)
     found = decisions(skip, visits)
@@ -95,7 +95,7 @@ def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
 
 
 @pytest.mark.parametrize("least", [0.1, 0.9])
-def test_the_least_share_of_whole_steps_is_kept_and_used(least):
+def test_minimum_fraction_of_full_steps_is_respected(least):
     """Losses that only fall would all be skipped."""
     visits = [(f"view {step % 9}", 1 / (1 + step)) for step in range(2000)]
     found = np.array(decisions(SkipBackward(start=0, warm_up=100, min_fraction=least), visits))
@@ -105,7 +105,7 @@ def test_the_least_share_of_whole_steps_is_kept_and_used(least):
     assert not decisions(SkipBackward(start=0, warm_up=9), visits)[9:].count(True), "a warm-up of first visits alone"
 
 
-def test_a_loss_that_is_not_finite_changes_nothing():
+def test_nonfinite_loss_changes_nothing():
     skip, scalars = SkipBackward(start=0, warm_up=1, min_fraction=0), {}
     scalars.update(skip.decide("a", 1.0, scalars).scalars)
     for loss in (math.nan, math.inf):
@@ -135,7 +135,7 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
 
 
 @pytest.mark.parametrize("least", ["2", "-0.1", "much", "[1]", "null"])
-def test_a_share_that_is_none_is_refused(least):
+def test_invalid_fraction_is_refused(least):
     with pytest.raises(ConfigError, match=r"skip_backward\.min_fraction=.*: expected 'auto' or a share from 0 to 1"):
         load(
             "smoke", ["optimize.modules.skip_backward.start=9", f"optimize.modules.skip_backward.min_fraction={least}"]
@@ -168,7 +168,7 @@ def state(run: Run) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a filter that learns"])
-def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
+def test_skipped_step_changes_nothing(tiny_scene, tmp_path, more):
     run, steps = begun(tiny_scene, tmp_path, FROM_5, *NO_EDITS, *more)
     before, skipped = state(run), []
     for view in steps:
@@ -198,7 +198,7 @@ def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_pat
     assert len(averages) > 8, "photographs"
 
 
-def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_path, monkeypatch):
+def test_failure_after_the_decision_saves_the_previous_step(tiny_scene, tmp_path, monkeypatch):
     run, steps = begun(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
@@ -213,7 +213,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     assert (run.step, (state(run), dict(run.modules["skip_backward"].scalars))) == (9, before)
 
 
-def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
+def test_no_loss_is_read_before_the_start(tiny_scene, tmp_path, monkeypatch):
     """A value that is read is a wait for the device."""
     reads, get = Counter(), Array.get
 
@@ -236,7 +236,7 @@ def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatc
 # ---- runs
 
 
-def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
+def test_skipping_run_resumes_bit_for_bit(tiny_scene, tmp_path, caplog):
     caplog.set_level(logging.INFO, "clsplat")
     settings = (FROM_5, "optimize.checkpoint.keep=9", "densify.stop=30")
     first = train(tiny_scene, tmp_path / "first", *settings)
@@ -258,7 +258,7 @@ def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
     assert resumed.records.read("skip") == [told]
 
 
-def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
+def test_auto_measures_its_fraction_in_the_warm_up(tiny_scene, tmp_path):
     """Of forty steps on eight photographs, the first visits at least."""
     settings = (SKIP + "={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
@@ -268,14 +268,14 @@ def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     assert 0 < told["skipped"] <= (1 - told["min_fraction"]) * 78
 
 
-def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tmp_path):
+def test_skipping_changes_no_bits_before_its_start(tiny_scene, few_steps, tmp_path):
     run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.skip_backward.start=12")
     assert digest(run.out) == digest(few_steps)
     assert [line["steps"] for line in run.records.read("skip")] == [0]
     assert not run.modules["skip_backward"].scalars
 
 
-def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
+def test_run_may_resume_with_skipping(tiny_scene, killed_run, caplog):
     run = train(
         tiny_scene,
         killed_run,

@@ -64,7 +64,7 @@ def learned(yard, tmp_path_factory) -> Path:
 # ---- the oracle
 
 
-def test_a_painted_sky_is_found_again(yard, learned):
+def test_painted_sky_is_recovered(yard, learned):
     """From places that no photograph was taken from, where no Gaussian covers it.
 
     The sky is infinitely far: there is no distance that Gaussians could be nearer than. Alpha finds those before it at
@@ -97,7 +97,7 @@ def evaluate_without(out: Path, model) -> float:
     ("pitch", "rows", "share"),
     [(0, 9, 0), (0, 8, 1), (45, 12, 1), (-45, 6, 0), (45, 0, 0)],
 )
-def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
+def test_sky_ends_at_the_horizon(pitch, rows, share):
     """Level, looking up at something narrow, and down at something on white; upper rows that are bright, of 12."""
     mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
     down = np.sin(np.radians(-pitch))
@@ -105,7 +105,7 @@ def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
     assert SkyEvidence(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
 
 
-def test_a_choice_is_written_with_its_reason(learned):
+def test_decision_is_recorded_with_its_reason(learned):
     found = load(str(learned / "pipeline.yaml")).settings.model.background
     assert isinstance(found, Auto)
     assert found.chosen == "on"
@@ -114,7 +114,7 @@ def test_a_choice_is_written_with_its_reason(learned):
     assert f"model.background: on, since {found.reason}" in (learned / "log.txt").read_text()
 
 
-def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
+def test_key_changes_no_bits_without_visible_sky(tiny_scene, tmp_path, few_steps, rng):
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
     run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
@@ -137,7 +137,7 @@ def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_
         (255, "edge", 8, "on", "9 of 9 photographs show"),
     ],
 )
-def test_pixels_that_count_and_are_opaque_show_a_sky(tmp_path, rng, alpha, masked, size, chosen, why):
+def test_counted_opaque_pixels_can_show_sky(tmp_path, rng, alpha, masked, size, chosen, why):
     """alpha: of one pixel of photographs but one, opaque elsewhere; masked: what is left out, an edge that is dark."""
     yard, masks = Yard(rng), tmp_path / "masks"
     folder = yard.write(tmp_path / "scene")
@@ -164,7 +164,7 @@ def test_pixels_that_count_and_are_opaque_show_a_sky(tmp_path, rng, alpha, maske
     assert (found.chosen, found.reason.startswith(why)) == (chosen, True), found.reason
 
 
-def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+def test_decision_is_not_written_as_a_setting():
     asked = load("smoke", ["model.background=auto"]).resolved()
     chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
     assert asked != chosen
@@ -189,7 +189,7 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
 # ---- bits
 
 
-def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
+def test_best_model_has_the_sky_of_its_step(tiny_scene, tmp_path):
     wild = "model.background={type: envmap, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
     kept = (
         "scene.validation=2",
@@ -214,7 +214,7 @@ def test_a_run_folder_is_rendered_and_measured_with_its_sky(learned):
     assert "point_cloud_sky.json" in json.loads((learned / "checksums.json").read_text())
 
 
-def test_a_model_file_without_its_sky_says_so(learned, tmp_path, caplog):
+def test_model_file_without_its_sky_is_reported(learned, tmp_path, caplog):
     shutil.copy(learned / "point_cloud.ply", tmp_path / "alone.ply")
     assert clsplat.load(tmp_path / "alone.ply").sky is None
     assert "was trained with a sky; put alone_sky.json next to it" in caplog.text
@@ -223,7 +223,7 @@ def test_a_model_file_without_its_sky_says_so(learned, tmp_path, caplog):
     np.testing.assert_array_equal(clsplat.load(tmp_path / "moved.ply").sky.texels, model.sky.texels)
 
 
-def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, caplog):
+def test_other_model_of_the_same_name_ignores_the_sky(learned, tmp_path, caplog):
     """Not by a file that another program wrote there, nor by our own of a model without one."""
     model = clsplat.load(learned)
     model.save(tmp_path / "scene.ply")
@@ -238,7 +238,7 @@ def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, c
     assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
 
 
-def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_path):
+def test_exported_splats_show_the_sky_without_its_file(yard, learned, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(learned, out)
     run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), RunState.read(out), None, "resume")
@@ -251,7 +251,7 @@ def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_p
     assert np.abs(found - expected).mean() < 0.02
 
 
-def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
+def test_sky_gaussians_match_its_colors_in_all_directions(rng, learned):
     model = clsplat.load(learned)
     baked = with_sky_splats(model, 500)
     added = baked[len(model) :]
@@ -261,7 +261,7 @@ def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
     assert with_sky_splats(baked) is baked
 
 
-def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
+def test_invalid_sky_is_refused(tiny_scene, yard, tmp_path, caplog):
     """Of transparent photographs, and as splats of a model that has none."""
     transparent = "the photographs are transparent, so the sky would learn the color that clsplat puts behind them"
     nothing = "export.sky: splats has no effect: the model has no sky"
@@ -276,7 +276,7 @@ def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
         assert [text in caplog.text for text in (transparent, nothing)] == said
 
 
-def test_a_turned_model_has_a_turned_sky(rng, learned):
+def test_rotated_model_has_a_rotated_sky(rng, learned):
     model = clsplat.load(learned)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     direction = np.array([0.3, -0.8, 0.2])

@@ -53,7 +53,7 @@ def test_dropout_changes_the_bits(tiny_scene, tmp_path, pipeline):
     assert without[0] != whole
 
 
-def test_opacities_decay_by_the_same_share_in_each_pass(tiny_scene, tmp_path, pipeline):
+def test_opacities_decay_by_the_same_factor_in_each_pass(tiny_scene, tmp_path, pipeline):
     """Where nothing else changes them: eleven steps, of which five are followed by a decay, of eight photographs."""
     still = "optimize.rates.logit_opacity=0", "densify.start=100"
     found = {}
@@ -67,7 +67,7 @@ def test_opacities_decay_by_the_same_share_in_each_pass(tiny_scene, tmp_path, pi
     np.testing.assert_allclose(found[0.9], 0.3 * 0.9 ** (5 * 2 / 8), rtol=1e-5)
 
 
-def test_a_gaussian_that_is_left_out_counts_as_not_seen(rng):
+def test_dropped_gaussian_counts_as_invisible(rng):
     device = Device(choose())
     case = random_case(rng, 40)
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device)
@@ -84,6 +84,6 @@ def test_a_gaussian_that_is_left_out_counts_as_not_seen(rng):
 
 
 @pytest.mark.parametrize("wrong", ["1", "-0.1", "[[0, 0.2], [9, 2]]"])
-def test_a_probability_that_leaves_nothing_is_refused(pipeline, wrong):
+def test_probability_out_of_range_is_refused(pipeline, wrong):
     with pytest.raises(ConfigError, match=r"expected values (of at most 0\.9|at least 0)"):
         load(pipeline, [f"optimize.modules.dropout.probability={wrong}"])

@@ -84,7 +84,7 @@ def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("failure", "state", "code"), [(OutputError("no space"), "failed", 7), (KeyboardInterrupt(), "interrupted", 130)]
 )
-def test_run_that_ends_early_names_the_stage_and_fits_the_schema(
+def test_early_end_names_the_stage_and_fits_the_schema(
     failure, state, code, written, tiny_scene, tmp_path, monkeypatch
 ):
     def fail(*arguments, **settings):
@@ -133,7 +133,7 @@ def test_steps_of_the_preparation_are_stages(written, tmp_path):
     assert ("preparing", "wait") in {(one["state"], one.get("stage")) for one in written}
 
 
-def test_the_heart_beats_while_nothing_else_happens(written, tmp_path):
+def test_heartbeat_continues_during_long_work(written, tmp_path):
     status = StatusFile(tmp_path)
     status.begin()
     until(lambda: len(written) > 3)
@@ -181,7 +181,7 @@ def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, capl
     ]
 
 
-def test_a_heartbeat_changes_no_bit(tiny_scene, tmp_path, monkeypatch):
+def test_heartbeat_changes_no_bits(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 1000.0)
     train(tiny_scene, tmp_path / "slow", *FEW)
     monkeypatch.setattr(writing, "BEAT", 0.0005)
@@ -189,7 +189,7 @@ def test_a_heartbeat_changes_no_bit(tiny_scene, tmp_path, monkeypatch):
     assert digest(tmp_path / "slow") == digest(tmp_path / "fast")
 
 
-def test_a_folder_that_was_removed_stays_removed(written, tmp_path):
+def test_removed_folder_is_not_recreated(written, tmp_path):
     status = StatusFile(tmp_path / "run")
     status.begin()
     (tmp_path / "gone").mkdir()
@@ -201,7 +201,7 @@ def test_a_folder_that_was_removed_stays_removed(written, tmp_path):
     status._ended.set()
 
 
-def test_a_run_that_nobody_holds_has_no_heartbeat(written, tmp_path):
+def test_unlocked_run_has_no_heartbeat(written, tmp_path):
     status = StatusFile(tmp_path)
     status.begin()
     thread = status._thread

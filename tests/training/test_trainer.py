@@ -93,14 +93,14 @@ def test_differentiating_updates_nothing(device, rng):
 
 
 @pytest.mark.parametrize("loss", [Loss(), print])
-def test_what_is_neither_image_loss_nor_penalty_is_refused(any_device, rng, loss):
+def test_loss_of_an_unknown_kind_is_refused(any_device, rng, loss):
     trainer, photograph = trainer_of(any_device, rng, [L1(), loss])
     with pytest.raises(ConfigError, match=r"^the loss \w+: expected a subclass of ImageLoss or of Penalty$"):
         trainer.step(photograph, 1)
 
 
 @pytest.mark.parametrize(("step", "expected"), [(1, 0.3), (9, 0.3), (10, 0.6)])
-def test_rates_and_weights_are_those_of_the_global_step(any_device, rng, step, expected):
+def test_rates_and_weights_use_the_global_step(any_device, rng, step, expected):
     """The first update of Adam moves by the rate, and means by the rate times the extent."""
     weight = {"points": [[0, 1.0], [10, 0.25]], "between": "steps"}
     trainer, photograph = trainer_of(any_device, rng, [L1(weight=weight)])
@@ -116,7 +116,7 @@ def test_rates_and_weights_are_those_of_the_global_step(any_device, rng, step, e
     assert view.loss == pytest.approx(full * (0.25 if step >= 10 else 1.0), rel=1e-6)
 
 
-def test_stale_parameters_stay(any_device, rng):
+def test_stale_parameters_do_not_change(any_device, rng):
     trainer, photograph = trainer_of(any_device, rng, [L1(), Anisotropy(above=1.0)])
     before = {name: trainer.model.gaussians.get(name) for name in ("logit_opacity", "log_scales")}
     view = trainer.step(photograph, 1, stale=["logit_opacity"])
@@ -126,7 +126,7 @@ def test_stale_parameters_stay(any_device, rng):
 
 
 @pytest.mark.parametrize("losses", [[L1()], [L1(), Anisotropy(above=1.0)]], ids=["losses", "a penalty"])
-def test_rows_that_no_view_sees_stay(device, rng, losses):
+def test_invisible_rows_do_not_change(device, rng, losses):
     """Their moments too; penalties give gradients to all rows, and change no other ones than losses do."""
     trainer, photograph = trainer_of(device, rng, losses)
     gaussians = trainer.model.gaussians
@@ -144,7 +144,7 @@ def test_rows_that_no_view_sees_stay(device, rng, losses):
         assert changed[seen].sum() > 15, name
 
 
-def test_what_a_mask_leaves_out_has_no_gradient(any_device, rng):
+def test_masked_pixels_have_no_gradient(any_device, rng):
     trainer, photograph = trainer_of(any_device, rng, [Dssim(), L2()])
     comparison = trainer.differentiate(photograph, 1).comparison
     for planes in (comparison.gradient, comparison.image, comparison.photograph):
@@ -163,7 +163,7 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (65, 12)])
-def test_a_loss_in_numpy_is_the_one_of_the_device(any_device, rng, width, height):
+def test_numpy_loss_matches_the_device_loss(any_device, rng, width, height):
     x, y = images(rng, width, height)
     weight = [[0, 0.5], [10, 1.5]]
     found = []
@@ -179,7 +179,7 @@ def test_a_loss_in_numpy_is_the_one_of_the_device(any_device, rng, width, height
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_loss_in_numpy_adds_to_the_others_wherever_it_stands(any_device, rng, place):
+def test_numpy_loss_adds_to_others_in_any_order(any_device, rng, place):
     x, y = images(rng, 40, 30)
     found = []
     for loss in (L1(weight=0.7), HostLoss(mean_difference, 0.7)):
@@ -192,7 +192,7 @@ def test_a_loss_in_numpy_adds_to_the_others_wherever_it_stands(any_device, rng, 
     np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-6 * np.abs(found[0][1]).max())
 
 
-def test_a_loss_in_numpy_trains_as_the_one_of_the_device(any_device, rng):
+def test_numpy_loss_trains_like_the_device_loss(any_device, rng):
     """With a mask: what it leaves out is black in both images that the function is given."""
     state, tables = rng.bit_generator.state, []
     seen = []
@@ -220,7 +220,7 @@ def test_a_derivative_of_another_shape_is_refused(any_device, rng):
 
 
 @pytest.mark.parametrize("found", [None, 0.0, (0.0,), ("much", np.zeros((4, 5, 3))), (0.0, "much"), (0.0, None, 1)])
-def test_a_loss_that_returns_no_value_and_derivative_is_refused(any_device, rng, found):
+def test_loss_with_an_invalid_return_value_is_refused(any_device, rng, found):
     def odd(image, photograph):
         return found
 
@@ -238,7 +238,7 @@ def test_a_loss_that_returns_no_value_and_derivative_is_refused(any_device, rng,
         ([[0, 1.0], [9, -1.0]], "expected values at least 0"),
     ],
 )
-def test_a_weight_that_is_none_is_refused(weight, reason):
+def test_invalid_weight_is_refused(weight, reason):
     with pytest.raises(ConfigError, match=rf"^the weight of the loss is .*; {reason}") as caught:
         HostLoss(mean_difference, weight)
     assert "\n" not in str(caught.value)
@@ -255,7 +255,7 @@ def test_losses_of_a_run_are_added_to_those_of_its_pipeline(tiny_scene: Path, tm
     assert view.losses[1].value() == pytest.approx(0.5 * view.losses[0].value(), rel=1e-6)
 
 
-def test_a_loss_that_returns_nothing_is_named():
+def test_loss_that_returns_none_is_named():
     class Silent(ImageLoss):
         def add(self, comparison):
             pass

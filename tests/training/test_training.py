@@ -31,7 +31,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return out
 
 
-def test_a_run_leaves_what_it_promises(finished, tiny_scene):
+def test_run_writes_its_outputs(finished, tiny_scene):
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["steps"] == 50
     assert metrics["pipeline"] == "smoke"
@@ -48,7 +48,7 @@ def test_a_run_leaves_what_it_promises(finished, tiny_scene):
     assert not [path for path in finished.rglob(".*")], "temporary files are left"
 
 
-def test_the_loss_falls_and_density_changes(finished):
+def test_loss_decreases_and_density_changes(finished):
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     loss = [line["loss"] for line in lines if line["kind"] == "train"]
     assert loss[-1] < 0.6 * loss[0]
@@ -92,12 +92,12 @@ def test_another_seed_gives_other_bits(few_steps, tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("sort", ["radix", "bitonic"])
-def test_the_sort_does_not_matter(few_steps, tiny_scene, tmp_path, sort):
+def test_sort_does_not_change_the_bits(few_steps, tiny_scene, tmp_path, sort):
     train(tiny_scene, tmp_path / sort, *FEW, f"rasterizer.sort={sort}")
     assert digest(tmp_path / sort) == digest(few_steps)
 
 
-def test_interrupt_saves_and_resume_goes_on(few_steps, tiny_scene, tmp_path):
+def test_interrupt_saves_and_resume_continues(few_steps, tiny_scene, tmp_path):
     out = tmp_path / "stopped"
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
     run = opening.open_run(checked, out, None)
@@ -132,7 +132,7 @@ def test_other_settings_are_refused_on_resume(killed_run, tiny_scene):
         train(tiny_scene, killed_run)
 
 
-def test_checkpoints_hold_everything(finished, tiny_scene):
+def test_checkpoints_contain_the_whole_state(finished, tiny_scene):
     path = sorted((finished / "checkpoints").glob("*.npz"))[-1]
     with np.load(path, allow_pickle=False) as archive:
         names = set(archive.files)
@@ -143,14 +143,14 @@ def test_checkpoints_hold_everything(finished, tiny_scene):
     assert (meta["step"], meta["degree"]) == (50, 1)
 
 
-def test_values_that_are_not_finite_stop_the_run(tiny_scene, tmp_path):
+def test_nonfinite_values_stop_the_run(tiny_scene, tmp_path):
     with pytest.raises(NumericError, match=r"step 10, view '.*': the loss is .*not finite: .*sh_base") as error:
         train(tiny_scene, tmp_path, "optimize.rates.sh_base=1e38")
     assert error.value.exit_code == 6
     assert json.loads((tmp_path / "status.json").read_text())["exit_code"] == 6
 
 
-def test_a_model_without_gaussians_is_nothing_to_start_from(tiny_scene, tmp_path):
+def test_empty_model_is_refused_as_a_start(tiny_scene, tmp_path):
     path = tmp_path / "empty.ply"
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 45}
     write_ply(path, {name: np.zeros((0, width), np.float32) for name, width in widths.items()}, {})

@@ -15,7 +15,7 @@ def distribution(**scalars: float) -> dict[str, float]:
     return {KEYS[int(name[1:])]: number for name, number in scalars.items()}
 
 
-def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
+def test_threshold_is_the_upper_edge_of_a_bin():
     settings = Transients(start=10, quantile=0.9, outlier_ratio=1, tail_ratio=0)
     scalars = distribution(_40=50, _60=40, _80=10)
     assert settings.threshold(scalars, 10) is None, "not yet"
@@ -27,7 +27,7 @@ def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
     assert settings.model_copy(update={"quantile": 0.5}).threshold(scalars, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
 
 
-def test_all_pixels_count_where_no_few_differ_much_more():
+def test_all_pixels_count_without_outliers():
     """Eight bins are an octave: 24 of them a factor of eight."""
     settings = Transients(start=0, tail_ratio=8)
     assert settings.threshold(distribution(_40=90, _64=10), 1) is None
@@ -52,13 +52,13 @@ def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_st
 
 
 @pytest.mark.slow
-def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
+def test_transients_change_no_bits_without_masked_pixels(tiny_scene, tmp_path, few_steps):
     train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.transients={start: 4, tail_ratio: 1e9}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
 @pytest.mark.slow
-def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_path):
+def test_object_in_one_image_is_masked_there(tiny_scene, tmp_path):
     """And little else, of a model that has begun to look like the scene."""
     run = train(
         tiny_scene,

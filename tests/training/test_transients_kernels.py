@@ -12,11 +12,11 @@ from tests.support.devices import each_once, on_devices, product
 
 
 @on_devices("width, height, scale, share", each_once(SIZES, product(SCALES, [None, 0.5, 0.0])))
-def test_residuals_numbers_and_masks_are_those_of_the_reference(device, rng, width, height, scale, share):
+def test_residuals_histogram_and_masks_match_the_reference(device, rng, width, height, scale, share):
     assert_within_bounds(check_transient(device, rng, width, height, scale, share))
 
 
-def test_a_bin_begins_at_its_upper_bits(device):
+def test_bin_starts_at_its_upper_bits(device):
     """A residual on an edge is in the bin above."""
     edges = (2.0**-12 * 2.0 ** (np.arange(BINS) // 8) * (1 + np.arange(BINS) % 8 / 8)).astype(np.float32)
     for values in (edges, np.nextafter(edges[1:], np.float32(0))):
@@ -28,7 +28,7 @@ def test_a_bin_begins_at_its_upper_bits(device):
         np.testing.assert_array_equal(numbers, ref.residual_numbers(values.astype(np.float64)))
 
 
-def test_what_is_not_a_number_stays_for_the_losses_to_find(device):
+def test_nan_is_left_for_the_losses(device):
     x = np.zeros((3, 4, 5), np.float32)
     x[1, 2, 3] = np.nan
     camera = camera_of(device, 5, 4)

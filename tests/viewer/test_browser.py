@@ -90,7 +90,7 @@ def shown(browser) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "degree", "count"), [("plain", 3, COUNT), ("mip", 1, 300), ("plain", 0, 300)])
-def test_the_page_draws_what_the_renderer_draws(small, tmp_path, kind, degree, count):
+def test_page_matches_the_renderer(small, tmp_path, kind, degree, count):
     browser = small
     model = cloud(count, RENDERINGS[kind], degree)
     browser.open(write_page(tmp_path, model))
@@ -106,7 +106,7 @@ def test_the_page_draws_what_the_renderer_draws(small, tmp_path, kind, degree, c
         assert psnr(drawn, expected) >= LEAST, view.name
 
 
-def test_the_photograph_lies_exactly_over_the_picture(opened):
+def test_photograph_aligns_with_the_render(opened):
     """The photograph is a JPEG of the render: where it is shown, the screen hardly changes, and where it is shifted it
     does."""
     plain = shown(opened)
@@ -133,7 +133,7 @@ def test_the_photograph_lies_exactly_over_the_picture(opened):
     assert opened.run("viewer.photographs.comparison") == "off"
 
 
-def test_pictures_of_the_filmstrip_lead_to_their_cameras(opened):
+def test_filmstrip_images_jump_to_their_cameras(opened):
     opened.click("#strip button:nth-child(3)")
     opened.rest()
     assert opened.run("viewer.at") == 2
@@ -154,7 +154,7 @@ def test_pictures_of_the_filmstrip_lead_to_their_cameras(opened):
     opened.call("Emulation.setEmulatedMedia", features=[])
 
 
-def test_the_ways_to_move(opened):
+def test_navigation(opened):
     before = opened.run(POSE)
     radius = np.linalg.norm(np.subtract(before[:3], opened.run("viewer.pivot")))
     for act in (
@@ -186,7 +186,7 @@ def test_orbiting_keeps_the_distance_and_stays_below_the_top(opened):
     assert opened.run("-viewer.camera.rotation.slice(3, 6).reduce((sum, v, i) => sum + v * viewer.up[i], 0)") > 0
 
 
-def test_the_address_holds_the_camera(browser, page, opened):
+def test_url_contains_the_camera(browser, page, opened):
     opened.drag((200, 150), (260, 170))
     opened.rest()
     address, pose, picture = opened.run("location.hash"), opened.run(POSE), shown(opened)
@@ -206,7 +206,7 @@ def test_the_address_holds_the_camera(browser, page, opened):
         assert browser.run("viewer.at") == 0, "the first view, as without an address"
 
 
-def test_the_ways_to_show(opened):
+def test_display_modes(opened):
     pictures = [shown(opened)]
     for key in "234":
         opened.key(key)
@@ -218,7 +218,7 @@ def test_the_ways_to_show(opened):
     assert np.array_equal(shown(opened)[100:300], pictures[0][100:300])
 
 
-def test_settings_help_and_bareness(opened):
+def test_settings_help_and_hidden_controls(opened):
     hidden = "document.getElementById({}).hidden".format
     opened.click("#settings")
     assert not opened.run(hidden("'panel'"))
@@ -256,7 +256,7 @@ def test_settings_help_and_bareness(opened):
     assert opened.run("document.querySelector('header').offsetHeight") > 20
 
 
-def test_the_picture_is_saved_as_a_file(opened):
+def test_image_is_saved_as_a_file(opened):
     opened.run(
         "window.saved = []; HTMLAnchorElement.prototype.click = function () { saved.push([this.download, this.href]); }"
     )
@@ -266,7 +266,7 @@ def test_the_picture_is_saved_as_a_file(opened):
     assert address.startswith("blob:")
 
 
-def test_a_slow_device_shows_less_while_something_moves(opened):
+def test_slow_device_draws_fewer_splats_while_moving(opened):
     wide = opened.run("viewer.canvas.width")
     opened.run("viewer.quality = 0.05; viewer.move(viewer.camera); viewer.draw(false)")
     drawn = opened.run("[viewer.painter.target.width, document.getElementById('statistics').textContent]")
@@ -277,7 +277,7 @@ def test_a_slow_device_shows_less_while_something_moves(opened):
     assert opened.run("viewer.layers[0].first") == opened.run("viewer.layers[0].count")
 
 
-def test_nothing_leaves_the_page(opened):
+def test_page_makes_no_requests(opened):
     for attempt in (
         "fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'refused')",
         """new Promise(done => {
@@ -324,7 +324,7 @@ def test_two_models_share_a_camera(browser, tmp_path):
     assert browser.run("document.getElementById('strip')") is None, "there are no views"
 
 
-def test_nothing_to_show_and_damaged_bytes(browser, tmp_path):
+def test_empty_and_damaged_models(browser, tmp_path):
     stand = Viewpoint.from_points(cloud(4)[:0].means, (), None)
     page = tmp_path / "page.html"
     Page("nothing", {"a": pack(cloud(4)[:0])}, stand, "black").write(page)
@@ -338,7 +338,7 @@ def test_nothing_to_show_and_damaged_bytes(browser, tmp_path):
     assert "cannot be shown" in browser.run("document.getElementById('message').textContent")
 
 
-def test_fingers(page, tmp_path):
+def test_touch_gestures(page, tmp_path):
     with Browser(tmp_path, 390, 700, scale=1, touch=True) as phone:
         phone.open(page)
         first, pose = phone.run(AWAY), phone.run(POSE)

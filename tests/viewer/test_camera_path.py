@@ -26,7 +26,7 @@ def poses(views):
     return np.stack([view.world_to_camera for view in views])
 
 
-def test_a_path_comes_back(views, tmp_path):
+def test_path_round_trip(views, tmp_path):
     write_camera_path(tmp_path / "p.json", views, 24)
     found = camera_path.read(tmp_path / "p.json")
     assert (found.fps, found.size) == (24, SIZE)
@@ -37,7 +37,7 @@ def test_a_path_comes_back(views, tmp_path):
         )
 
 
-def test_a_path_of_nerfstudio_is_moved_back(views, tmp_path, rng):
+def test_nerfstudio_path_is_transformed_back(views, tmp_path, rng):
     turn, shift, scale = Rotation.random(random_state=3).as_matrix(), rng.normal(size=3), 0.37
     write_camera_path(tmp_path / "p.json", views, 24)
     data = json.loads((tmp_path / "p.json").read_text())
@@ -64,14 +64,14 @@ def test_nerfstudios_transform_of_poses_applies_to_the_path(views, tmp_path):
         np.testing.assert_allclose(new.world_to_camera[2, :3], applied[:, :3] @ old.world_to_camera[2, :3], atol=1e-12)
 
 
-def test_a_path_that_may_have_been_moved_is_said(views, tmp_path, caplog):
+def test_possibly_transformed_path_gives_a_warning(views, tmp_path, caplog):
     write_camera_path(tmp_path / "p.json", views, 24)
     with caplog.at_level(logging.WARNING, "clsplat"):
         camera_path.read(tmp_path / "p.json")
     assert "put dataparser_transforms.json next to the path" in caplog.text
 
 
-def test_a_path_is_spread_over_other_numbers_of_frames(views):
+def test_path_is_resampled_to_other_frame_counts(views):
     many = camera_path.resample(views, 23)
     np.testing.assert_allclose(poses(many)[::2], poses(views), atol=1e-12)
     between = (views[0].position + views[1].position) / 2
@@ -108,7 +108,7 @@ def test_another_size_keeps_the_lens(oblique):
     assert lenses(oblique.resized((640, 240))) == [(250, 200, 310, 100), (250, 200, 335, 100)]
 
 
-def test_between_two_views_the_lens_is_between_theirs(oblique):
+def test_lens_is_interpolated_between_views(oblique):
     assert lenses(camera_path.resample(oblique.views, 3)) == [(500, 400, cx, 200) for cx in (300, 325, 350)]
 
 
@@ -132,7 +132,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_damaged_paths_are_refused_in_a_line(fault, views, tmp_path):
+def test_damaged_paths_are_refused_in_one_line(fault, views, tmp_path):
     write_camera_path(tmp_path / "p.json", views, 24)
     data = json.loads((tmp_path / "p.json").read_text())
     change, message = FAULTS[fault]
@@ -144,7 +144,7 @@ def test_damaged_paths_are_refused_in_a_line(fault, views, tmp_path):
 
 
 @pytest.mark.parametrize("world", [{}, {"transform": [[1, 0, 0, 0]], "scale": 1}, {"scale": 0}, [], {"transform": "x"}])
-def test_a_damaged_move_is_refused(world, views, tmp_path):
+def test_damaged_dataparser_transform_is_refused(world, views, tmp_path):
     write_camera_path(tmp_path / "p.json", views, 24)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(world))
     with pytest.raises(DataError, match="export the file again"):

@@ -20,7 +20,7 @@ def columns(chart: str) -> list[str]:
     return re.findall(rf'y="{HEIGHT - 10}" text-anchor="middle">([^<]+)<', chart)
 
 
-def test_points_that_are_not_finite_are_left_out():
+def test_nonfinite_points_are_omitted():
     odd = [(1, float("nan")), (2, float("inf")), (3, 5.0), (4, 6.0)]
     assert rows(curve("a", [Line(odd)])) == rows(curve("a", [Line(odd[2:])]))
     assert curve("a", [Line(odd[:2])], logarithmic=True) == ""
@@ -34,32 +34,32 @@ def test_points_that_are_not_finite_are_left_out():
     ((100_000, 100_800), ["100k", "100.2k", "100.4k", "100.6k", "100.8k"]),
     ((156_855, 157_062), ["156.9k", "157k"]),
 ])  # fmt: skip
-def test_ticks_of_counts_are_whole_numbers(counts, labels):
+def test_ticks_of_counts_are_integers(counts, labels):
     chart = curve("Gaussians", [Line(list(zip((10.0, 20.0), map(float, counts), strict=True)))])
     assert rows(chart) == labels
 
 
-def test_charts_that_show_a_single_value_are_left_out():
+def test_charts_with_a_single_value_are_omitted():
     assert curve("Gaussians", [Line([(10.0, 8.0), (20.0, 8.0)])]) == ""
     assert curve("PSNR", [Line([(10.0, 8.0)]), Line([(10.0, 9.0)])]) == ""
     assert histogram("points", [7.0, 7.0]) == ""
 
 
-def test_ticks_of_steps_are_integers_and_those_of_measures_not():
+def test_only_ticks_of_steps_are_integers():
     chart = curve("PSNR, dB", [Line([(1.0, 20.5), (3.0, 21.25)])])
     assert columns(chart) == ["0", "1", "2", "3"]
     assert rows(chart) == ["20.6", "20.8", "21", "21.2"]
     assert rows(histogram("points", [1.0, 5.0])) == ["0", "1"]
 
 
-def test_lines_of_one_color_differ_in_their_strokes():
+def test_lines_of_one_color_have_different_dashes():
     points = [(0.0, 0.0), (1.0, 1.0)]
     chart = curve("PSNR", [Line(points, "A one", "#123456"), Line(points, "A two", "#123456", dash=1)])
     assert re.findall(r">([^<]+)</tspan>", chart) == ["A one", "A two (dashed)"]
     assert chart.count("stroke-dasharray") == 1
 
 
-def test_the_psnr_of_the_report_is_that_of_the_terminal():
+def test_report_and_terminal_show_the_same_psnr():
     """A mean over views; single ones differ by many dB."""
     psnrs = [20.0, 30.0, 22.0, 31.0, 21.0, 29.0, 24.0]
     forecast, seen = Forecast(100, 0), []

@@ -36,7 +36,7 @@ def command(*arguments: str | Path) -> str:
     return done.stdout
 
 
-def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
+def test_run_writes_a_viewer_and_its_report_links_to_it(run):
     viewer, report = ((run / name).read_text() for name in ("viewer.html", "report.html"))
     assert Page(viewer).elements["canvas"] == 2
     assert viewer.count('"split":"test"') == 2
@@ -46,7 +46,7 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     assert Page(report).elements["a"] == 2, "the viewer and the model"
 
 
-def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, monkeypatch, caplog):
+def test_too_many_splats_for_smooth_display_get_advice(run, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("clsplat.runs.film.MANY_SPLATS", 10)
     heard = []
     with listening(lambda *what, seconds_left: heard.append(what)):
@@ -58,7 +58,7 @@ def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, 
     assert "smoothly" not in caplog.text
 
 
-def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, monkeypatch):
+def test_titles_name_the_given_folder(run, tiny_scene, tmp_path, monkeypatch):
     """Not that of the prepared photographs, whose name is a hash."""
     prepared = shutil.copytree(tiny_scene, tmp_path / "undistort-f22e16004ac0")
     copy = shutil.copytree(run, tmp_path / "castle_run")
@@ -83,7 +83,7 @@ def test_report_links_files_of_one_name_in_several_folders(tiny_scene, tmp_path)
     ]
 
 
-def test_the_stage_and_the_command_show_the_same(run, tmp_path):
+def test_stage_and_command_write_the_same_page(run, tmp_path):
     """But for the name and the digits of a PLY that is read."""
     command("view", run, "--out", tmp_path / "a.html")
     sizes = [len(text.read_text()) for text in (run / "viewer.html", tmp_path / "a.html")]
@@ -100,7 +100,7 @@ def test_every_shipped_pipeline_ends_with_a_viewer_and_a_report():
         assert isinstance(checked.stages[-2], Viewer)
 
 
-def test_the_model_has_the_same_bits_without_the_stage(run, tiny_scene, tmp_path):
+def test_stage_does_not_change_the_model(run, tiny_scene, tmp_path):
     text = Path(load("smoke").path).read_text().replace("  - viewer: {file: viewer.html, photographs: test}\n", "")
     (tmp_path / "plain.yaml").write_text(text)
     plain = clsplat.run(tmp_path / "plain.yaml", tiny_scene, tmp_path / "plain", set=SHORT)
@@ -109,7 +109,7 @@ def test_the_model_has_the_same_bits_without_the_stage(run, tiny_scene, tmp_path
     assert (plain / "point_cloud.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
 
 
-def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
+def test_link_is_relative_from_another_folder(tiny_scene, tmp_path):
     places = {**SHORT, "viewer.file": "pages/my scene.html", "report.file": "more/report.html"}
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=places)
     (address,) = re.findall(r'<a class="viewer" href="([^"]*)"', (out / "more" / "report.html").read_text())
@@ -145,13 +145,13 @@ def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_
     assert (tmp_path / "a2.html").read_text().count('"photograph":null') == 0
 
 
-def test_a_page_over_an_earlier_one_says_so(run, tmp_path):
+def test_replacing_a_page_is_logged(run, tmp_path):
     words = ["view", run, "--out", tmp_path / "a.html"]
     assert "replaced" not in command(*words)
     assert "a.html: replaced; 0." in command(*words)
 
 
-def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
+def test_models_of_different_scenes_are_reported(run, tiny_scene, tmp_path):
     other, same = (shutil.copytree(run, tmp_path / name) for name in ("other", "same"))
     text = (other / "pipeline.yaml").read_text()
     (other / "pipeline.yaml").write_text(text.replace(str(tiny_scene), str(tmp_path / "kitchen")))
@@ -165,7 +165,7 @@ def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
         assert "both stand" not in CliRunner().invoke(app, [str(word) for word in ("view", *models, *for_all)]).output
 
 
-def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
+def test_page_replaces_no_other_file_of_a_run(run, tmp_path):
     copy = shutil.copytree(run, tmp_path / "copy")
     before = (copy / "report.html").read_bytes()
     with pytest.raises(ConfigError, match=r"report\.html: is a file of a run; use another name"):
@@ -176,7 +176,7 @@ def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
     assert (copy / "viewer.html").read_bytes() != (run / "viewer.html").read_bytes()
 
 
-def test_which_way_is_up_is_said_where_no_view_tells(run, tmp_path):
+def test_assumed_up_direction_is_reported(run, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
     assert "up is -y; add --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
     assert "-y" not in command("view", run, *for_all)
@@ -199,7 +199,7 @@ def test_names_of_models(tmp_path):
     assert names([tmp_path / "other", tmp_path / "other"])[0] != names([tmp_path / "other", tmp_path / "other"])[1]
 
 
-def test_the_help_says_what_is_shown():
+def test_help_describes_what_is_shown():
     assert "Model files or run folders" in command("view", "--help")
 
 

@@ -43,7 +43,7 @@ def page_of(folder, model) -> Page:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_motion_is_packed_beside_the_other_planes(width):
+def test_motion_is_packed_after_other_planes(width):
     model = moving(cloud(300), width)
     packed = pack(model)
     found, fields = unpacked(packed), motion_fields(width)
@@ -66,7 +66,7 @@ def test_motion_is_packed_beside_the_other_planes(width):
     }
 
 
-def test_a_model_that_stands_still_has_no_motion_and_no_slider(tmp_path):
+def test_static_model_has_no_motion_and_no_slider(tmp_path):
     model = cloud(60)
     assert "motion" not in pack(model).header
     still, runs = page_of(tmp_path, model).text(), page_of(tmp_path, moving(model)).text()
@@ -77,7 +77,7 @@ def test_a_model_that_stands_still_has_no_motion_and_no_slider(tmp_path):
 @pytest.mark.slow
 @pytest.mark.large
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
-def test_a_browser_draws_each_photograph_at_its_moment(tmp_path):
+def test_browser_draws_each_photograph_at_its_time(tmp_path):
     model = moving(cloud(500), 15)
     page_of(tmp_path, model).write(tmp_path / "page.html")
     renderer = clsplat.Renderer(model)

@@ -36,7 +36,7 @@ def matched(model, found):
 @pytest.mark.parametrize(
     ("count", "degree"), [(1, 0), (2, 1), (BLOCK - 1, 2), (BLOCK, 3), (BLOCK + 1, 0), (3 * BLOCK + 7, 3)]
 )
-def test_what_comes_out_is_what_went_in(count, degree):
+def test_packing_round_trips_within_its_steps(count, degree):
     model = spread(count, degree=degree)
     packed = pack(model)
     found = unpacked(packed)
@@ -61,7 +61,7 @@ def test_the_same_model_gives_the_same_bytes():
     assert packed.data != pack(cloud(500, seed=1)).data
 
 
-def test_the_order_of_a_file_does_not_matter():
+def test_file_order_does_not_matter():
     model = spread(700)
     assert pack(model).data == pack(model[RNG.permutation(700)]).data
 
@@ -85,7 +85,7 @@ def test_a_limit_keeps_the_most_important():
     np.testing.assert_allclose(np.sort(kept.means[:, 0]), np.sort(best.means[:, 0]), atol=0.01)
 
 
-def test_what_no_view_shows_is_left_out():
+def test_invisible_splats_are_omitted():
     model = spread(10)
     tables = {name: table.copy() for name, table in model.tables().items()}
     tables["means"][0, 1] = np.nan
@@ -100,13 +100,13 @@ def test_what_no_view_shows_is_left_out():
     np.testing.assert_allclose(np.sort(unpacked(packed).means[:, 0]), np.sort(model.means[5:, 0]), atol=1e-3)
 
 
-def test_a_model_of_nothing():
+def test_empty_model():
     packed = pack(cloud(4)[:0])
     assert (packed.count, packed.header["levels"]) == (0, [0] * LEVELS)
     assert len(unpacked(packed).means) == 0
 
 
-def test_splats_at_one_place_and_of_one_size():
+def test_coincident_splats_of_equal_size():
     model = cloud(300)
     same = {name: np.repeat(table[:1], 300, axis=0) for name, table in model.tables().items()}
     found = unpacked(pack(replace(model, **same)))
@@ -114,7 +114,7 @@ def test_splats_at_one_place_and_of_one_size():
     np.testing.assert_allclose(np.log(found.scales), same["log_scales"], rtol=1e-5)
 
 
-def test_colors_far_beyond_the_usual_ones():
+def test_extreme_colors():
     model = spread(300)
     wild = replace(model, sh_rest=model.sh_rest * 60, sh_base=model.sh_base * 20)
     found = unpacked(pack(wild))
@@ -125,7 +125,7 @@ def test_colors_far_beyond_the_usual_ones():
     assert np.abs(found.sh[:, 0] - wild.sh_base).max() < 0.02 * np.abs(wild.sh_base).max()
 
 
-def test_the_numbers_for_rendering_and_a_world_filter():
+def test_render_settings_and_world_filter():
     model = replace(spread(50), rendering=MIP, filter_variance=np.full((50, 1), 0.01, np.float32))
     packed = pack(model)
     header = packed.header

@@ -54,7 +54,7 @@ def test_names_are_escaped(page):
     assert re.fullmatch(r"[\w.-]+", info["file"])
 
 
-def test_splats_too_faint_to_draw_are_told(page):
+def test_splats_too_faint_to_draw_are_reported(page):
     model = cloud(60)
     model.logit_opacity[:] = 0
     model.logit_opacity[:7] = -6
@@ -64,11 +64,11 @@ def test_splats_too_faint_to_draw_are_told(page):
     assert "too faint to draw, SH" not in replace(page, models={"model": pack(model)}).text()
 
 
-def test_the_help_names_the_gestures_of_fingers_too(page):
+def test_help_lists_touch_gestures(page):
     assert "double-click it · double-tap it" in page.text()
 
 
-def test_only_the_script_and_style_of_the_package_may_run(page):
+def test_content_policy_allows_only_package_scripts_and_styles(page):
     text = page.text()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text).group(1)
     for element in ("script", "style"):
@@ -80,7 +80,7 @@ def test_only_the_script_and_style_of_the_package_may_run(page):
     assert "http" not in text.replace("http-equiv", ""), "an address of another place"
 
 
-def test_a_script_that_would_end_its_element_is_refused():
+def test_script_that_closes_its_element_is_refused():
     with pytest.raises(ValueError, match="closes its element"):
         inline("'</script>'")
 
@@ -96,7 +96,7 @@ def test_scripts_are_short_and_part_of_the_page():
     assert not faults, "\n".join(faults)
 
 
-def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch):
+def test_too_large_page_for_browsers_is_refused(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.95 * page.size)
     with pytest.raises(
         OutputError, match=r"page would have 0 MB, .*show only the \d+ most important splats \(--splats \d+\)"
@@ -105,7 +105,7 @@ def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-def test_of_a_page_with_too_many_photographs_these_are_the_fault(page, tmp_path, monkeypatch):
+def test_too_large_page_blames_its_photographs(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.2)
     large = replace(page, views=[{"name": "a", "thumbnail": "", "photograph": "x" * 300_000}])
     with pytest.raises(OutputError, match="at most 0 MB; show fewer photographs") as raised:
@@ -113,7 +113,7 @@ def test_of_a_page_with_too_many_photographs_these_are_the_fault(page, tmp_path,
     assert "splats" not in str(raised.value)
 
 
-def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
+def test_suggested_splat_limit_fits(page, monkeypatch):
     model = cloud(4000)
     large = replace(page, models={"model": pack(model)})
     monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
@@ -122,13 +122,13 @@ def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
     assert 0.5 * module.MAX_SIZE < fitting.size <= module.MAX_SIZE
 
 
-def test_a_small_model_beside_a_large_one_keeps_its_splats(page, monkeypatch):
+def test_small_model_next_to_a_large_one_keeps_its_splats(page, monkeypatch):
     large = replace(page, models={"a": pack(cloud(4000)), "b": pack(cloud(40))})
     monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
     assert 500 < large.max_splats < 3000
 
 
-def test_the_size_is_that_of_the_file(page, tmp_path):
+def test_page_size_matches_the_file(page, tmp_path):
     large = replace(page, models={"model": pack(cloud(20000))})
     large.write(tmp_path / "page.html")
     assert large.size == pytest.approx((tmp_path / "page.html").stat().st_size / 1e6, rel=0.05)
@@ -145,12 +145,12 @@ def test_the_size_is_that_of_the_file(page, tmp_path):
         ([], 4, []),
     ],
 )
-def test_photographs_up_to_a_budget(sizes, budget, kept):
+def test_photographs_stay_within_a_budget(sizes, budget, kept):
     assert left_out(sizes, budget) == set(range(len(sizes))) - set(kept)
 
 
 @pytest.mark.parametrize(("which", "held"), [("none", []), ("test", [0, 3]), ("all", [0, 1, 2, 3])])
-def test_photographs_of_the_views_that_are_wanted(tmp_path, which, held):
+def test_photographs_of_the_selected_views(tmp_path, which, held):
     found = described(scene(tmp_path), flat, which)
     assert [i for i, view in enumerate(found) if view["photograph"]] == held
     assert all(view["thumbnail"].startswith("data:image/jpeg;base64,") for view in found)
@@ -163,7 +163,7 @@ def test_thumbnails_keep_their_aspect(shape, after):
     assert shrink(np.zeros((*shape, 3), np.uint8), 128).shape[:2] == after
 
 
-def test_where_a_page_begins(tmp_path):
+def test_initial_camera_of_a_page(tmp_path):
     model, found = cloud(200), views()
     stand = Viewpoint.from_points(model.means, found, found[2])
     assert stand.start is found[2]
@@ -178,12 +178,12 @@ def test_where_a_page_begins(tmp_path):
     assert np.isfinite(Viewpoint.from_points(model.means, (), None).start.world_to_camera).all()
 
 
-def test_a_camera_keeps_its_digits():
+def test_camera_keeps_its_digits():
     view = views()[1]
     data = camera_data(view)
     np.testing.assert_allclose(np.reshape(data["pose"], (3, 4)), view.world_to_camera, rtol=1e-8, atol=1e-12)
     assert data["lens"] == [80.0, 104.0, pytest.approx(33.6), pytest.approx(56.0), 112, 80]
 
 
-def test_the_folder_holds_no_script_that_is_forgotten():
+def test_every_script_in_the_folder_is_used():
     assert sorted(path.stem for path in Path(FOLDER).glob("*.js")) == sorted(SCRIPTS)

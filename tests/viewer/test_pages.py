@@ -36,7 +36,7 @@ def strings(path: Path) -> list[tuple[int, str]]:
     return [(node.lineno, node.value) for node in constants if isinstance(node.value, str)]
 
 
-def test_html_stands_in_templates_only():
+def test_html_is_only_in_templates():
     faults, drawing = [], set()
     for path in SOURCES:
         name, texts = path.relative_to(Path(package.__file__).parents[1]).as_posix(), strings(path)
@@ -59,7 +59,7 @@ def luminance(color: str) -> float:
 
 
 @pytest.mark.parametrize("mode", ["light", "dark"])
-def test_text_can_be_read_on_its_paper(mode):
+def test_text_has_enough_contrast(mode):
     light, dark = re.findall(r":root \{(.*?)\}", (FOLDER / "base.css").read_text(), re.DOTALL)
     found = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
     assert found[0].keys() == found[1].keys(), "a color of one mode alone"
@@ -75,7 +75,7 @@ def test_text_can_be_read_on_its_paper(mode):
         assert (light + 0.05) / (dark + 0.05) >= 4.5, f"{text} on {paper}"
 
 
-def test_colors_of_text_and_paper_follow_the_mode():
+def test_colors_follow_dark_mode():
     """Where one of both is fixed, so is the other: the page's own is dark or light."""
     faults = []
     for path in (path for path in FOLDER.iterdir() if path.suffix in (".css", ".j2")):
@@ -88,7 +88,7 @@ def test_colors_of_text_and_paper_follow_the_mode():
     assert not faults, "\n".join(faults)
 
 
-def test_one_place_marks_text_as_safe():
+def test_only_one_module_marks_text_as_safe():
     found = [path.name for path in SOURCES for line in path.read_text().splitlines() if "Markup(" in line]
     assert found == ["page.py"]
     for path in FOLDER.iterdir():
@@ -125,17 +125,17 @@ def test_values_are_escaped_and_charts_are_not():
         ("`<script>`", "<code>&lt;script&gt;</code>"),
     ],
 )
-def test_what_stands_between_backticks_is_code(text, found):
+def test_text_in_backticks_is_code(text, found):
     page = TEMPLATES.from_string("{% from 'macros.html.j2' import words %}{{ words(text) }}")
     assert page.render(text=text).strip() == found
 
 
-def test_a_value_that_a_template_lacks_is_an_error():
+def test_missing_template_value_is_an_error():
     with pytest.raises(UndefinedError, match="is undefined"):
         render("inspect.html.j2", title="a", subtitle="b")
 
 
-def test_data_cannot_end_their_script():
+def test_data_cannot_close_its_script():
     text = TEMPLATES.from_string("{{ data | tojson }}").render(data={"b": "</script>", "a": [1]})
     assert text == '{"b":"\\u003c/script\\u003e","a":[1]}'
     assert json.loads(text)["b"] == "</script>"
@@ -172,7 +172,7 @@ def hostile_scene(tiny_scene: Path, folder: Path) -> Path:
     return scene
 
 
-def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
+def test_report_escapes_markup_in_names(tiny_scene, tmp_path):
     scene, out = hostile_scene(tiny_scene, tmp_path), tmp_path / "run"
     clsplat("run", "smoke", "--scene", scene, "--out", out, "--set", "optimize.steps=30", "optimize.log_every=10")
     page = Page((out / "report.html").read_text())
@@ -187,7 +187,7 @@ def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
-def test_a_page_that_has_lost_its_end_is_refused(text, tmp_path):
+def test_truncated_page_is_refused(text, tmp_path):
     (tmp_path / "a.html").write_text(text)
     assert refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: is truncated; make the page again"
     (tmp_path / "a.html").write_text("<html></html>\n")

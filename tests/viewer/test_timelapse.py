@@ -38,11 +38,11 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def test_pictures_and_videos_change_no_bit_of_the_model(run, few_steps):
+def test_images_and_videos_change_no_bits_of_the_model(run, few_steps):
     assert digest(run) == digest(few_steps)
 
 
-def test_a_picture_every_so_many_steps_and_a_video_of_them(run):
+def test_images_are_written_periodically_and_joined_to_a_video(run):
     names = [path.name for path in sorted((run / "timelapse").iterdir())]
     assert names == [f"step_{step:06d}.png" for step in range(2, 13, 2)]
     assert {image_size(path) for path in (run / "timelapse").iterdir()} == {(40, 40)}
@@ -52,16 +52,16 @@ def test_a_picture_every_so_many_steps_and_a_video_of_them(run):
     assert (last == render).all(), "the camera of the view, the model of the last step"
 
 
-def test_the_cameras_lie_beside_the_model(run):
+def test_cameras_are_written_next_to_the_model(run):
     assert (run / "cameras" / "cameras.json").is_file()
     assert (run / "cameras" / "sparse" / "0" / "images.bin").is_file()
 
 
-def test_a_run_with_videos_is_found_whole(run):
+def test_run_with_videos_passes_the_check(run):
     assert "all" in command("check", run).stdout
 
 
-def test_a_run_that_was_killed_ends_with_the_same_pictures(run, pipeline, tiny_scene, tmp_path):
+def test_killed_run_resumes_to_the_same_images(run, pipeline, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(run, out)
     (out / "checkpoints" / "step_000012.npz").unlink()  # back to step 8
@@ -75,7 +75,7 @@ def test_a_run_that_was_killed_ends_with_the_same_pictures(run, pipeline, tiny_s
     assert digest(out) == digest(run)
 
 
-def test_a_time_lapse_needs_pictures(pipeline, tmp_path):
+def test_time_lapse_needs_images(pipeline, tmp_path):
     text = pipeline.read_text()
     (tmp_path / "none.yaml").write_text(text.replace(SNAPSHOT, ""))
     with pytest.raises(ConfigError, match=r"timelapse needs 'snapshots', which no earlier stage makes \(snapshot"):

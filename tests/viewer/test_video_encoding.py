@@ -37,7 +37,7 @@ def pictures(count=9, size=(64, 48)):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_video_holds_its_pictures(suffix, tmp_path):
+def test_video_contains_its_frames(suffix, tmp_path):
     assert clsplat.write_video(tmp_path / f"a{suffix}", pictures(), fps=12) == 9
     found, fps = decoded(tmp_path / f"a{suffix}")
     assert (len(found), fps) == (9, 12)
@@ -47,7 +47,7 @@ def test_a_video_holds_its_pictures(suffix, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_the_same_pictures_give_the_same_bytes(suffix, tmp_path):
+def test_equal_frames_give_equal_bytes(suffix, tmp_path):
     for name in "ab":
         clsplat.write_video(tmp_path / f"{name}{suffix}", [image / np.float32(255) for image in pictures()], 30)
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
@@ -59,7 +59,7 @@ def test_an_encoder_is_silent(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_failure_leaves_the_file_that_was_there(suffix, tmp_path):
+def test_failure_leaves_the_previous_file(suffix, tmp_path):
     file = tmp_path / f"a{suffix}"
     file.write_bytes(b"old")
     with pytest.raises(ValueError, match="image 1 has shape"):
@@ -69,20 +69,20 @@ def test_a_failure_leaves_the_file_that_was_there(suffix, tmp_path):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {file.name: b"old"}
 
 
-def test_a_file_that_lost_frames_is_no_result(tmp_path, monkeypatch):
+def test_file_with_missing_frames_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(encoding, "count_frames", lambda path: 3)
     with pytest.raises(OutputError, match="3 of 9 frames can be read back"):
         clsplat.write_video(tmp_path / "a.webm", pictures())
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+def test_uncreatable_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         clsplat.write_video(tmp_path / "file" / "a.webm", pictures())
 
 
-def test_mp4_without_pyav_says_how_to_get_it(tmp_path, monkeypatch):
+def test_mp4_without_pyav_names_the_package(tmp_path, monkeypatch):
     load = builtins.__import__
 
     def refuse(name, *rest, **more):
@@ -96,7 +96,7 @@ def test_mp4_without_pyav_says_how_to_get_it(tmp_path, monkeypatch):
         clsplat.write_video(tmp_path / "a.mp4", pictures())
 
 
-def test_opencv_without_an_encoder_says_what_else_there_is(tmp_path, monkeypatch):
+def test_opencv_without_an_encoder_names_alternatives(tmp_path, monkeypatch):
     monkeypatch.setattr(encoding, "CODEC", "none")
     with pytest.raises(OutputError, match=r"cannot write WebM.*or write images with --out DIR"):
         clsplat.write_video(tmp_path / "a.webm", pictures())
@@ -113,7 +113,7 @@ def test_odd_sizes_are_refused(tmp_path):
         clsplat.write_video(tmp_path / "a.webm", pictures(2, (63, 48)))
 
 
-def test_a_file_that_is_no_webm_stays_as_it_is(tmp_path, rng):
+def test_file_that_is_not_webm_is_unchanged(tmp_path, rng):
     for length in (0, 1, 2, 7, 300):
         data = rng.integers(0, 256, length, dtype=np.uint8).tobytes()
         (tmp_path / "x").write_bytes(data)

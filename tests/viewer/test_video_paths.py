@@ -42,14 +42,14 @@ def turns(views):
     return np.arctan2(place[:, 1], place[:, 0])
 
 
-def test_the_focus_and_the_upward_axis_are_those_of_the_cameras(rng):
+def test_focus_and_up_axis_follow_the_cameras(rng):
     rig = rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False), target=(0.2, -0.1, 0.3)), rng)
     np.testing.assert_allclose(rig.focus, (0.2, -0.1, 0.3), atol=0.01)
     assert rig.up @ UP > 0.99
 
 
 @pytest.mark.parametrize("name", ["ellipse", "orbit"])
-def test_ring_of_cameras_is_circled_once_at_its_distance(name, rng):
+def test_orbit_circles_a_camera_ring_once_at_its_distance(name, rng):
     found = PATHS[name](rig_of(ring(np.linspace(0, 2 * np.pi, 24, endpoint=False)), rng), 36, SIZE)
     place = positions(found)
     np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), 3, rtol=0.05)
@@ -65,7 +65,7 @@ def test_ring_of_cameras_is_circled_once_at_its_distance(name, rng):
         np.testing.assert_allclose((x, y), 0, atol=0.05)
 
 
-def test_an_ellipse_is_as_long_and_wide_as_the_cameras_stand(rng):
+def test_ellipse_matches_the_extent_of_the_cameras(rng):
     angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     places = [(4 * np.cos(a), 2 * np.sin(a), 1) for a in angles]
     views = [View.looking_at(p, (0, 0, 0), UP, CAMERA, f"{i:03d}") for i, p in enumerate(places)]
@@ -74,7 +74,7 @@ def test_an_ellipse_is_as_long_and_wide_as_the_cameras_stand(rng):
     assert 1.7 < np.abs(place[:, 1]).max() < 2.05
 
 
-def test_ellipse_facing_cameras_on_one_side_swings_there(rng):
+def test_ellipse_of_one_sided_cameras_swings_on_their_side(rng):
     views = ring(np.linspace(-0.8, 0.8, 15))
     found = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
     assert np.abs(turns(found)).max() < 0.9
@@ -83,13 +83,13 @@ def test_ellipse_facing_cameras_on_one_side_swings_there(rng):
     assert moves.max() < 0.5, "the last frame leads to the first"
 
 
-def test_an_orbit_says_what_no_photograph_shows(rng, caplog):
+def test_orbit_reports_unseen_directions(rng, caplog):
     with caplog.at_level(logging.WARNING, "clsplat"):
         PATHS["orbit"](rig_of(ring(np.linspace(-0.8, 0.8, 15)), rng), 4, SIZE)
     assert "degrees of the orbit were not photographed" in caplog.text
 
 
-def test_cameras_that_look_outwards_have_nothing_to_circle(rng):
+def test_outward_facing_cameras_have_no_orbit(rng):
     views = [
         View.looking_at(view.position, 3 * view.position * (1, 1, 0.2), UP, CAMERA, view.name)
         for view in ring(np.linspace(0, 2 * np.pi, 12, endpoint=False), radius=0.5)
@@ -115,7 +115,7 @@ def test_spiral_sways_no_farther_than_the_cameras(rng):
     assert 4 < rig.depths[0] < rig.depths[1] < 6
 
 
-def test_axes_that_are_almost_parallel_meet_amid_what_they_show(rng):
+def test_nearly_parallel_axes_meet_within_the_visible_points(rng):
     """As from a drone that looks straight down: the axes alone would meet far below the ground."""
     places = np.column_stack([rng.uniform(-2, 2, (30, 2)), np.full(30, 5.0)])
     slopes = np.column_stack([0.02 * -places[:, :2], np.full(30, -1.0)])
@@ -167,13 +167,13 @@ def test_a_walk_passes_near_the_views_and_looks_as_they_do(rng):
         *(("through", 2), ("ellipse", 2), ("views", 3)),
     ],
 )
-def test_few_views_are_enough(name, count, rng):
+def test_few_views_are_sufficient(name, count, rng):
     found = PATHS[name](rig_of(ring(np.linspace(0, 1, count)), rng), 5, SIZE)
     assert len(found) == (min(count, 5) if name == "views" else 5)
     assert np.isfinite(positions(found)).all()
 
 
-def test_views_keep_their_pose_and_see_all_of_their_photograph():
+def test_views_keep_pose_and_field_of_view():
     (view,) = PATHS["views"](rig_of(ring([0.3])), 3, (300, 120))
     np.testing.assert_array_equal(view.world_to_camera, ring([0.3])[0].world_to_camera)
     camera, scale = view.camera, 120 / 150
@@ -181,7 +181,7 @@ def test_views_keep_their_pose_and_see_all_of_their_photograph():
     assert camera.cx == pytest.approx(101 * scale + (300 - 200 * scale) / 2)
 
 
-def test_a_camera_that_strayed_changes_nothing(rng):
+def test_outlier_camera_changes_nothing(rng):
     views = ring(np.linspace(0, 2 * np.pi, 24, endpoint=False))
     stray = View.looking_at((500, 0, 0), (500, 9, 0), UP, CAMERA, "stray")
     with_it, without = (PATHS["ellipse"](rig_of(v), 8, SIZE) for v in ([*views, stray], views))
@@ -222,14 +222,14 @@ def test_an_unknown_path_and_a_path_without_a_scene_are_refused():
         plan_video(VideoRequest(), None, np.zeros((1, 3)))
 
 
-def test_a_path_of_a_scene_in_python(rng):
+def test_path_of_a_scene_in_python(rng):
     scene = make_scene(Path("none"), ring(np.linspace(0, 6, 12)), set(), None)
     found = clsplat.camera_path(scene, "orbit", 5, "64x32")
     assert [view.name for view in found] == [f"frame_{i:05d}" for i in range(1, 6)]
     assert clsplat.camera_path(scene)[0].camera.width == 200
 
 
-def test_the_ellipse_of_photographs_stays_before_what_they_show():
+def test_ellipse_of_photographs_stays_in_front_of_the_scene():
     scene = clsplat.read_scene(data_set("fox"))
     found = clsplat.camera_path(scene, frames=30)
     middle = scene.points.positions.mean(axis=0)

@@ -47,7 +47,7 @@ def test_other_times_are_refused(given):
         parse_times(given)
 
 
-def test_time_runs_along_a_path_or_stands_still(scene):
+def test_time_advances_along_a_path_or_is_fixed(scene):
     assert [view.time for view in plan_views(scene)] == [0, 0.25, 0.5, 0.75, 1]
     assert [view.time for view in plan_views(scene, times="1..0.5", frames=3)] == [1, 0.75, 0.5]
     frozen = plan_views(scene, times=0.25)
@@ -72,7 +72,7 @@ def test_views_of_a_scene_keep_their_timestamps(scene):
     assert {view.time for view in plan_views(scene, "views", times=0.5)} == {0.5}
 
 
-def test_a_model_that_does_not_move_has_no_times(scene):
+def test_static_model_has_no_times(scene):
     still = replace(scene, views=tuple(replace(view, time=None) for view in scene.views))
     assert {view.time for view in plan_views(still, moves=False)} == {None}
     with pytest.raises(ConfigError, match="the model does not move; omit the time"):
@@ -85,7 +85,7 @@ def test_nearest_photo_is_that_of_the_nearest_timestamp(scene):
     assert nearest_view(replace(view, time=0.1), scene.views, scene.extent).name == "c3/0"
 
 
-def test_a_path_in_a_file_keeps_its_moments(scene, tmp_path):
+def test_path_file_keeps_its_times(scene, tmp_path):
     views = plan_views(scene, times="0..0.5")
     write_camera_path(tmp_path / "path.json", views, 30)
     again = camera_path.read(tmp_path / "path.json").views

@@ -47,7 +47,7 @@ def test_video_has_the_renders_of_its_path(few_steps, tiny_scene, tmp_path):
     assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
 
 
-def test_a_path_of_a_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
+def test_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     model = shutil.copy(few_steps / "point_cloud.ply", tmp_path)
     told = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
@@ -56,7 +56,7 @@ def test_a_path_of_a_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
         clsplat.render_path(model, video=tmp_path / "a.webm")
 
 
-def test_a_path_of_a_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
+def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
     write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     shutil.copytree(few_steps, tmp_path / "run")
     pipeline = tmp_path / "run" / "pipeline.yaml"
@@ -101,7 +101,7 @@ def test_failed_video_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("record", [{"../a.png": True, "sub/b.png": True, "\0.png": True}, "x", [["a.png"]]])
-def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
+def test_foreign_record_removes_no_files(record, few_steps, tmp_path):
     (tmp_path / "out" / "sub").mkdir(parents=True)
     for name in ("a.png", "out/sub/b.png"):
         (tmp_path / name).write_bytes(b"a drawing")
@@ -111,7 +111,7 @@ def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
     assert (tmp_path / "out" / "sub" / "b.png").is_file()
 
 
-def test_a_folder_of_sog_needs_no_scene_for_a_path_of_a_file(few_steps, tiny_scene, tmp_path):
+def test_sog_folder_with_a_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     clsplat.load(few_steps).save(tmp_path / "m.sog")
     with zipfile.ZipFile(tmp_path / "m.sog") as archive:
@@ -156,7 +156,7 @@ def test_another_model_is_shown_next_to_it(few_steps, tmp_path):
         assert np.abs(frame[:, :40].astype(int) - frame[:, 40:]).mean() < 3
 
 
-def test_depth_and_coverage_are_pictures_and_arrays(few_steps, tmp_path):
+def test_depth_and_coverage_are_images_and_arrays(few_steps, tmp_path):
     count = clsplat.render_views(few_steps, out=tmp_path / "png", depth=True, alpha=True)
     assert count == 6 == len(pictures(tmp_path / "png"))
     clsplat.render_views(few_steps, out=tmp_path / "npy", kind="npy", depth=True, alpha=True)
@@ -170,7 +170,7 @@ def test_depth_and_coverage_are_pictures_and_arrays(few_steps, tmp_path):
     np.testing.assert_allclose(gray[:, :, 1] / 255, alpha, atol=0.5 / 255)
 
 
-def test_depths_go_from_red_to_blue():
+def test_depth_colors_range_from_red_to_blue():
     depth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
     ((near, middle, far, nothing),) = depth_image(depth, np.ones((1, 4), np.float32), (1.0, 4.0)).astype(int)
     assert near[0] > 80 + near[2]
@@ -179,7 +179,7 @@ def test_depths_go_from_red_to_blue():
     assert nothing.tolist() == [0, 0, 0]
 
 
-def test_a_picture_stands_in_the_middle_of_its_box():
+def test_image_is_centered_in_its_box():
     box = letterbox(np.full((10, 20, 3), 7, np.uint8), (40, 40))
     assert box.shape == (40, 40, 3)
     assert (box[10:30] == 7).all()

@@ -13,7 +13,7 @@ from clsplat.workflows.partition import Membership, assign_cells, cells, quantil
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
-def test_every_gaussian_has_one_cell_and_each_cell_its_share(rng, count):
+def test_gaussians_are_partitioned_into_equal_cells(rng, count):
     means = (rng.standard_normal((4000, 3)) * [20, 5, 1]).astype(np.float32)
     weights = rng.random(4000) * np.exp(means[:, 0] / 20)
     found = cells(means, weights, count)
@@ -25,13 +25,13 @@ def test_every_gaussian_has_one_cell_and_each_cell_its_share(rng, count):
     assert (np.stack([cell.box.holds(far) for cell in found]).sum(axis=0) == 1).all()
 
 
-def test_long_sides_are_cut_and_thin_ones_are_not(rng):
+def test_only_long_sides_are_cut(rng):
     means = rng.standard_normal((2000, 3)) * [20, 5, 0.1]
     for cell in cells(means, np.ones(2000), 4):
         assert (cell.box.low[2], cell.box.high[2]) == (None, None)
 
 
-def test_cell_grows_by_half_the_share_on_each_bounded_side():
+def test_cell_margin_is_half_the_share_per_bounded_side():
     left, right = cells(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
     assert 0 < left.box.high[0] == right.box.low[0] <= 10
     assert left.extended(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])
@@ -39,17 +39,17 @@ def test_cell_grows_by_half_the_share_on_each_bounded_side():
     assert right.extended(0.2).high == [None] * 3
 
 
-def test_nothing_is_not_cut():
+def test_empty_model_is_not_cut():
     with pytest.raises(DataError, match="has no Gaussians"):
         cells(np.zeros((0, 3)), np.zeros(0), 2)
 
 
-def test_equal_places_are_not_cut():
+def test_coincident_positions_are_not_cut():
     with pytest.raises(DataError, match="5 Gaussians cannot be split into 2 blocks; give fewer --blocks"):
         cells(np.ones((5, 3)), np.ones(5), 2)
 
 
-def test_a_gaussian_without_a_place_is_told():
+def test_nonfinite_position_is_reported():
     means = np.array([[0.0, 0, 0], [np.nan, 0, 0]])
     with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have positions that are not finite"):
         assign_cells(means, cells(means[:1], np.ones(1), 1))
@@ -77,7 +77,7 @@ def written(path: Path, rng: np.random.Generator, count: int, near: float = 0.2)
     return parameters
 
 
-def test_joined_models_are_their_rows_in_order(rng, tmp_path, monkeypatch):
+def test_joined_models_keep_row_order(rng, tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "PIECE_ROWS", 7)  # several pieces
     files = [tmp_path / f"{i}.ply" for i in range(3)]
     parts = [written(file, rng, count) for file, count in zip(files, (20, 1, 14), strict=True)]
@@ -90,7 +90,7 @@ def test_joined_models_are_their_rows_in_order(rng, tmp_path, monkeypatch):
     assert read_ply(tmp_path / "all.ply").rendering["near"] == 0.2
 
 
-def test_models_that_do_not_fit_together_are_not_joined(rng, tmp_path):
+def test_incompatible_models_are_not_joined(rng, tmp_path):
     written(tmp_path / "a.ply", rng, 5)
     written(tmp_path / "b.ply", rng, 5, near=0.1)
     with pytest.raises(DataError, match=r"b\.ply: differs from .*a\.ply in properties or comments"):

@@ -49,7 +49,7 @@ def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
     return model[np.argsort(held.argmax(axis=0), kind="stable")]
 
 
-def test_merged_model_is_the_whole_with_all_cameras_everywhere(tiny_scene, few_steps, tmp_path):
+def test_merged_model_equals_an_undivided_run_with_all_cameras(tiny_scene, few_steps, tmp_path):
     coarse = clsplat.load(few_steps)
     coarse.logit_opacity[::50] = -9  # in no view
     coarse.save(tmp_path / "coarse.ply")
@@ -95,7 +95,7 @@ def test_block_trains_with_the_full_extent_and_grows_in_its_cell(trained, tiny_s
 
 
 @pytest.mark.parametrize("most", [16_000, "[[0, 15000], [8, 16000]]"])
-def test_a_number_of_gaussians_is_shared_by_pairs(most, tiny_scene, few_steps, tmp_path):
+def test_gaussian_limit_is_split_by_visible_pairs(most, tiny_scene, few_steps, tmp_path):
     """All blocks grow to their parts; many of the Gaussians outside are pruned meanwhile, and leave no room."""
     rules = "[{type: clone, gradient_above: 1.0e-7, size_below: 0.05}, {type: prune_faint, opacity_below: 0.11}]"
     grows = f"densify.rules={rules}", f"densify.max_gaussians={most}", "densify.every=4", "densify.start=3"
@@ -118,7 +118,7 @@ def test_the_merged_run_is_measured_with_all_views(trained):
     np.testing.assert_array_equal(clsplat.load(out / "merged").means, merged)
 
 
-def test_killed_and_missing_blocks_go_on_with_equal_bits(trained, tiny_scene, few_steps, tmp_path):
+def test_killed_and_missing_blocks_resume_with_equal_bits(trained, tiny_scene, few_steps, tmp_path):
     out = shutil.copytree(trained[0], tmp_path / "out")
     for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
         (out / "block_01" / name).unlink()
@@ -144,13 +144,13 @@ def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_step
         assert (out / name).read_bytes() == (trained[0] / name).read_bytes()
 
 
-def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
+def test_finished_blocks_are_not_trained_again(trained, tiny_scene, few_steps, monkeypatch):
     monkeypatch.setattr("clsplat.workflows.finetune.run_pipeline", lambda *_: pytest.fail("a run begins"))
     again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, min_coverage=NEVER)
     assert again == trained[1]
 
 
-def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_steps, tmp_path):
+def test_failing_block_is_named_and_others_are_trained(tiny_scene, few_steps, tmp_path):
     (tmp_path / "out").mkdir()
     train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, min_coverage=NEVER, only_plan=True)
     (tmp_path / "out" / "block_01").write_text("in the way")
@@ -161,7 +161,7 @@ def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_
     assert not (tmp_path / "out" / "merged.ply").exists()
 
 
-def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_scene, few_steps, tmp_path, caplog):
+def test_block_with_only_damaged_checkpoints_restarts(trained, tiny_scene, few_steps, tmp_path, caplog):
     out = tmp_path / "out"
     shutil.copytree(trained[0], out)
     (out / "block_01" / "point_cloud.ply").unlink()
@@ -172,9 +172,7 @@ def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_sce
     assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
 
 
-def test_a_block_without_gaussians_at_its_end_is_left_out(
-    trained, tiny_scene, few_steps, tmp_path, monkeypatch, caplog
-):
+def test_block_that_ends_empty_is_left_out(trained, tiny_scene, few_steps, tmp_path, monkeypatch, caplog):
     def empty(pipeline, folder, *options):
         if folder.name == "block_01":
             raise EmptyRegionError("crop: none lies inside")
@@ -189,7 +187,7 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
     np.testing.assert_array_equal(clsplat.load(out / "merged").means, np.concatenate(parts))
 
 
-def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
+def test_empty_box_is_reported_separately(few_steps, tiny_scene, tmp_path):
     file = tmp_path / "x.yaml"
     stages = [{"init": {"source": "model", "file": str(few_steps)}}, {"crop": {"inside": {"low": [99, 99, 99]}}}]
     file.write_text(json.dumps({"name": "x", "stages": stages}))
@@ -197,7 +195,7 @@ def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
         clsplat.run(file, tiny_scene, tmp_path / "out")
 
 
-def test_blocks_trained_in_a_store_are_those_trained_here(tiny_scene, few_steps, tmp_path, monkeypatch):
+def test_blocks_from_a_store_equal_local_ones(tiny_scene, few_steps, tmp_path, monkeypatch):
     train(tiny_scene, few_steps, tmp_path / "here", blocks=2, min_coverage=NEVER)
     on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
     run = finetune.run_pipeline
@@ -214,7 +212,7 @@ def test_blocks_trained_in_a_store_are_those_trained_here(tiny_scene, few_steps,
         train(tiny_scene, few_steps, out, blocks=2, min_coverage=NEVER, on=on)
 
 
-def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
+def test_status_lists_every_block(trained, tmp_path):
     out = tmp_path / "out"
     assert clsplat.status(trained[0])["state"] == "done"
     shutil.copytree(trained[0], out)
@@ -232,7 +230,7 @@ def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
 
 
 @pytest.mark.parametrize("damaged", ["block_01/point_cloud.ply", "block_01.ply", "partition.json", "block_02", None])
-def test_check_finds_what_is_damaged_in_a_folder_of_blocks(trained, tmp_path, damaged):
+def test_check_finds_damaged_blocks(trained, tmp_path, damaged):
     out = tmp_path / "out"
     shutil.copytree(trained[0], out)
     if damaged == "block_02":
@@ -257,7 +255,7 @@ def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps
         assert rates.means.initial == pytest.approx(6.4e-5 / share**0.5)
 
 
-def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
+def test_coarse_model_is_trained_if_none_is_given(tiny_scene, tmp_path):
     coarse = ("optimize.steps=6", "optimize.views.resolution=1")
     found = clsplat.train_in_blocks(
         tiny_scene, tmp_path / "out", blocks=2, coarse_overrides=coarse, overrides=SHORT, only_plan=True
@@ -289,7 +287,7 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
         ("init.source=random", "start with `init: {source: model}`, and add a stage 'optimize'"),
     ],
 )
-def test_what_blocks_cannot_share_is_refused(override, message, tiny_scene, few_steps, tmp_path):
+def test_settings_that_blocks_cannot_share_are_refused(override, message, tiny_scene, few_steps, tmp_path):
     with pytest.raises(ConfigError, match=message):
         train(tiny_scene, few_steps, tmp_path / "out", override)
     assert not (tmp_path / "out").exists()

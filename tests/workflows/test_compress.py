@@ -62,7 +62,7 @@ def test_targets(text, most, change):
 
 
 @pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
-def test_what_is_no_target_is_refused(text):
+def test_invalid_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
         CompressionTarget.parse(text)
 
@@ -74,7 +74,7 @@ def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
     np.testing.assert_array_equal(clsplat.load(tmp_path / "compressed.sog").sky.texels, sky.texels)
 
 
-def test_the_best_of_a_size_and_the_smallest_of_a_loss():
+def test_best_file_for_a_size_and_smallest_for_a_loss():
     points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
     assert CompressionTarget.parse("800B").best(points, 30) is points[1]
     assert CompressionTarget.parse("-0.1dB").best(points, 30) is points[1]
@@ -85,7 +85,7 @@ def test_the_best_of_a_size_and_the_smallest_of_a_loss():
     assert CompressionTarget.parse("0dB").nearest(points) is points[0]
 
 
-def test_the_search_goes_down_until_it_cannot_be_better():
+def test_search_shrinks_until_no_file_can_be_better():
     rung = [point(900, 30.0), point(500, 29.5)]
     assert not CompressionTarget.parse("600B").is_decided(rung, 30), "fewer Gaussians let more settings fit"
     assert CompressionTarget.parse("1kB").is_decided(rung, 30), "all fit"
@@ -99,13 +99,13 @@ def test_unsearched_format_is_refused_before_anything_is_opened():
 
 
 @pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [float("nan")], [0.501, 0.5]])
-def test_what_are_no_shares_is_refused(keeps):
+def test_invalid_fractions_are_refused(keeps):
     with pytest.raises(ConfigError, match="--keep: expected fractions"):
         ordered_keeps(keeps)
     assert ordered_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
 
 
-def test_every_file_is_measured_as_it_is_read_back(searched, few_steps, tiny_scene):
+def test_every_file_is_measured_after_reading_it_back(searched, few_steps, tiny_scene):
     found = json.loads((searched / "compress.json").read_text())
     whole = len(read(few_steps / "point_cloud.ply"))
     assert found["source"]["gaussians"] == whole
@@ -132,7 +132,7 @@ def test_the_page_shows_every_file_and_the_curve(searched):
     Page(text)
 
 
-def test_the_page_names_the_scene_and_leads_to_the_file(searched, few_steps, tiny_scene):
+def test_page_names_the_scene_and_links_to_the_file(searched, few_steps, tiny_scene):
     text = (searched / "compress.html").read_text()
     assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
     assert str(few_steps / "point_cloud.ply") in text
@@ -179,7 +179,7 @@ def interrupted(pipeline: Pipeline, run: Run, run_stages=runner.run_stages) -> N
     run_stages(pipeline, run)
 
 
-def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkeypatch):
+def test_interrupted_search_resumes_when_repeated(few_steps, tmp_path, monkeypatch):
     run_stages = runner.run_stages
     monkeypatch.setattr(runner, "run_stages", interrupted)
     search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
@@ -198,7 +198,7 @@ def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
 
 
-def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path, monkeypatch):
+def test_search_does_not_resume_with_other_photographs(few_steps, tiny_scene, tmp_path, monkeypatch):
     shutil.copytree(tiny_scene, tmp_path / "scene")
     ask = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
     monkeypatch.setattr(runner, "run_stages", interrupted)
@@ -210,13 +210,13 @@ def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, t
         clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
 
 
-def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
+def test_concurrent_search_in_a_folder_is_refused(few_steps, tmp_path):
     with lock.lock_folder(tmp_path), pytest.raises(OutputError, match="is in use by this process"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path):
+def test_search_killed_early_resumes_and_removes_leftovers(few_steps, tmp_path):
     out, names = tmp_path / "out", [LOCK, f".compress.json.{NO_PROCESS}-0.partial"]
     out.mkdir()
     for name in names:
@@ -235,7 +235,7 @@ def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "[]"])
-def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, tmp_path):
+def test_damaged_search_record_is_reported_with_a_remedy(text, few_steps, tmp_path):
     (tmp_path / "compress.json").write_text(text)
     with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .* or give another"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
@@ -250,7 +250,7 @@ def test_unreachable_target_leaves_page_and_nearest_file(few_steps, tmp_path):
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"
 
 
-def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path):
+def test_earlier_file_stays_if_none_meets_the_new_target(few_steps, tmp_path):
     ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
     clsplat.compress_model(few_steps, target="1MB", **ask)
     assert detect(tmp_path / "out" / "compressed.spz").name == "SPZ"
@@ -259,7 +259,7 @@ def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path)
     assert (tmp_path / "out" / "compressed.spz").is_file()
 
 
-def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_path, caplog):
+def test_spz_losses_are_reported_once_per_search(few_steps, tiny_scene, tmp_path, caplog):
     caplog.set_level("INFO")
     model = clsplat.load(few_steps / "point_cloud.ply")
     model = replace(model, rendering=replace(model.rendering, near=0.05))
@@ -280,7 +280,7 @@ def test_the_command_prints_a_table(searched, few_steps):
     assert "compressed.sog: " in found.output
 
 
-def test_a_loss_of_nothing_has_no_sign(monkeypatch):
+def test_zero_loss_has_no_sign(monkeypatch):
     same = {"psnr": 30.0, "bytes": 10}
     found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
     monkeypatch.setattr("clsplat.api.commands.compress_model", lambda *_, **__: found)
@@ -290,7 +290,7 @@ def test_a_loss_of_nothing_has_no_sign(monkeypatch):
     assert "-0.00" not in told
 
 
-def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
+def test_candidate_is_trained_with_the_models_render_settings(few_steps, tmp_path):
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
@@ -304,7 +304,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
 
 
 @pytest.mark.parametrize(("steps", "lengths", "starts"), [(None, (400, 200), (200, 500)), (100, (40, 20), (20, 50))])
-def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, few_steps, tmp_path):
+def test_palette_averages_start_midway_through_training(steps, lengths, starts, few_steps, tmp_path):
     """Their steps count from the first stage that is run, not from that of the recipe."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     tuning = Tuning("compress", ModelSource.of(few_steps, None), model, steps, None)
@@ -315,12 +315,12 @@ def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, 
 
 
 @pytest.mark.parametrize("steps", [19, 1, 0, -5])
-def test_fewer_steps_than_leave_an_average_are_refused(steps, few_steps, tmp_path):
+def test_too_few_steps_for_an_average_are_refused(steps, few_steps, tmp_path):
     with pytest.raises(ConfigError, match=f"--steps {steps}: expected at least 20"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, steps=steps)
 
 
-def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path, monkeypatch):
+def test_model_of_unknown_size_leaves_no_folder(few_steps, tmp_path, monkeypatch):
     def damaged(path):
         raise DataError("a level is missing")
 

@@ -47,7 +47,7 @@ def moments(tables: dict[str, np.ndarray], row: int) -> tuple[float, np.ndarray,
     return mass, tables["means"][row], turn @ np.diag(scales**2) @ turn.T
 
 
-def test_a_pair_becomes_the_moments_of_its_mixture(rng):
+def test_merged_pair_has_the_moments_of_its_mixture(rng):
     tables = wide(model(rng, 40))
     first, second = np.arange(0, 40, 2), np.arange(1, 40, 2)
     found = merge(tables, first, second, surface)
@@ -78,7 +78,7 @@ def test_a_mixture_is_symmetric_in_its_pair(rng, size):
 
 
 @pytest.mark.parametrize("count", [2, 3, 64, 257])
-def test_mass_and_mean_are_kept(rng, count):
+def test_mass_and_mean_are_preserved(rng, count):
     source = model(rng, count)
     found = decimate(source)
     assert len(found) == (count + 1) // 2
@@ -91,11 +91,11 @@ def test_mass_and_mean_are_kept(rng, count):
         assert getattr(found, name).dtype == np.float32
 
 
-def test_a_share_is_met_in_several_rounds(rng):
+def test_target_fraction_is_reached_in_several_rounds(rng):
     assert [len(decimate(model(rng, 100), keep)) for keep in (1, 0.7, 0.25, 0.001)] == [100, 70, 25, 1]
 
 
-def test_none_and_one_stay(rng):
+def test_zero_and_one_gaussian_do_not_change(rng):
     for count in (0, 1):
         source = model(rng, count)
         found = decimate(source)
@@ -114,7 +114,7 @@ def test_same_model_gives_same_bytes_in_any_row_order(rng):
         np.testing.assert_allclose(*tables, rtol=1e-4, atol=1e-5)
 
 
-def test_duplicates_in_one_place_become_one(rng):
+def test_coincident_duplicates_merge(rng):
     """More of them than there are neighbors."""
     one = model(rng, 1)
     found = decimate(one[np.zeros(51, int)])
@@ -125,7 +125,7 @@ def test_duplicates_in_one_place_become_one(rng):
     assert alone.sum() == 1, "25 pairs, and the odd one"
 
 
-def test_thousands_in_one_place_are_no_more_work_than_others(rng):
+def test_coincident_gaussians_need_no_extra_work(rng):
     """A round pairs them all: a tree of places alone, or of rows, takes quadratic time here."""
     one = model(rng, 1, degree=0)
     rows = [len(pairs) for pairs in match_pairs(wide(one[np.zeros(30_000, int)]))]
@@ -147,7 +147,7 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
     assert rows == [300, 300]
 
 
-def test_the_cheapest_pair_goes_first_and_none_is_in_two():
+def test_cheapest_pair_merges_first_and_pairs_are_disjoint():
     """Three in a row, and two far from them that are equal."""
     x = np.array([0, 0.1, 0.35, 9, 9], np.float32)
     tables = {
@@ -162,7 +162,7 @@ def test_the_cheapest_pair_goes_first_and_none_is_in_two():
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(3, 4), (0, 1)]
 
 
-def test_color_keeps_neighbors_apart():
+def test_neighbors_of_different_color_do_not_merge():
     tables = {
         "means": np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0]]),
         "quats": np.tile([1.0, 0, 0, 0], (3, 1)),
@@ -174,7 +174,7 @@ def test_color_keeps_neighbors_apart():
     assert [rows.tolist() for rows in match_pairs(tables)] == [[1], [2]]
 
 
-def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
+def test_extreme_values_and_zero_quaternions_merge_finitely(rng):
     source = model(rng, 24)
     source.log_scales[:6] = (-80, -80, 3)
     source.log_scales[6:9] = 60
@@ -186,7 +186,7 @@ def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
     assert all(np.isfinite(table).all() for table in found.tables().values())
 
 
-def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
+def test_mip_model_keeps_its_settings_and_bakes_a_world_filter(rng):
     source = model(rng, 10, mode="mip")
     filtered = Model(**source.tables(), filter_variance=np.full((10, 1), 0.1), rendering=source.rendering)
     found = decimate(filtered)
@@ -195,7 +195,7 @@ def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
     np.testing.assert_array_equal(found.means, decimate(filtered.baked()).means)
 
 
-def test_what_cannot_be_merged_is_refused(rng):
+def test_unmergeable_model_is_refused(rng):
     source = model(rng, 5)
     for keep in (0, -1, 1.5, float("nan")):
         with pytest.raises(ConfigError, match="expected a fraction"):

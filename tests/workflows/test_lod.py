@@ -53,20 +53,20 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
     assert first["psnr"] == first["merged_psnr"] == evaluate(few_steps)["test"]["1"]["psnr"]
 
 
-def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
+def test_numbers_are_formatted_as_in_other_commands(monkeypatch, caplog):
     caplog.set_level("INFO")
     monkeypatch.setattr(lod, "decimate", lambda model, keep: range(1200))
     lod._levels(range(2400), LodPlan(levels=2), None)
     assert "level 1: 1,200 Gaussians" in caplog.text
 
 
-def test_each_level_is_merged_from_the_trained_one_before(trained):
+def test_each_level_is_merged_from_the_previous_trained_one(trained):
     training = trained[0].with_name("site.training")
     expected = decimate(clsplat.load(training / "level_1" / "point_cloud.ply"))
     np.testing.assert_array_equal(clsplat.load(training / "level_2.ply").means, expected.means)
 
 
-def test_sizes_are_those_of_the_files(trained):
+def test_sizes_match_the_files(trained):
     folder, found = trained
     assert found["bytes"] == model_bytes(folder) == sum(map(len, tree(folder).values()))
     meta = (folder / "lod-meta.json").stat().st_size
@@ -88,7 +88,7 @@ def test_the_written_level_0_is_a_model(trained, few_steps, tiny_scene):
     assert psnr == pytest.approx(found["levels"][0]["psnr"], abs=1)
 
 
-def test_a_file_alone_is_merged_without_a_device(few_steps, tmp_path, monkeypatch):
+def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch):
     def opens(device):
         raise AssertionError("a device is opened")
 
@@ -111,7 +111,7 @@ def alone(few_steps: Path, tmp_path: Path) -> Path:
     return file
 
 
-def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
+def test_merging_without_training_is_reported(alone, tmp_path):
     found = CliRunner().invoke(app, ["lod", str(alone), str(tmp_path / "site"), "--steps", "0"])
     assert found.exit_code == 0, found.output
     assert "model.ply: no photos: levels are merged without training" in found.output
@@ -144,14 +144,14 @@ def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog
     assert "levels are merged without training and not measured" in caplog.text
 
 
-def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
+def test_device_is_refused_if_the_photographs_have_moved(moved, tmp_path):
     message = r"run: its photos cannot be read, which --device needs; give --scene, or leave --device out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
+def test_missing_photographs_are_refused_with_a_remedy(moved, tmp_path):
     with pytest.raises(
         DataError, match=r"gone, is missing; .* \(give --scene DIR, or --steps 0 to merge without photos\)$"
     ):
@@ -159,7 +159,7 @@ def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_damaged_model_is_told_as_such(few_steps, tmp_path):
+def test_damaged_model_is_reported(few_steps, tmp_path):
     shutil.copytree(few_steps, tmp_path / "run")
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"")
     with pytest.raises(DataError, match=r"point_cloud\.ply: .*[^)]$"):
@@ -183,7 +183,7 @@ def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_what_a_killed_process_left_is_removed(alone, tmp_path):
+def test_leftovers_of_a_killed_process_are_removed(alone, tmp_path):
     for name in (f".site.{NO_PROCESS}-0.partial", f".other.{NO_PROCESS}-0.partial"):
         (tmp_path / name / "0_0").mkdir(parents=True)
     clsplat.write_levels(alone, tmp_path / "site", levels=2)
@@ -195,7 +195,7 @@ def interrupted(pipeline, run, run_stages=runner.run_stages):
     run_stages(pipeline, run)
 
 
-def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch, trained):
+def test_interrupted_training_resumes(few_steps, tmp_path, monkeypatch, trained):
     run_stages = runner.run_stages
     monkeypatch.setattr(runner, "run_stages", interrupted)
     with pytest.raises(Interrupted, match=r"^stopped in level_1; run the same command again to resume$"):
@@ -208,7 +208,7 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
     assert tree(tmp_path / "site") == tree(trained[0])
 
 
-def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path, monkeypatch):
+def test_training_does_not_resume_with_other_photographs(few_steps, tiny_scene, tmp_path, monkeypatch):
     shutil.copytree(tiny_scene, tmp_path / "scene")
     ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": STEPS}
     monkeypatch.setattr(runner, "run_stages", interrupted)
@@ -220,18 +220,18 @@ def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene,
         clsplat.write_levels(few_steps, **ask)
 
 
-def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):
+def test_folder_of_levels_is_a_model(trained, tiny_scene, tmp_path):
     """With a scene of its own, as any model file."""
     found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
     assert found["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
 
 
-def test_photographs_are_as_small_as_is_asked(few_steps, tmp_path):
+def test_photographs_have_the_requested_size(few_steps, tmp_path):
     clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=STEPS, downscale=2)
     assert "20x20 px" in (tmp_path / "site.training" / "level_1" / "log.txt").read_text()
 
 
-def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
+def test_zero_steps_only_measure_the_levels(few_steps, tmp_path):
     found = clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=0)
     assert found["levels"][1]["psnr"] == found["levels"][1]["merged_psnr"]
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
@@ -250,7 +250,7 @@ def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
         ({"downscale": 2.0, "steps": 0}, "--downscale 2: needs training; set --steps above 0"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(plan, message):
+def test_invalid_plan_is_refused(plan, message):
     with pytest.raises(ConfigError, match=message):
         LodPlan(**plan)
 
@@ -264,7 +264,7 @@ def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
         clsplat.write_levels(few_steps, tmp_path)
 
 
-def test_the_command_prints_a_table_and_advises_one_file_for_few(few_steps, tmp_path):
+def test_command_prints_a_table_and_suggests_one_file_for_few(few_steps, tmp_path):
     arguments = ["lod", str(few_steps), str(tmp_path / "site"), "--levels", "2", "--steps", str(STEPS)]
     found = CliRunner().invoke(app, arguments)
     assert found.exit_code == 0, found.output
