@@ -8,8 +8,8 @@ are wrong.
 import logging
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -20,6 +20,7 @@ from clsplat.core.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
 from clsplat.scene.images import read_image
+from clsplat.scene.lookup import FileLookup
 from clsplat.scene.scene import Tracks
 
 LOG = logging.getLogger("clsplat")
@@ -32,27 +33,30 @@ TINY = 1e-12  # scene units⁻¹, if all points have the same depth
 MAX_RESIDUAL = 0.5  # of the points' spread; a map that leaves more does not fit
 
 
+def _png_names(name: str) -> list[str]:
+    return [str(PurePosixPath(name).with_suffix(".png"))]
+
+
 @dataclass(frozen=True)
 class DepthMaps:
     """A folder of maps: `a.png`, of 8 or 16 bits and any size, for the photograph a.jpg; deeper ones likewise."""
 
     folder: Path
+    _files: dict[str, Path] = field(default_factory=dict, compare=False)
 
     def require(self, names: Iterable[str]) -> None:
         """Raise DataError if a photograph has no map."""
-        for name in names:
-            if not self._file(name).is_file():
-                raise DataError(
-                    f"{self._file(name)}: the depth map of {name} is missing; add it, or --set another folder"
-                )
-
-    def _file(self, name: str) -> Path:
-        return (self.folder / name).with_suffix(".png")
+        new = [name for name in names if name not in self._files]
+        files = FileLookup(self.folder, self.folder, new, _png_names, strict=True)
+        for name, file in zip(new, files.paths, strict=True):
+            if not file.is_file():
+                raise DataError(f"{file}: the depth map of {name} is missing; add it, or --set another folder")
+        self._files.update(zip(new, files.paths, strict=True))
 
     def read(self, name: str, width: int, height: int) -> Floats:
         """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError without one."""
         self.require([name])
-        pixels = read_image(self._file(name))[:, :, 0]
+        pixels = read_image(self._files[name])[:, :, 0]
         values: NDArray[Any] = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
         if values.shape != (height, width):
             values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)

@@ -133,8 +133,9 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         reader.missing = split.missing
         return split.applied(replace(reader.read(folder, split.of_reader), path=path))
     if any(is_image(file) for file in path.iterdir()):
-        raise DataError(
-            f"{path}: photographs without cameras; `clsplat run photos --scene {shell_quote(path)}` finds the cameras"
-        )
+        above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
+        remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
+        remedy = f"the cameras are in {above}: give that folder" if above else remedy
+        raise DataError(f"{path}: photographs without cameras; {remedy}")
     known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {known}")

@@ -99,7 +99,7 @@ class DecodedSizes:
         self._new: dict[str, Size] = {}
         self.path: Path | None = None
         with suppress(DataError, OutputError):
-            self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}.txt"
+            self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-as-stored.txt"
             lines = read_file(self.path, limit=MAX_REMEMBERED).splitlines(keepends=True)
             self._known = dict(filter(None, map(_entry, lines)))
 

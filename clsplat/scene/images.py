@@ -222,15 +222,35 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
         raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
+    if (level := _transparent_gray(data)) is not None and pixels.shape[2] == 1:
+        return np.dstack([pixels] * 3 + [np.where(pixels == level, 0, np.iinfo(pixels.dtype).max).astype(pixels.dtype)])
     if pixels.shape[2] == 1:
         return np.repeat(pixels, 3, axis=2)
     return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])  # OpenCV decodes to BGR
+
+
+def _transparent_gray(data: bytes) -> int | None:
+    """Return the gray level that a PNG declares transparent, which OpenCV drops; None for other files."""
+    if data[:8] != PNG or len(data) < 26 or data[25] != 0:
+        return None
+    at = data.find(b"\0\0\0\2tRNS", 33, data.find(b"IDAT"))
+    largest = (1 << data[24]) - 1
+    level = struct.unpack_from(">H", data, at + 8)[0] & largest if at > 0 else None
+    return None if level is None else level * max(1, 255 // largest)
+
+
+def _without_rotation(data: bytes) -> bytes:
+    """Return a TIFF without its orientation, by which OpenCV always rotates; other files unchanged."""
+    at = find_orientation(data) if data[:4] in (b"II*\0", b"MM\0*") else None
+    return data if at is None else data[:at] + (b"\1\0" if data[:1] == b"I" else b"\0\1") + data[at + 2 :]
 
 
 def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     if is_truncated(data):  # some versions of OpenCV fill the rest with gray
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
+    if flags & cv2.IMREAD_IGNORE_ORIENTATION:
+        data = _without_rotation(data)
     try:  # not cv2.imread: that needs ASCII paths on Windows
         pixels = cv2.imdecode(np.frombuffer(strip_png_metadata(data), np.uint8), flags)
     except ValueError as error:

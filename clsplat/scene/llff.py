@@ -69,9 +69,9 @@ def read_poses(path: Path) -> NDArray[np.float64]:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the images by name: of `images`, otherwise the largest `images_N`, otherwise the folder itself."""
+    """Return the images by name: of `images`, `input`, the largest `images_N`, or otherwise the folder itself."""
     smaller = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
-    for folder in (path / "images", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
+    for folder in (path / "images", path / "input", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
         files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
         if files:
             return files

@@ -219,7 +219,7 @@ class FileLookup:
         if not lost:
             return exists
         is_refused = missing == "refuse" or len(lost) == len(exists)
-        hint = self.hint(lost)
+        hint = self.hint
         if is_refused and (outside := next((i for i in lost if not _is_safe(self.given[i])), None)) is not None:
             place = sources[outside] if sources else where
             more = f"; {len(lost)} of {len(exists)} image files are missing" if len(lost) > 1 else ""
@@ -234,8 +234,12 @@ class FileLookup:
         logger.warning("%s; the scene is read without them", fault)
         return exists
 
-    def hint(self, lost: Sequence[int]) -> str:
-        """Return what is there instead of missing files: in brackets, with a space before them."""
+    @cached_property
+    def hint(self) -> str:
+        """What is there instead of the first missing file, in brackets with a space before them; "" if all exist."""
+        lost = [i for i, path in enumerate(self.paths) if not os.path.exists(path)]
+        if not lost:
+            return ""
         if (several := next((i for i in lost if i in self.choices), None)) is not None:
             choices = ["/".join(parts) for parts in self.choices[several]]
             return f" ({first_few(choices)} fit {quote(self.given[several])} equally well)"

@@ -37,6 +37,7 @@ class Parts:
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
+    hint: str = ""  # what is there instead of missing files
     notes: list[str] = field(default_factory=list)  # about files that are not where the dataset says
     scene: Scene | None = None
     refusal: str = ""
@@ -54,6 +55,7 @@ class Parts:
         """Add files that the dataset names, with a note on how they were matched."""
         self.expected += files.paths
         self.notes += [files.note] if files.note else []
+        self.hint = files.hint
         if not all(path.is_relative_to(files.folder) for path in files.paths):
             self.image_folder = None
 

@@ -220,7 +220,8 @@ def other_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
     """Return the indices below `count` that are not in `test`.  Raises DataError when there are none."""
     if train := tuple(i for i in range(count) if i not in test):
         return train
-    raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
+    remedy = "raise scene.holdout or add images" if count > 1 else "set scene.holdout=0 to train on it"
+    raise DataError(f"{path}: {'every' if count > 1 else 'the only'} image is held out for testing; {remedy}")
 
 
 def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:

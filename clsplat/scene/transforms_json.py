@@ -4,6 +4,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -30,6 +31,7 @@ LENSES = {  # the parameters of each camera_model, in COLMAP's order
 }
 COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
 MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; they take some 15 s
+MIN_SCALE = 1e-6  # of the rotation in a pose
 MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
@@ -49,6 +51,9 @@ class JsonFrame:
         value = self.value(key)
         if value is None:
             return None
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = float(value)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(f"{self.where}: {key} is {quote(value)}; expected {BELOW_MAX}: export the file again")
         return float(value)
@@ -232,6 +237,9 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
 def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
     """Return a focal length in pixels, given as such or as the angle (rad) that `pixels` span."""
     length, angle = frame.number(length_key), frame.number(angle_key)
+    degrees = frame.number(f"{angle_key[-1]}_fov")  # of instant-ngp
+    if angle is None and degrees is not None:
+        angle_key, angle = f"{angle_key[-1]}_fov", math.radians(degrees)
     if length is not None or angle is None:
         return length
     if not 0 < angle < math.pi:
@@ -263,6 +271,8 @@ def camera_to_world_of(frame: JsonFrame) -> Floats:
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     finite = (np.abs(matrix) < MAX_VALUE).all()
+    if matrix.shape in ((4, 4), (3, 4)) and finite and not _is_rotation(matrix[:3, :3]):
+        matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
     if matrix.shape not in ((4, 4), (3, 4)) or not finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
             f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "

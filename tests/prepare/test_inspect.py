@@ -124,7 +124,9 @@ def test_a_missing_image(scene):
     (scene / "images" / "03.png").unlink()
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
-    assert "1 of 24 registered images are missing on disk (images/03.png): restore" in said(inspection, "error")
+    assert "1 of 24 registered images are missing on disk (images/03.png) (searched: images): restore" in said(
+        inspection, "error"
+    )
     assert inspection.verdict.startswith("cannot train: 1 of 24 registered images")
     assert inspection.facts.train is None
     assert inspection.facts.points.in_two == 1.0  # the rest is inspected all the same

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from clsplat.core.errors import OutputError
 from clsplat.scene.camera import Camera
-from clsplat.scene.images import image_size, write_image
+from clsplat.scene.images import image_size, read_image, write_image
 from clsplat.scene.lookup import require_files
 from clsplat.scene.view import View, load_image
 from tests.support.data_sets import data_set
@@ -98,6 +98,21 @@ def test_exif_rotation_is_ignored(tmp_path: Path) -> None:
     path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
     assert cv2.imread(str(path)).shape == (16, 8, 3)  # the tag is understood
     assert load_image(view_of(path, 16, 8)).shape == (8, 16, 3)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_orientation_of_a_tiff_is_ignored_too(tmp_path: Path, order: str) -> None:
+    pixels = random(8, 16, 3)
+    entries = [(256, 3, 16), (257, 3, 8), (258, 3, 8), (259, 3, 1), (262, 3, 2), (273, 4, 122), (0x0112, 3, 6)]
+    entries += [(277, 3, 3), (279, 4, pixels.size)]
+    rows = [
+        struct.pack(f"{order}HHI{'HH' if kind == 3 else 'I'}", tag, kind, 1, *((value, 0) if kind == 3 else (value,)))
+        for tag, kind, value in sorted(entries)
+    ]
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(rows))
+    (tmp_path / "a.tif").write_bytes(head + b"".join(rows) + bytes(4) + pixels.tobytes())
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), pixels)
+    assert read_image(tmp_path / "a.tif", upright=True).shape == (16, 8, 3)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no image", "cut"])

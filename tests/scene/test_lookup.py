@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from clsplat.photos.depths import DepthMaps
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene.detect import is_scene, read_scene
 from clsplat.scene.view import load_image
@@ -91,7 +92,7 @@ REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is s
     "two names": (JSON, ["l/a.jpg", "r/a.jpg"], ["images/a.jpg"], "2 of 2 image files are missing"),
     "another camera": ("colmap", ["l/a.jpg", "r/a.jpg"], ["images/l/a.jpg", "x/a.jpg"], "1 of 2 image files are miss"),
     "a mask": (JSON, ["images/a.jpg"], ["masks/a.jpg"], "1 of 1 image files are missing"),
-    "a typing error": (JSON, ["images/IMG_01.jpg"], ["images/IMG_1.jpg"], "nearest file is images/IMG_1.jpg, searched"),
+    "a letter less": (JSON, ["images/IMG_01.jpg"], ["images/IMG_1.jpg"], "nearest file is images/IMG_1.jpg, searched"),
     "nothing": (JSON, ["images/a.jpg"], [], "no images in that folder"),
     "outside": (JSON, ["../other/a.jpg"], ["../other/a.jpg"], "'../other/a.jpg' is not a path below"),
     "an absolute path": ("colmap", ["/x/a.jpg"], ["images/b.jpg"], "/x/a.jpg' is not a path below"),
@@ -105,7 +106,8 @@ def test_a_photograph_is_refused(tmp_path: Path, case: str) -> None:
     assert text in refusal(read_scene, scene)
     inspection = Inspection.from_folder(scene)
     (error,) = [finding.text for finding in inspection.findings if finding.level == "error"]
-    assert "of the registered images" in error or "missing" in error
+    assert "registered images are missing on disk" in error
+    assert "skip" in error or len(names) == 1 or "2 of 2" in error
     assert not inspection.trainable
 
 
@@ -224,3 +226,24 @@ def test_photographs_of_several_sizes_need_no_sizes_in_the_file(tmp_path: Path) 
     (scene / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": table["frames"]}))
     assert [(view.camera.width, view.camera.height) for view in read_scene(scene).views] == [(64, 48), (48, 64)]
     assert Inspection.from_folder(scene).trainable
+
+
+def test_the_only_photograph_is_trained_on_without_holdout(tmp_path: Path) -> None:
+    scene = made(tmp_path, JSON, ["a.jpg"], ["a.jpg"])
+    assert "the only image is held out for testing; set scene.holdout=0 to train on it" in refusal(read_scene, scene)
+    assert len(read_scene(scene, 0).train) == 1
+
+
+def test_the_folder_above_is_named_where_it_has_the_cameras(tmp_path: Path) -> None:
+    scene = made(tmp_path, "colmap", ["a.jpg"], ["images/a.jpg"])
+    assert f"the cameras are in {scene}: give that folder" in refusal(read_scene, scene / "images")
+
+
+def test_depth_maps_are_found(tmp_path: Path) -> None:
+    photograph(made(tmp_path, JSON, [], []) / "A.PNG")
+    (tmp_path / "x").mkdir()
+    photograph(tmp_path / "x" / "b.tif")
+    maps = DepthMaps(tmp_path)
+    maps.require(["images/a.jpg", "x/b.jpg"])
+    assert maps.read("x/b.jpg", 64, 48).shape == (48, 64)
+    assert "the depth map of c.jpg is missing" in refusal(maps.require, ["c.jpg"])

@@ -56,6 +56,21 @@ def test_metadata_changes_no_pixel_and_prints_nothing(kind, what, wrong, tmp_pat
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(
+    ("bits", "level", "row", "expected"),
+    [
+        (8, 7, b"\0\x07\xc8", [(0, 255), (7, 0), (200, 255)]),
+        (2, 1, b"\x18", [(0, 255), (85, 0), (170, 255)]),
+        (16, 7, b"\0\x07\x07\0\0\0", [(7, 0), (1792, 65535), (0, 65535)]),
+    ],
+)
+def test_the_transparent_level_of_a_gray_photograph_is_kept(tmp_path, bits, level, row, expected):
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 1, bits, 0, 0, 0, 0))
+    pixels = chunk(b"tRNS", struct.pack(">H", level)) + chunk(b"IDAT", zlib.compress(b"\0" + row))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))
+    assert read_image(tmp_path / "a.png")[0, :, [0, 3]].T.tolist() == [list(pair) for pair in expected]
+
+
 def test_pixels_do_not_depend_on_truncated_metadata():
     data = with_chunk(encoded(KINDS["color"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
     whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, strip_png_metadata(data)))

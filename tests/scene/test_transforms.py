@@ -95,6 +95,8 @@ def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
     [
         (LENS, Camera(64, 48, 50, 51.5, 30.5, 25)),
         ({"fl_x": 50, "w": 64, "h": 48}, Camera(64, 48, 50, 50, 32, 24)),
+        ({"fl_x": "50", "w": "64", "h": "48.0"}, Camera(64, 48, 50, 50, 32, 24)),
+        ({"x_fov": 90}, Camera(64, 48, 32, 32, 32, 24)),
         ({"fl_x": 50, "camera_angle_x": 1, "cx": 0}, Camera(64, 48, 50, 50, 0, 24)),
         ({"camera_angle_x": math.pi / 2}, Camera(64, 48, 32, 32, 32, 24)),
         ({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 2}, Camera(64, 48, 32, 24, 32, 24)),
@@ -118,6 +120,12 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
         assert ours == pytest.approx(theirs)
 
 
+def test_the_scale_of_a_rotation_is_ignored(tmp_path: Path) -> None:
+    scaled = [[*(2.5 * value for value in row[:3]), str(row[3])] for row in POSE[:3]]
+    view, _ = read_scene(write(tmp_path, **LENS, frames=frames("a.png", "b.png", transform_matrix=scaled))).views
+    np.testing.assert_allclose(view.world_to_camera @ (2, 4, 1, 1), (1, -2, 4))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -126,7 +134,7 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
         ({"camera_model": "OPENCV_FISHEYE", "p2": 0.1}, "p2"),
         ({"is_fisheye": True, "k6": 1.0}, "camera_model"),
         ({"fl_x": 0}, "0.0, 51.5"),
-        ({"fl_x": "50"}, "'50'"),
+        ({"fl_x": "fifty"}, "'fifty'"),
         ({"fl_x": math.nan}, "nan"),
         ({"fl_x": None, "fl_y": None}, "None"),
         ({"fl_x": None, "camera_angle_x": 4}, "camera_angle_x is 4"),
@@ -139,7 +147,7 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
         ({"transform_matrix": [[1, 0, 0, math.nan], *POSE[1:]]}, "transform_matrix"),
         ({"transform_matrix": [[10**400, 0, 0, 1], *POSE[1:]]}, "transform_matrix"),
         ({"transform_matrix": [[-1, 0, 0, 1], *POSE[1:]]}, "transform_matrix"),  # a mirror
-        ({"transform_matrix": [[2, 0, 0, 1], [0, 2, 0, 1], [0, 0, 2, 1], POSE[3]]}, "transform_matrix"),  # a scale
+        ({"transform_matrix": [[2, 0, 0, 1], [0, 2, 0, 1], [0, 0, 1, 1], POSE[3]]}, "transform_matrix"),  # two scales
         ({"transform_matrix": [[0] * 4] * 4}, "transform_matrix"),
         ({"file_path": None}, "file_path"),
         ({"file_path": 3}, "file_path"),

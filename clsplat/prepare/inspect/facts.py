@@ -261,6 +261,7 @@ class Facts:
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
+    hint: str  # what is there instead of missing files
     notes: list[str]  # sentences about files that are not where the dataset says
     faults: list[str]  # why parts of it cannot be read
     refusal: str  # why training does not start
@@ -307,6 +308,7 @@ def measure_dataset(parts: Parts) -> Facts:
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,
+        hint=parts.hint,
         notes=parts.notes,
         faults=parts.faults,
         refusal=parts.refusal,

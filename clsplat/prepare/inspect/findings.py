@@ -100,8 +100,8 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
-        remedy = "restore the files, or skip them with --set scene.missing=skip"
-        yield Finding("error", f"{fault} ({_listed(facts.missing)})", remedy)
+        skip = ", or skip them with --set scene.missing=skip" if len(facts.missing) < facts.registered else ""
+        yield Finding("error", f"{fault} ({_listed(facts.missing)}){facts.hint}", f"restore the files{skip}")
     if photographs.unreadable:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
         fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
