@@ -189,7 +189,7 @@ def forgets_released_buffers(info: DeviceInfo) -> bool:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def held_buffers() -> Iterator[None]:
+def keep_buffers() -> Iterator[None]:
     """Keep every buffer to the end where addresses must not be used twice."""
     allocate, held = Device.empty, []
 
@@ -205,7 +205,7 @@ def held_buffers() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def built_once() -> Iterator[None]:
+def share_contexts() -> Iterator[None]:
     """Every device of a session has one context, with programs that are built once: opening one more costs little."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(opencl_device, "create_context", functools.cache(opencl_device.create_context))
@@ -214,7 +214,7 @@ def built_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def parsed_once() -> Iterator[None]:
+def cache_parsed_yaml() -> Iterator[None]:
     """Texts of YAML are parsed, and plain data become text, once: tests read the shipped pipelines again and again."""
     parse, texts, write = functools.lru_cache(512)(yaml_file._parse), dict[str, str](), yaml_file.yaml_text
 
@@ -233,7 +233,7 @@ def parsed_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_wait_for_the_disk() -> Iterator[None]:
+def skip_fsync() -> Iterator[None]:
     """No test pulls the plug: what is written need not reach the disk. Processes that tests start do wait."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", os.fstat)

@@ -47,7 +47,7 @@ def damaged_photograph(scene: Path, folder: Path) -> list[str]:
     return []
 
 
-def folder_in_the_way(scene: Path, folder: Path) -> list[str]:
+def block_with_folder(scene: Path, folder: Path) -> list[str]:
     (folder / "run" / "metrics.jsonl").mkdir()
     return []
 
@@ -60,7 +60,7 @@ CAUSES: dict[str, tuple[int, str | Callable[[Path, Path], list[str]], str, str |
     "a damaged photograph": (3, damaged_photograph, "", "failed"),
     "no such device": (4, "--device nowhere", "no device matches 'nowhere'", "failed"),
     "values that are not finite": (6, "--set optimize.rates.sh_base=1e38", "not finite", "failed"),
-    "an output that cannot be written": (7, folder_in_the_way, "metrics.jsonl: cannot be written", "failed"),
+    "an output that cannot be written": (7, block_with_folder, "metrics.jsonl: cannot be written", "failed"),
 }
 
 

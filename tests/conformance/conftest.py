@@ -14,7 +14,7 @@ _results: dict[bytes, bytes] = {}
 
 
 @pytest.fixture(scope="module")
-def reference_once() -> Iterator[None]:
+def cache_references() -> Iterator[None]:
     """Compute the reference of a scene once for all settings and faults: it depends on its arguments only."""
     with pytest.MonkeyPatch.context() as patch:
         for name in DEAR:

@@ -31,7 +31,7 @@ def cases() -> list[Any]:
     ]
 
 
-@pytest.mark.usefixtures("reference_once")
+@pytest.mark.usefixtures("cache_references")
 @pytest.mark.parametrize(("device", "check"), cases(), indirect=["device"])
 def test_a_check_passes(device, check):
     found = list(check.deviations(device))

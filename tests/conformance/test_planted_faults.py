@@ -13,7 +13,7 @@ from clsplat.opencl.device import Device, parse_kernels
 from clsplat.opencl.discovery import choose
 from tests.support.devices import NAMES
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("reference_once")]  # most programs are built anew
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache_references")]  # most programs are built anew
 
 FAULTS = {  # kernel -> file, text, wrong text
     "adam_step": ("adam.h", "EPSILON 1.0e-15f", "EPSILON 1.0e-5f"),

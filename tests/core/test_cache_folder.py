@@ -44,7 +44,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def own(machine: Path) -> Path:
+def user_folder(machine: Path) -> Path:
     """The user's folder below the temporary one."""
     return machine / "tmp" / f"clsplat-{os.getuid()}"
 
@@ -65,33 +65,33 @@ def put_file(machine: Path, place: str) -> None:
 
 @linux
 @pytest.mark.parametrize("place", ["home", "home/.cache", "home/.cache/pocl", "home/.cache/pytools"])
-def test_caches_move_if_home_or_library_cache_is_read_only(machine, own, place, caplog):
+def test_caches_move_if_home_or_library_cache_is_read_only(machine, user_folder, place, caplog):
     put_file(machine, place)
-    assert cache_folder() == own / "clsplat"
-    assert os.environ["XDG_CACHE_HOME"] == str(own)
-    assert platformdirs.user_cache_dir("pyopencl", "pyopencl") == str(own / "pyopencl")
-    assert stat.S_IMODE(own.stat().st_mode) == 0o700
+    assert cache_folder() == user_folder / "clsplat"
+    assert os.environ["XDG_CACHE_HOME"] == str(user_folder)
+    assert platformdirs.user_cache_dir("pyopencl", "pyopencl") == str(user_folder / "pyopencl")
+    assert stat.S_IMODE(user_folder.stat().st_mode) == 0o700
     cache_folder()
     (record,) = caplog.records  # once
     assert record.levelno == logging.WARNING
     assert str(machine / place) in record.getMessage()
-    assert f"caches are in {own} instead" in record.getMessage()
+    assert f"caches are in {user_folder} instead" in record.getMessage()
 
 
 @linux
-def test_caches_move_if_the_user_has_no_home(machine, own, monkeypatch, caplog):
+def test_caches_move_if_the_user_has_no_home(machine, user_folder, monkeypatch, caplog):
     monkeypatch.delenv("HOME")
     monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
-    assert cache_folder() == own / "clsplat"
+    assert cache_folder() == user_folder / "clsplat"
     assert "there is no home folder" in caplog.text
 
 
 @linux
-def test_caches_move_if_the_pocl_folder_is_read_only(machine, own, monkeypatch):
+def test_caches_move_if_the_pocl_folder_is_read_only(machine, user_folder, monkeypatch):
     put_file(machine, "kernels")
     monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
     cache_folder()
-    assert os.environ["POCL_CACHE_DIR"] == str(own / "pocl")
+    assert os.environ["POCL_CACHE_DIR"] == str(user_folder / "pocl")
 
 
 @linux
@@ -103,20 +103,20 @@ def test_writable_pocl_folder_stays(machine, monkeypatch):
 
 @linux
 @pytest.mark.parametrize("trap", ["open to all", "a link", "a file", "dangling"])
-def test_world_writable_temporary_folder_is_not_used(machine, own, trap):
+def test_world_writable_temporary_folder_is_not_used(machine, user_folder, trap):
     put_file(machine, "home")
     if trap == "open to all":
-        own.mkdir()
-        own.chmod(0o777)
+        user_folder.mkdir()
+        user_folder.chmod(0o777)
     elif trap == "a file":
-        own.write_text("")
+        user_folder.write_text("")
     else:
         target = machine / "elsewhere"
         if trap == "a link":
             target.mkdir(mode=0o700)
-        own.symlink_to(target)
+        user_folder.symlink_to(target)
     folder = cache_folder()
-    assert own not in folder.parents
+    assert user_folder not in folder.parents
     assert folder.parents[1] == machine / "tmp"
     assert stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
 

@@ -30,7 +30,7 @@ def bounded() -> Iterator[None]:
         yield
 
 
-def a_socket(path: Path) -> None:
+def make_socket(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as made:
         made.bind(str(path))
 
@@ -38,7 +38,7 @@ def a_socket(path: Path) -> None:
 NOT_FILES: dict[str, Callable[[Path], object]] = {
     "a pipe": lambda path: os.mkfifo(path),  # which not every system has
     "a folder": Path.mkdir,
-    "a socket": a_socket,
+    "a socket": make_socket,
     "a device": lambda path: path.symlink_to("/dev/zero"),
 }
 READERS: dict[str, Callable[[Path], object]] = {

@@ -41,7 +41,7 @@ def loaded(tmp_path: Path):
 
 
 @pytest.fixture
-def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def forget_variants(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget afterwards the variants that a test defines."""
     load("smoke")  # the first pipeline of a process makes all variants known that there are
     with monkeypatch.context() as patch:
@@ -61,7 +61,7 @@ def test_variants_are_the_subclasses_with_a_name():
     assert {"densify", "evaluate", "checkpoint"} <= variants(Scheduled).keys() < variants(Stage).keys()
 
 
-@pytest.mark.usefixtures("own")
+@pytest.mark.usefixtures("forget_variants")
 def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
     class Thin(Rule):
         """Remove every n-th Gaussian."""
@@ -81,7 +81,7 @@ def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
     assert "Thin" in json_schema()["$defs"]
 
 
-@pytest.mark.usefixtures("own")
+@pytest.mark.usefixtures("forget_variants")
 def test_nested_variants_are_known_in_any_definition_order(tmp_path):
     class Apply(Stage):
         """Apply a rule."""
@@ -106,7 +106,7 @@ def test_nested_variants_are_known_in_any_definition_order(tmp_path):
     assert load(str(tmp_path / "apply.yaml")).stages == [Apply(rule=Thin())]
 
 
-@pytest.mark.usefixtures("own")
+@pytest.mark.usefixtures("forget_variants")
 def test_two_variants_of_one_name_are_refused():
     class Other(Order):
         type: Literal["shuffle"] = "shuffle"

@@ -27,7 +27,7 @@ def test_empty_box_is_refused(high):
         Box(low=[None, 0.0, None], high=[None, high, None])
 
 
-def grown(out) -> int:
+def count_growth(out) -> int:
     return sum(
         json.loads(line)["grown"].get("clone", 0)
         for line in (out / "metrics.jsonl").read_text().splitlines()
@@ -52,7 +52,7 @@ def test_only_gaussians_inside_grow(tiny_scene, tmp_path):
     means = {name: read(tmp_path / name / "point_cloud.ply").parameters["means"][:, 0] for name in ("none", "half")}
     assert (means["half"] < 0).sum() == (means["none"] < 0).sum()
     assert (means["half"] >= 0).sum() > (means["none"] >= 0).sum()
-    assert grown(tmp_path / "whole") > grown(tmp_path / "half") > 0 == grown(tmp_path / "none")
+    assert count_growth(tmp_path / "whole") > count_growth(tmp_path / "half") > 0 == count_growth(tmp_path / "none")
 
 
 @pytest.mark.slow

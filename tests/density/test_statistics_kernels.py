@@ -117,7 +117,9 @@ def test_added_and_removed_columns_keep_their_sums(device, rng):
     assert "stats/screen_grad" not in gaussians.tables
 
 
-def made(device: Device, screen_grad: list[float], absolute: list[float], size: list[float], rules: list) -> list[int]:
+def row_counts(
+    device: Device, screen_grad: list[float], absolute: list[float], size: list[float], rules: list
+) -> list[int]:
     """Rows that each Gaussian becomes under `rules`, from means of its statistics and its size."""
     count = len(size)
     case = random_case(np.random.default_rng(1), count)
@@ -150,7 +152,7 @@ def test_absgs_splits_where_gradients_cancel(device):
         (3e-4, 5e-4, 0.002, 2),
     ]
     grad, absolute, size, rows = (list(column) for column in zip(*cases, strict=True))
-    assert made(device, grad, absolute, size, rules) == rows
+    assert row_counts(device, grad, absolute, size, rules) == rows
     rule = ref.DensityRule(split_gradient=4e-4, dense=0.001)
     oracle = ref.adc_actions(np.array(grad), np.array(size), np.full(5, 0.5), 1.0, False, rule, np.array(absolute))
     assert [1 + (action in (ref.CLONE, ref.SPLIT)) for action in oracle] == rows
@@ -163,10 +165,10 @@ def test_as_many_as_selects_the_matching_quantile(device):
     absolute = [1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3, 7e-3, 8e-3]
     clone = Clone(gradient_above=2e-4, size_below=1)
     matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)
-    assert made(device, grad, absolute, [0.1] * 8, [clone]) == [2, 2, 1, 1, 1, 1, 1, 1]
+    assert row_counts(device, grad, absolute, [0.1] * 8, [clone]) == [2, 2, 1, 1, 1, 1, 1, 1]
     limit = np.quantile(absolute, 0.75)
     assert [value >= limit for value in absolute[-3:]] == [False, True, True]
-    assert made(device, grad, absolute, [0.1] * 8, [clone, matching]) == [2, 2, 1, 1, 1, 1, 2, 2]
+    assert row_counts(device, grad, absolute, [0.1] * 8, [clone, matching]) == [2, 2, 1, 1, 1, 1, 2, 2]
 
 
 @on_one_setting
@@ -174,7 +176,7 @@ def test_as_many_as_never_selects_zero_gradients(device):
     """If so many qualify that the quantile is zero, a Gaussian without gradient still does not."""
     grad, absolute = [9e-4, 9e-4, 9e-4, 0.0], [0.0, 0.0, 0.0, 1e-3]
     matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)
-    assert made(device, grad, absolute, [0.1] * 4, [matching]) == [1, 1, 1, 2]
+    assert row_counts(device, grad, absolute, [0.1] * 4, [matching]) == [1, 1, 1, 2]
 
 
 def test_texture_under_splats(device, rng):

@@ -12,7 +12,7 @@ from clsplat.formats.gltf_usd import write_glb
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import detect, read, write
 from clsplat.gaussians.model import Model, load
-from tests.support.models import angles, assert_close, glued, interop, parts, splats, there_and_back
+from tests.support.models import angles, assert_close, interop, join_glb, round_trip, splats, split_glb
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {5121: 1, 5126: 4}
@@ -29,7 +29,7 @@ def attribute(tree, binary, name):
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (200, 0), (200, 1), (200, 2)])
 def test_glb_round_trip_is_within_its_precision(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
-    found = there_and_back(tmp_path / "a.glb", source)
+    found = round_trip(tmp_path / "a.glb", source)
     assert detect(tmp_path / "a.glb").name == "GLB"
     assert (found.mode, found.rendering) == ("mip", source.rendering)
     assert_close(found, source, 1e-3, means=0, log_scales=1e-6, opacity=1e-6, sh_base=0, sh_rest=0)
@@ -38,7 +38,7 @@ def test_glb_round_trip_is_within_its_precision(tmp_path, rng, count, degree):
 def test_glb_follows_the_specification(tmp_path, rng):
     source = splats(rng, 100, 2)
     write(tmp_path / "a.glb", source)
-    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
     assert tree["extensionsUsed"] == [KHR]
     (primitive,) = tree["meshes"][0]["primitives"]
     assert primitive["mode"] == 0
@@ -84,9 +84,9 @@ def covariances(model):
 
 def moved(tmp_path, rng, **node):
     write(tmp_path / "a.glb", splats(rng, 20))
-    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
     tree["nodes"] = [{"children": [1], "translation": [0, 1, 0]}, {"mesh": 0, **node}]
-    (tmp_path / "b.glb").write_bytes(glued(tree, binary))
+    (tmp_path / "b.glb").write_bytes(join_glb(tree, binary))
     return tmp_path / "a.glb", tmp_path / "b.glb"
 
 
@@ -126,14 +126,14 @@ def test_a_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
 
 def test_integers_and_strides_are_read(tmp_path, rng):
     write(tmp_path / "a.glb", splats(rng, 5, 0))
-    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
     rows = np.zeros((5, 8), "<i2")
     rows[:, :4] = [0, 32767, 0, -32768]
     tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": 80, "byteStride": 16})
     tree["buffers"][0]["byteLength"] += 80
     number = tree["meshes"][0]["primitives"][0]["attributes"][f"{KHR}:ROTATION"]
     tree["accessors"][number] |= {"componentType": 5122, "normalized": True, "bufferView": len(tree["bufferViews"]) - 1}
-    (tmp_path / "b.glb").write_bytes(glued(tree, binary + rows.tobytes()))
+    (tmp_path / "b.glb").write_bytes(join_glb(tree, binary + rows.tobytes()))
     np.testing.assert_array_equal(read(tmp_path / "b.glb").parameters["quats"], [[-1, 0, -1, 0]] * 5)
 
 
@@ -181,9 +181,9 @@ REFUSED = {
 def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
     changed, words = REFUSED[fault]
     write_glb(tmp_path / "a.glb", splats(rng, 4, 0), Writing())
-    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
     changed(tree)
-    (tmp_path / "a.glb").write_bytes(glued(tree, binary))
+    (tmp_path / "a.glb").write_bytes(join_glb(tree, binary))
     with pytest.raises(DataError, match=words):
         read(tmp_path / "a.glb")
 
@@ -214,10 +214,10 @@ def test_too_long_json_is_refused_with_the_limit(tmp_path, rng, monkeypatch):
 
 def test_nodes_without_a_scene_use_their_parents(tmp_path, rng):
     _, path = moved(tmp_path, rng, translation=[1, 0, 0])
-    tree, binary = parts(path.read_bytes())
+    tree, binary = split_glb(path.read_bytes())
     del tree["scenes"], tree["scene"]
     expected = load(path).means
-    path.write_bytes(glued(tree, binary))
+    path.write_bytes(join_glb(tree, binary))
     np.testing.assert_array_equal(load(path).means, expected)
 
 
@@ -285,7 +285,7 @@ def test_lost_mip_mark_is_reported(name, said, tmp_path, rng, caplog):
 def test_lost_render_settings_are_reported(tmp_path, rng, caplog):
     source = splats(rng, 5, 0, "mip")
     for name in ("a.ply", "a.sog", "a.glb"):
-        assert there_and_back(tmp_path / name, source).rendering == source.rendering
+        assert round_trip(tmp_path / name, source).rendering == source.rendering
     assert "does not store" not in caplog.text
     write(tmp_path / "a.spz", source)
     assert "SPZ does not store near = 0.05; PLY, SOG, and GLB do" in caplog.text

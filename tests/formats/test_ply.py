@@ -184,7 +184,7 @@ def test_writing_is_all_or_nothing(tmp_path, rng):
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def a_model(count: int, degree: int = 3) -> dict[str, np.ndarray]:
+def make_model(count: int, degree: int = 3) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(count)
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}
     widths |= {"sh_rest": 3 * ((degree + 1) ** 2 - 1), "filter_variance": 1, "motion": 5}
@@ -194,7 +194,7 @@ def a_model(count: int, degree: int = 3) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 33])
 def test_rows_are_written_and_read_in_blocks(count, tmp_path, monkeypatch):
     """The same bytes, and the same tables."""
-    model = a_model(count)
+    model = make_model(count)
     whole = ply.write_ply(tmp_path / "whole.ply", model, {})
     monkeypatch.setattr(ply, "ROWS", 16)
     assert ply.write_ply(tmp_path / "parts.ply", model, {}) == whole
@@ -207,7 +207,7 @@ def test_rows_are_written_and_read_in_blocks(count, tmp_path, monkeypatch):
 
 def test_model_is_in_memory_once(tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "ROWS", 1000)
-    model = a_model(40_000, degree=1)
+    model = make_model(40_000, degree=1)
     size = sum(table.nbytes for table in model.values())
     tracemalloc.start()
     try:

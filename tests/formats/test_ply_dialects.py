@@ -10,7 +10,7 @@ from clsplat.core.errors import DataError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import FLAT_LOG_SCALE
 from clsplat.formats.table import detect, read
-from tests.support.models import interop, splats, there_and_back
+from tests.support.models import interop, round_trip, splats
 
 MARKS = {
     "comment SplatRenderMode: mip": "mip",
@@ -85,7 +85,7 @@ def test_a_compressed_ply_without_ranges_of_colors(tmp_path):
 
 
 def test_empty_model_is_read(tmp_path, rng):
-    assert len(there_and_back(tmp_path / "a.ply", splats(rng, 0))) == 0
+    assert len(round_trip(tmp_path / "a.ply", splats(rng, 0))) == 0
 
 
 BROKEN = {

@@ -27,10 +27,10 @@ from clsplat.formats.table import read, write
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import Sky
-from tests.support.models import splats, there_and_back
+from tests.support.models import round_trip, splats
 
 
-def seen_from_one_side(rng: np.random.Generator, count: int, degree: int = 3) -> SplatFile:
+def one_sided_model(rng: np.random.Generator, count: int, degree: int = 3) -> SplatFile:
     """A model whose harmonics lie mostly along a few directions, as those of cameras on one side do."""
     source = splats(rng, count, degree)
     coefficients = source.parameters["sh_rest"].shape[1] // 3
@@ -41,7 +41,7 @@ def seen_from_one_side(rng: np.random.Generator, count: int, degree: int = 3) ->
     return source
 
 
-def shown(error: np.ndarray, form: np.ndarray) -> np.ndarray:
+def visible_error(error: np.ndarray, form: np.ndarray) -> np.ndarray:
     """What shows of the errors of each Gaussian, e^T G e over its channels, [N]."""
     channels = error.astype(np.float64).reshape(len(error), len(form), 3)
     return np.einsum("nkc,kl,nlc->n", channels, form, channels)
@@ -87,7 +87,7 @@ def test_sky_gaussians_do_not_decide_the_rounding(count, rng, tmp_path):
     for name in ("a.spz", "a.sog"):
         errors = []
         for one in (source, behind):
-            found = there_and_back(tmp_path / name, one).parameters["means"]
+            found = round_trip(tmp_path / name, one).parameters["means"]
             errors.append(np.median(cKDTree(found).query(source.parameters["means"])[0]))
         assert errors[1] < 1.3 * errors[0], name
 
@@ -102,7 +102,7 @@ def test_model_without_sky_counts_all_gaussians(rng, tmp_path):
     assert abs(np.median(log_weights(source.parameters))) < 1e-9
     noted = replace(source, rendering={"sky": "splats"})
     for name in ("a.spz", "a.sog"):
-        found = [there_and_back(tmp_path / name, one).parameters["means"] for one in (source, noted)]
+        found = [round_trip(tmp_path / name, one).parameters["means"] for one in (source, noted)]
         assert (found[0] != found[1]).any(), name
 
 
@@ -144,7 +144,7 @@ def test_steps_are_proportional_to_root_weights(rng):
 @pytest.mark.parametrize("count", [1, 50])
 def test_rounding_matches_the_reference(count, rng):
     """The reference solves for what the rest of the coefficients should take up, one coefficient after another."""
-    rest = seen_from_one_side(rng, count).parameters["sh_rest"]
+    rest = one_sided_model(rng, count).parameters["sh_rest"]
     form, step = visible_form(rest), np.exp2(rng.integers(-7, -2, count)).astype(np.float32)
     expected = np.empty(rest.shape)
     for row in range(count):
@@ -161,18 +161,18 @@ def test_rounding_matches_the_reference(count, rng):
 
 
 def test_joint_rounding_is_less_visible_than_independent(rng):
-    rest = seen_from_one_side(rng, 400).parameters["sh_rest"]
+    rest = one_sided_model(rng, 400).parameters["sh_rest"]
     step = np.full(400, 1 / 32, np.float32)
     form = visible_form(rest)
     found, alone = round_sh(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
     np.testing.assert_array_equal(found, np.rint(found * 32) / 32)
-    assert shown(found - rest, form).sum() < 0.4 * shown(alone - rest, form).sum()
+    assert visible_error(found - rest, form).sum() < 0.4 * visible_error(alone - rest, form).sum()
     np.testing.assert_array_equal(round_sh(rest, step, np.eye(15)), alone)
 
 
 @pytest.mark.parametrize("rows", [7, 64])
 def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
-    rest = seen_from_one_side(rng, 150, 2).parameters["sh_rest"]
+    rest = one_sided_model(rng, 150, 2).parameters["sh_rest"]
     step = np.full(150, 1 / 32, np.float32)
     form = visible_form(rest)
     table = rest.astype(np.float64).reshape(150, 8, 3)
@@ -212,8 +212,8 @@ def test_band_0_absorbs_the_view_independent_part(rng):
 
 
 def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
-    source = seen_from_one_side(rng, 500)
-    found = there_and_back(tmp_path / "a.spz", source).parameters
+    source = one_sided_model(rng, 500)
+    found = round_trip(tmp_path / "a.spz", source).parameters
     levels = 128 * found["sh_rest"]
     np.testing.assert_array_equal(levels, np.rint(levels))
     expected = np.sort(
@@ -230,9 +230,9 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
 
 
 def test_spz_steps_depend_on_each_gaussians_weight(tmp_path, rng):
-    source = seen_from_one_side(rng, 500)
+    source = one_sided_model(rng, 500)
     source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
-    found = there_and_back(tmp_path / "a.spz", source).parameters
+    found = round_trip(tmp_path / "a.spz", source).parameters
     p = source.rows(morton_order(source.parameters["means"])).parameters
     own = np.argsort(quantization_steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
     p = {name: table[own] for name, table in p.items()}
@@ -249,7 +249,7 @@ def test_spz_steps_depend_on_each_gaussians_weight(tmp_path, rng):
 
 def test_spz_positions_and_rotations_are_within_their_steps(tmp_path, rng):
     source = splats(rng, 300, 0)
-    found, expected = there_and_back(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
+    found, expected = round_trip(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
     smallest = np.exp(expected.parameters["log_scales"].min(axis=1, keepdims=True))
     away = np.abs(found.parameters["means"] - expected.parameters["means"])
     largest = smallest / 4 * np.exp2(-log_weights(expected.parameters)[:, None] / 2)  # half a step
@@ -267,7 +267,7 @@ def test_spz_gzip_is_readable_by_other_programs(tmp_path, rng):
 
 @pytest.mark.parametrize(("count", "entries"), [(1, 1), (40, 40), (700, 30), (1500, 300)])
 def test_neighbor_palette_holds_the_means_of_its_clusters(count, entries, rng):
-    rest = seen_from_one_side(rng, count).parameters["sh_rest"]
+    rest = one_sided_model(rng, count).parameters["sh_rest"]
     weights = rng.normal(size=count)
     vectors, labels = tree_palette(rest, weights, entries, 1.0)
     assert len(vectors) <= entries
@@ -282,10 +282,10 @@ def test_neighbor_palette_holds_the_means_of_its_clusters(count, entries, rng):
 
 
 def test_neighbor_palette_favors_heavier_gaussians(rng):
-    rest = seen_from_one_side(rng, 2000).parameters["sh_rest"]
+    rest = one_sided_model(rng, 2000).parameters["sh_rest"]
     weights = np.where(np.arange(2000) % 4 == 0, 3.0, -3.0)
     vectors, labels = tree_palette(rest, weights, 400, 2.0)
-    errors = shown(vectors[labels] - rest, visible_form(rest))
+    errors = visible_error(vectors[labels] - rest, visible_form(rest))
     assert errors[::4].mean() < 0.3 * errors[weights < 0].mean()
     same = np.tile(rest[:1], (50, 1))
     vectors, labels = tree_palette(same, np.zeros(50), 20, 1.0)
@@ -294,7 +294,7 @@ def test_neighbor_palette_favors_heavier_gaussians(rng):
 
 
 def test_existing_palette_is_recovered(rng):
-    few = seen_from_one_side(rng, 300).parameters["sh_rest"]
+    few = one_sided_model(rng, 300).parameters["sh_rest"]
     rest = few[rng.integers(0, 300, 2000)]
     vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
     assert len(vectors) <= 300
@@ -309,8 +309,8 @@ def test_small_harmonics_have_smaller_steps(rng):
 
 
 def test_sog_keeps_the_shape_and_converts_again_losslessly(tmp_path, rng):
-    source = seen_from_one_side(rng, 1500)
-    found = there_and_back(tmp_path / "a.sog", source)
+    source = one_sided_model(rng, 1500)
+    found = round_trip(tmp_path / "a.sog", source)
     order = morton_order(source.parameters["means"])
     expected, shapes = covariances(source.rows(order)), covariances(found)
     size = np.linalg.norm(expected, axis=(1, 2))
@@ -321,7 +321,7 @@ def test_sog_keeps_the_shape_and_converts_again_losslessly(tmp_path, rng):
     for name, bound in (("means", 0.01), ("logit_opacity", 1.0)):
         away = np.abs(found.parameters[name] - source.parameters[name][order])
         assert np.percentile(away, 90) <= bound, name
-    again = there_and_back(tmp_path / "b.sog", found)
+    again = round_trip(tmp_path / "b.sog", found)
     rows = np.lexsort(found.parameters["means"].T), np.lexsort(again.parameters["means"].T)
     for name in ("sh_rest", "log_scales", "quats", "sh_base"):
         np.testing.assert_allclose(

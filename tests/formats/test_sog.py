@@ -22,7 +22,7 @@ from clsplat.formats.palette import ENTRIES, codebook, nearest_entries, palette
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import detect, read, write
 from tests.support.data_sets import data_set
-from tests.support.models import assert_close, interop, splats, there_and_back
+from tests.support.models import assert_close, interop, round_trip, splats
 
 
 def test_the_published_bytes_of_a_sog():
@@ -52,7 +52,7 @@ def test_version_1_is_read():
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 0), (300, 1), (1100, 2)])
 def test_sog_round_trip_is_within_its_steps(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
-    found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high"))
+    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert (found.mode, found.rendering) == ("mip", source.rendering)
     assert_close(found, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
@@ -62,14 +62,14 @@ def test_palette_with_an_entry_per_distinct_vector_is_exact(tmp_path, rng):
     """Eight different colors in a thousand Gaussians."""
     source = splats(rng, 1024)
     source.parameters["sh_rest"][:] = source.parameters["sh_rest"][rng.integers(0, 8, 1024)].round(1)
-    found = there_and_back(tmp_path / "a.sog", source).parameters["sh_rest"]
+    found = round_trip(tmp_path / "a.sog", source).parameters["sh_rest"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_folder_and_bundle_have_the_same_content(tmp_path, rng):
     source = splats(rng, 200, 1)
-    bundled = there_and_back(tmp_path / "a.sog", source)
+    bundled = round_trip(tmp_path / "a.sog", source)
     write(tmp_path / "folder" / "meta.json", source)
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         images = {archive.read(name) for name in archive.namelist() if name != "meta.json"}
@@ -128,7 +128,7 @@ def test_larger_palette_is_more_accurate(tmp_path, rng):
     source = splats(rng, 2050, 1)
     errors = []
     for quality in ("small", "balanced"):
-        found = there_and_back(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
+        found = round_trip(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
         expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
         errors.append(float(np.square(found - expected).mean()))
     assert errors[1] < errors[0] < 0.1**2
@@ -195,7 +195,7 @@ def test_palette_does_not_depend_on_the_thread_count(rng):
 def test_a_transparent_splat_keeps_its_color(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
-    found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high"))
+    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert_close(found, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
 
@@ -362,7 +362,7 @@ def test_cpus_with_and_without_avx_512_write_equal_bytes(tmp_path):
 def test_position_precision_depends_only_on_the_range(place, tmp_path, rng):
     source = splats(rng, 400, 0)
     source.parameters["means"][:] += place
-    found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
+    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
     assert np.abs(found - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:

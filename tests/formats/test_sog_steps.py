@@ -10,7 +10,7 @@ from clsplat.formats.palette import ENTRIES, codebook
 from clsplat.formats.sog_quantize import LEVELS, round_means, round_quats, round_to
 from clsplat.formats.splats import Writing, unit
 from clsplat.formats.table import write
-from tests.support.models import splats, there_and_back
+from tests.support.models import round_trip, splats
 
 
 def covariances(quats, log_scales):
@@ -59,11 +59,11 @@ def test_rounded_tables_are_written_exactly_in_fewer_bytes(tmp_path: Path, rng):
     source = splats(rng, 1500, 0)
     p = source.parameters
     p["log_scales"] -= 2
-    there_and_back(tmp_path / "before.sog", source, Writing(quality="high"))
+    round_trip(tmp_path / "before.sog", source, Writing(quality="high"))
     p["means"] = round_means(p["means"], p["log_scales"], np.zeros(1500), 0.5)
     p["quats"], p["log_scales"] = round_quats(p["quats"], p["log_scales"], 4)
     p["log_scales"], p["sh_base"] = round_to(p["log_scales"], 0.1), round_to(p["sh_base"], 0.06)
-    found = there_and_back(tmp_path / "after.sog", source, Writing(quality="high"))
+    found = round_trip(tmp_path / "after.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(p["means"]))
     for name in ("means", "quats", "log_scales", "sh_base"):
         np.testing.assert_allclose(found.parameters[name], expected.parameters[name], rtol=1e-4, atol=1e-5)

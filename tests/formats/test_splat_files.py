@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.formats.splats import opacities
 from clsplat.formats.table import detect, read, write
-from tests.support.models import angles, assert_close, interop, ksplat, splats, there_and_back
+from tests.support.models import angles, assert_close, interop, ksplat, round_trip, splats
 
 PUBLISHED = bytes.fromhex("c2851ec15dd5db3eba33d54072ce773ee8e8ca3d8e23743e7a8d597cff80757d")
 LEVELS = {"L0": (1e-6, 1e-6, 1e-6), "L1": (2e-4, 0.002, 0.001), "L2": (2e-4, 0.002, 0.013)}
@@ -43,7 +43,7 @@ def test_splat_of_another_program_equals_its_source(name):
 def test_splat_round_trip_is_within_its_steps(tmp_path, rng):
     source = splats(rng, 300)
     source.parameters["sh_base"][:] = np.clip(source.parameters["sh_base"], -1.7, 1.7)
-    found = there_and_back(tmp_path / "a.splat", source)
+    found = round_trip(tmp_path / "a.splat", source)
     expected = by_size(source)
     expected.parameters["sh_rest"] = np.zeros((300, 0), np.float32)
     bounds = {"means": 0, "log_scales": 1e-6, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.2820947, "sh_rest": 0}

@@ -15,7 +15,7 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import Reading, Writing, flip_axes
 from clsplat.formats.table import detect, read, write
-from tests.support.models import angles, assert_close, interop, splats, spz_version_4, there_and_back
+from tests.support.models import angles, assert_close, interop, round_trip, splats, spz_version_4
 
 STEPS = {"means": 2**-13, "log_scales": 1 / 32, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.15}
 
@@ -53,7 +53,7 @@ def test_spz_of_another_program_equals_its_source(version):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_round_trip_is_within_its_steps(tmp_path, rng, degree):
     source = splats(rng, 200, degree, "mip")
-    found = there_and_back(tmp_path / "a.spz", source, Writing(quality="high"))
+    found = round_trip(tmp_path / "a.spz", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert found.mode == "mip"
     assert_close(found, expected, 0.25, sh_rest=1 / 256, **STEPS)
@@ -62,7 +62,7 @@ def test_spz_round_trip_is_within_its_steps(tmp_path, rng, degree):
 def test_both_versions_give_the_same_values(tmp_path, rng):
     source = splats(rng, 100)
     version_4(tmp_path / "b.spz", source)
-    a, b = there_and_back(tmp_path / "a.spz", source), read(tmp_path / "b.spz")
+    a, b = round_trip(tmp_path / "a.spz", source), read(tmp_path / "b.spz")
     for name, table in a.parameters.items():
         np.testing.assert_array_equal(table, b.parameters[name])
 
@@ -74,7 +74,7 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
         caplog.clear()
         source.parameters["means"][0] = largest
         expected = source.rows(morton_order(source.parameters["means"])).parameters
-        found = there_and_back(tmp_path / "a.spz", source).parameters["means"]
+        found = round_trip(tmp_path / "a.spz", source).parameters["means"]
         away, least = np.abs(found - expected["means"]).max(axis=1), 2.0 ** -(fraction + 1)
         assert (away <= np.maximum(np.exp(-9.9) / 4 * np.exp2(-log_weights(expected) / 2), least)).all()
         lost = (
@@ -88,14 +88,14 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
     ):
         write(tmp_path / "a.spz", source)
     source = splats(rng, 50)
-    fine = there_and_back(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]
+    fine = round_trip(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]
     assert np.abs(fine - source.rows(morton_order(source.parameters["means"])).parameters["means"]).max() < 2e-6
 
 
 def test_harmonics_beyond_one_are_clipped_with_a_warning(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_rest"][3, 5] = 2.9
-    found = there_and_back(tmp_path / "a.spz", source)
+    found = round_trip(tmp_path / "a.spz", source)
     assert "values of 1 Gaussians were clipped" in caplog.text
     assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
 
@@ -104,7 +104,7 @@ def test_out_of_range_values_are_clipped_with_a_warning(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_base"][2:4, 1] = 9
     source.parameters["log_scales"][5, 0] = -12
-    there_and_back(tmp_path / "a.spz", source)
+    round_trip(tmp_path / "a.spz", source)
     assert "colors from -0.44 to 1.44; values of 2 Gaussians were clipped" in caplog.text
     assert "scales from 4.5e-05 to 379; values of 1 Gaussians were clipped" in caplog.text
 

@@ -55,7 +55,7 @@ def damaged(seeds: Sequence[bytes], words: Sequence[str] = ()) -> Callable[[Rand
     return draw
 
 
-def misbuilt(trees: Sequence[Any]) -> Callable[[Random], bytes]:
+def rearranged_json(trees: Sequence[Any]) -> Callable[[Random], bytes]:
     """Draw one of the valid trees of JSON with one to three parts exchanged: it stays JSON, of another shape."""
 
     def draw(random: Random) -> bytes:

@@ -15,9 +15,9 @@ from clsplat.formats.splats import Reading
 from clsplat.formats.streamed_sog import LeafLimits, write_lod
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.validate import examine
-from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
+from tests.fuzz.mutation import damaged, fuzzed, one_of, rearranged_json
 from tests.fuzz.outcome import outcome
-from tests.support.models import glued, interop, ksplat, parts, splats, spz_version_4
+from tests.support.models import interop, join_glb, ksplat, splats, split_glb, spz_version_4
 
 RNG = np.random.default_rng(0)
 WORDS = {
@@ -123,7 +123,7 @@ def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
     path = folder / "levels" / "lod-meta.json"
     whole = path.read_bytes()
 
-    @fuzzed(60, data=damaged([whole], WORDS["streamed SOG"]), other=misbuilt([json.loads(whole)]))
+    @fuzzed(60, data=damaged([whole], WORDS["streamed SOG"]), other=rearranged_json([json.loads(whole)]))
     def reads(data, other):
         path.write_bytes(data)
         reads_or_refuses(path)
@@ -136,12 +136,12 @@ def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
 
 def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
     """Its JSON is whole, but no glTF."""
-    tree, binary = parts(seeds("GLB", folder)[0])
+    tree, binary = split_glb(seeds("GLB", folder)[0])
     doubled = {**tree, "nodes": [*({"children": [i + 1] * 2} for i in range(50)), {}]}
 
-    @fuzzed(300, data=misbuilt([tree, tree, tree, doubled]))
+    @fuzzed(300, data=rearranged_json([tree, tree, tree, doubled]))
     def reads(data):
-        (folder / "b.glb").write_bytes(glued(json.loads(data), binary))
+        (folder / "b.glb").write_bytes(join_glb(json.loads(data), binary))
         reads_or_refuses(folder / "b.glb")
 
     reads()
@@ -160,7 +160,7 @@ def test_a_sog_of_another_shape_is_read_or_refused(folder: Path):
             if kind == zipfile.ZIP_DEFLATED:
                 archive.writestr("large", bytes(160_000_000))
 
-    @fuzzed(60, data=misbuilt([meta, meta, bomb]), kind=one_of(KINDS), place=lambda random: 2 * random.random())
+    @fuzzed(60, data=rearranged_json([meta, meta, bomb]), kind=one_of(KINDS), place=lambda random: 2 * random.random())
     def reads(data, kind, place):
         packed = io.BytesIO((folder / f"{kind}.sog").read_bytes())
         with zipfile.ZipFile(packed, "a", kind) as archive:

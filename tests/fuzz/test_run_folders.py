@@ -97,7 +97,7 @@ def test_damaged_run_file_is_read_equal_or_reported(name, run: Path):
         found = outcome(lambda: verify(RunState.read(run)))
         assert found is not None
         if found["whole"]:
-            assert held(name, json.loads(data), found) == held(name, json.loads(before), whole)
+            assert checked_part(name, json.loads(data), found) == checked_part(name, json.loads(before), whole)
 
     try:
         reads()
@@ -105,7 +105,7 @@ def test_damaged_run_file_is_read_equal_or_reported(name, run: Path):
         (run / name).write_bytes(before)
 
 
-def held(name: str, content: Any, found: dict[str, Any]) -> Any:
+def checked_part(name: str, content: Any, found: dict[str, Any]) -> Any:
     """What a check holds a file to: all of it, but of status.json, which has no checksum, the state and the files."""
     return [content["state"], [one["file"] for one in found["objects"]]] if name == "status.json" else content
 

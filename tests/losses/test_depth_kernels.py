@@ -17,7 +17,7 @@ from clsplat.photos.depths import PointDepths, nearest_in_pixels
 from clsplat.scene.scene import Tracks
 from clsplat.stages.optimize import Optimize
 from clsplat.training.modules.depth_supervision import DepthSupervisionState
-from tests.support.deviations import assert_within_bounds, same_of_schedules
+from tests.support.deviations import assert_schedules_agree, assert_within_bounds
 from tests.support.device_images import trainer_of
 from tests.support.devices import on_one_setting
 
@@ -42,7 +42,7 @@ def test_schedules_agree(device, rng):
     for number, (one, two) in enumerate(zip(*(gradients_of(d, case, weights) for d in (device, other)), strict=True)):
         assert relative_error(two, one) < 1e-5
         if number == 0:
-            same_of_schedules(device, two, one)
+            assert_schedules_agree(device, two, one)
 
 
 def test_reference_gradient_matches_finite_differences(rng):
@@ -105,7 +105,7 @@ def test_nearest_point_per_pixel_counts_and_outside_none(device, rng):
     np.testing.assert_allclose(depths, [2, 5], rtol=1e-6)
 
 
-def known(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
+def depths_of_means(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
     """Depths at the means of the first Gaussians: a view with the number 0 shows all, another one half of them."""
     means = trainer.model.gaussians.get("means")[:count].astype(np.float64)
     tracks = Tracks(means, {"a": np.arange(count), "b": np.arange(count // 2), "c": np.arange(count // 2)})
@@ -115,7 +115,7 @@ def known(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
 @on_one_setting
 def test_points_with_more_observations_weigh_more(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
-    found = known(device, trainer, photograph)
+    found = depths_of_means(device, trainer, photograph)
     camera = replace(photograph.camera, view=0)
     here = found.at(camera)
     assert here is not None
@@ -132,7 +132,7 @@ def test_training_with_the_loss_approaches_known_depths(device, rng):
     for weight in (0.0, 0.3):
         local = np.random.default_rng(3)
         trainer, photograph = trainer_of(device, local, [L1(weight=0.0), InverseDepth(weight=weight)])
-        trainer.modules = [DepthSupervisionState(known(device, trainer, photograph))]
+        trainer.modules = [DepthSupervisionState(depths_of_means(device, trainer, photograph))]
         photograph = replace(photograph, camera=replace(photograph.camera, view=0), mask=None)
         measured = replace(trainer, losses=[L1(weight=0.0), InverseDepth(weight=1.0)])
         for step in range(1, 60):

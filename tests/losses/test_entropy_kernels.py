@@ -17,7 +17,7 @@ from clsplat.losses.image import L1, WeightEntropy
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer, RenderLimits
 from clsplat.stages.optimize import Optimize
-from tests.support.deviations import same_of_schedules
+from tests.support.deviations import assert_schedules_agree
 from tests.support.device_images import SIZES, trainer_of
 from tests.support.devices import on_devices, on_one_setting, product
 
@@ -121,7 +121,7 @@ def test_schedules_sorts_and_bands_agree(device, rng):
     np.testing.assert_array_equal(entropy_of(device, case, "bitonic"), entropy)
     np.testing.assert_array_equal(pixel_sums_of(device, case, weights, RenderLimits(250, 3)), sums)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
-    same_of_schedules(device, entropy_of(other, case), entropy)
+    assert_schedules_agree(device, entropy_of(other, case), entropy)
     assert relative_error(pixel_sums_of(other, case, weights), sums) < 1e-5
 
 

@@ -36,7 +36,7 @@ def taps_of(scalars: dict[str, float]) -> np.ndarray:
     return scalars["haar/scale"] * HAAR + scalars.get("haar/leak", 0.0) * LEAK
 
 
-def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> np.ndarray:
+def apply_haar(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> np.ndarray:
     """The photograph [3, H, W] after the transform."""
     camera = camera_of(device, image.shape[2], image.shape[1])
     counted = None if mask is None else planes_of(device, camera, mask[None])
@@ -71,10 +71,10 @@ def test_unfiltered_haar_is_the_identity(device, rng, masked):
     squares = np.where(mask, image, np.nan).reshape(3, 5, 2, 11, 2)
     count = mask.reshape(5, 2, 11, 2).sum(axis=(1, 3))
     mean = np.nansum(squares, axis=(2, 4), dtype=np.float64) / np.maximum(count, 1)
-    found = through(device, image, (0.0, 0.0), mask if masked else None)[:, mask]
+    found = apply_haar(device, image, (0.0, 0.0), mask if masked else None)[:, mask]
     np.testing.assert_allclose(found, np.kron(mean, np.ones((2, 2)))[:, mask], rtol=1e-6)
     np.testing.assert_allclose(
-        through(device, image, HAAR, mask if masked else None)[:, mask], image[:, mask], atol=3e-7
+        apply_haar(device, image, HAAR, mask if masked else None)[:, mask], image[:, mask], atol=3e-7
     )
 
 
@@ -83,10 +83,10 @@ def test_nonfinite_values_stay_in_their_square(device, rng):
     image[1, 7, 12] = np.nan
     bad = np.zeros(image.shape, bool)
     bad[1, 6:8, 12:14] = True
-    np.testing.assert_array_equal(np.isnan(through(device, image, (0.2, 0.1))), bad)
+    np.testing.assert_array_equal(np.isnan(apply_haar(device, image, (0.2, 0.1))), bad)
 
 
-def course_of(haar: Haar, steps: int) -> list[float]:
+def scale_history(haar: Haar, steps: int) -> list[float]:
     """The scale after each step, by the filter's own loss alone, from 0 on."""
     state, course = HaarState(haar), [0.0]
     for step in range(1, steps + 1):
@@ -100,7 +100,7 @@ def course_of(haar: Haar, steps: int) -> list[float]:
 def test_filter_follows_the_published_course(learn):
     """Adam decides it, whatever the weight."""
     for weight in (0.05, 7.0):
-        course = course_of(Haar(learn=learn, weight=weight), 15000)
+        course = scale_history(Haar(learn=learn, weight=weight), 15000)
         assert {step: course[step] for step in COURSE} == pytest.approx(COURSE, abs=0.005)
 
 
@@ -236,7 +236,7 @@ def test_asymmetric_loss_is_refused_before_a_run():
 def test_filter_follows_the_same_course_in_fewer_steps():
     """By its own loss: from the mean of squares to the photograph, long before the end."""
     training = load("auto_opti3dgs_7k").settings.training
-    course = course_of(training.modules[0], training.steps)
+    course = scale_history(training.modules[0], training.steps)
     assert [course[training.steps * n // 100] for n in (5, 10, 20)] == pytest.approx([0.145, 0.28, 0.53], abs=0.03)
     assert course[training.steps * 6 // 10] == pytest.approx(1, abs=0.03)
 

@@ -89,7 +89,7 @@ def test_relocation_keeps_optical_depth_at_any_limit(device, rng, limit):
     assert (sums[:50] == 0).all()
 
 
-class Alone(Rule):
+class UndoEverySecondGrowth(Rule):
     """Let every second Gaussian that was to become several stay as it is."""
 
     def mark(self, edit: Edit) -> None:
@@ -100,7 +100,7 @@ class Alone(Rule):
 def test_source_isolated_by_a_later_rule_does_not_change(device, rng):
     gaussians = some_gaussians(device, rng, 60, faint=30)
     before = {name: gaussians.get(name) for name in ("logit_opacity", "log_scales")}
-    source = relocated(gaussians, after=[Alone()])
+    source = relocated(gaussians, after=[UndoEverySecondGrowth()])
     copies = np.bincount(source, minlength=60)
     alone = np.flatnonzero(copies[30:] == 1) + 30
     assert len(alone) > 10

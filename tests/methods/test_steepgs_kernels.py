@@ -44,14 +44,14 @@ def loss_of(alpha: np.ndarray, splats: ref.Splats, weights: np.ndarray) -> float
     return float(((image + BACKGROUND[:, None, None] * left) * weights).sum())
 
 
-def of_two(alpha: np.ndarray, n: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def split_planes(alpha: np.ndarray, n: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """The planes with that of one splat replaced by two, one in front of the other."""
     found = alpha.copy()
     found[n] = 1 - (1 - one[n]) * (1 - other[n])
     return found
 
 
-def softly(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.ndarray]:
+def uncapped_case(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.ndarray]:
     """Six Gaussians that no pixel caps, weights of the loss, and their splitting matrices on the screen."""
     case = random_case(rng, 6, 24, 20)
     drawn = rng.uniform(*opacity, (6, 1))
@@ -62,7 +62,7 @@ def softly(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.nd
 
 def test_mean_of_two_shifts_changes_the_loss_by_the_matrix(rng):
     """ε²/2 vᵀ S v, and the error is of the fourth order."""
-    _, splats, weights, matrices = softly(rng)
+    _, splats, weights, matrices = uncapped_case(rng)
     alpha = alphas(splats, 24, 20)
     before = loss_of(alpha, splats, weights)
     for n in range(6):
@@ -82,14 +82,14 @@ def test_two_half_opacities_equal_the_mean_to_second_order(rng):
     errors = []
     for opacity in (0.02, 0.01):
         again = np.random.default_rng(7)
-        _, splats, weights, matrices = softly(again, (opacity, opacity))
+        _, splats, weights, matrices = uncapped_case(again, (opacity, opacity))
         v, step, worst = again.normal(size=2), 0.02, 0.0
         one = replace(splats, opacity=splats.opacity / 2)
         alpha, both = alphas(splats, 24, 20), alphas(one, 24, 20)
         moved = [alphas(one, 24, 20, sign * step * v) for sign in (1, -1)]
         for n in range(6):
-            change = loss_of(of_two(alpha, n, *moved), splats, weights)
-            change -= loss_of(of_two(alpha, n, both, both), splats, weights)
+            change = loss_of(split_planes(alpha, n, *moved), splats, weights)
+            change -= loss_of(split_planes(alpha, n, both, both), splats, weights)
             expected = v @ matrices[n] @ v / 2
             worst = max(worst, abs(change / step**2 - expected) / (np.abs(matrices[n]).max() * (v @ v)))
         errors.append(worst)
@@ -100,7 +100,7 @@ def test_two_half_opacities_equal_the_mean_to_second_order(rng):
 @pytest.mark.parametrize(("far", "bound"), [(100.0, 0.05), (1000.0, 0.005)])
 def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
     """Means moved in the scene, with splats that change their form: ten times as far with such a lens, as exact."""
-    case, _, weights, _ = softly(rng)
+    case, _, weights, _ = uncapped_case(rng)
     scene, eye = case.gaussians(), case.camera()
     away = eye.world_to_camera.copy()
     away[2, 3] += 4 * (far - 1)

@@ -25,7 +25,7 @@ def image(rng) -> np.ndarray:
     return rng.uniform(0.05, 0.7, (20, 31, 3)).astype(np.float32)
 
 
-def everywhere(image: np.ndarray) -> np.ndarray:
+def all_pixels(image: np.ndarray) -> np.ndarray:
     return np.ones(image.shape[:2], bool)
 
 
@@ -47,7 +47,7 @@ def test_colors_are_fitted_on_other_pixels_than_measured(image):
     """What is true of one half alone does not help there."""
     photograph = to_8_bits(image)
     photograph[:, :15] = to_8_bits(image[:, :15] * 0.5)
-    changed = in_colors_of(image.astype(np.float64), photograph, everywhere(image), Gain())
+    changed = in_colors_of(image.astype(np.float64), photograph, all_pixels(image), Gain())
     assert changed[:, :15] == pytest.approx(image[:, :15], abs=0.01), "as the right half asks for"
     assert changed[:, 15:] == pytest.approx(0.5 * image[:, 15:], abs=0.01)
 
@@ -64,7 +64,7 @@ def test_white_black_and_masked_pixels_are_not_fitted(image, rng):
 @pytest.mark.parametrize(("model", "numbers"), [(Gain(), 1), (Affine(), 4)])
 @pytest.mark.parametrize("half", [np.s_[:, :15], np.s_[:, 15:]])
 def test_half_with_too_few_pixels_has_no_color_metric(image, model, numbers, half):
-    photograph, counted = to_8_bits(image), everywhere(image)
+    photograph, counted = to_8_bits(image), all_pixels(image)
     counted[half] = False
     rows, columns = np.nonzero(~counted)
     for number, has in ((PIXELS * numbers - 1, False), (PIXELS * numbers, True)):
@@ -88,7 +88,7 @@ def test_views_with_the_metric_do_not_depend_on_the_model(image, model):
 def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
     photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
     bright[:5] = 3
-    changed = in_colors_of(bright, photograph, everywhere(image), Gain())
+    changed = in_colors_of(bright, photograph, all_pixels(image), Gain())
     assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
 
 
@@ -147,6 +147,6 @@ def test_render_is_regressed_on_the_photograph(rng):
     """With noise in the image its slope is too small by nothing, with noise in the photograph by 1 / (1 + noise)."""
     truth = rng.uniform(0.2, 0.8, (60, 60, 3))
     image = 0.5 * truth + 0.1
-    assert corrected_by_regression(image, truth, everywhere(image)) == pytest.approx(truth)
+    assert corrected_by_regression(image, truth, all_pixels(image)) == pytest.approx(truth)
     flat = np.full_like(truth, 0.3)
-    assert corrected_by_regression(flat, truth, everywhere(flat)) == pytest.approx(flat)
+    assert corrected_by_regression(flat, truth, all_pixels(flat)) == pytest.approx(flat)

@@ -32,7 +32,7 @@ from clsplat.stages.train_field import TrainField
 from clsplat.sweeps.compare.page import write_comparison
 from clsplat.training import archive, checkpoint
 from tests.support.commands import clsplat as clsplat_command
-from tests.support.fields import PIPELINE, alone, bits, resumed
+from tests.support.fields import PIPELINE, bits, resumed, train_single_threaded
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow
@@ -107,7 +107,7 @@ def test_killed_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path, pip
 
 
 def test_one_thread_gives_the_bits_of_several(finished, tiny_scene, tmp_path, pipeline):
-    assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
+    assert bits(train_single_threaded(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_comparison_accepts_fields_and_gaussians(finished, few_steps, tmp_path):

@@ -14,7 +14,7 @@ from clsplat.nerf.training import field_plan
 from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive
-from tests.support.fields import PIPELINE, SHAPE, alone, bits, resumed
+from tests.support.fields import PIPELINE, SHAPE, bits, resumed, train_single_threaded
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ def test_killed_grid_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path
 
 
 def test_grid_bits_do_not_depend_on_the_thread_count(finished, tiny_scene, tmp_path, pipeline):
-    assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
+    assert bits(train_single_threaded(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_grid_file_gives_the_metrics_of_its_run(finished):

@@ -30,7 +30,7 @@ OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, inde
 
 
 @pytest.fixture
-def found(monkeypatch):
+def set_devices(monkeypatch):
     """Lets the test say which devices there are; all work."""
     monkeypatch.delenv("CLSPLAT_DEVICE", raising=False)
     monkeypatch.setattr(runtimes, "probe_fault", lambda *_: None)
@@ -51,13 +51,13 @@ def found(monkeypatch):
         ([OTHER, replace(OTHER, units=64)], OTHER),
     ],
 )
-def test_strongest_gpu_or_first_cpu_is_chosen(found, devices, first):
-    found(*devices)
+def test_strongest_gpu_or_first_cpu_is_chosen(set_devices, devices, first):
+    set_devices(*devices)
     assert choose() is first
 
 
-def test_other_gpus_are_named_in_one_line(found, caplog):
-    found(CPU, INTEGRATED, LARGE, LARGER)
+def test_other_gpus_are_named_in_one_line(set_devices, caplog):
+    set_devices(CPU, INTEGRATED, LARGE, LARGER)
     with caplog.at_level(logging.INFO, "clsplat"):
         choose()
     assert [record.message for record in caplog.records] == [
@@ -65,17 +65,17 @@ def test_other_gpus_are_named_in_one_line(found, caplog):
         "--device NAME chooses one"
     ]
     caplog.clear()
-    found(CPU, LARGE)
+    set_devices(CPU, LARGE)
     choose()
     assert not caplog.records
 
 
 @pytest.mark.parametrize(("info", "least"), [(CPU, 16), (LARGE, 64)])
-def test_a_device_with_small_groups_does_not_work(found, info, least):
+def test_a_device_with_small_groups_does_not_work(set_devices, info, least):
     assert replace(info, group=least).fault() is None
     small = replace(info, group=least - 1)
     assert small.fault() == f"its work-groups have at most {least - 1} items; {least} are needed"
-    found(small)
+    set_devices(small)
     with pytest.raises(DeviceError, match="work-groups have at most"):
         choose()
 
@@ -165,8 +165,8 @@ class Platform:
 
     name, version = "Runtime", "OpenCL 3.0"
 
-    def __init__(self, *found) -> None:
-        self.found = found
+    def __init__(self, *set_devices) -> None:
+        self.found = set_devices
 
     def get_devices(self):
         for error in self.found:
@@ -185,8 +185,8 @@ def test_broken_runtime_is_reported_and_isolated(monkeypatch, info, caplog):
         Platform(*devices),
     ]
     monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
-    (found,) = discovery.list_devices()
-    assert (found.name, found.index) == (info.name, (2, 1))
+    (set_devices,) = discovery.list_devices()
+    assert (set_devices.name, set_devices.index) == (info.name, (2, 1))
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 2, "one without a device is no fault"
     assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]

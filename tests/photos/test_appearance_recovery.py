@@ -96,7 +96,7 @@ class Capture:
         return float(np.mean([psnr(image, photograph) for image, photograph in pairs]))
 
 
-def drawn(rng: np.random.Generator, exposure: float, balance: float) -> np.ndarray:
+def draw_gains(rng: np.random.Generator, exposure: float, balance: float) -> np.ndarray:
     """Gains whose means are 0."""
     gains = rng.normal(0, exposure, (VIEWS, 1)) + np.log1p(rng.uniform(-balance, balance, (VIEWS, 3)))
     return gains - gains.mean(axis=0)
@@ -107,7 +107,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def test_known_exposures_are_recovered(rng, info):
-    truth = drawn(rng, 0.25, 0.05)
+    truth = draw_gains(rng, 0.25, 0.05)
     found = Capture(rng, info, truth).learned(rng)
     assert rms(truth) > 0.15
     assert rms(found - truth) < 0.02
@@ -135,7 +135,7 @@ def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
 
 def test_grids_recover_known_exposures(rng, info):
     """By what a grid makes of the whole image; it has 768 numbers for what three say."""
-    truth = drawn(rng, 0.25, 0.05)
+    truth = draw_gains(rng, 0.25, 0.05)
     capture = Capture(rng, info, truth)
     trainer = capture.trained(rng, GridState(BilateralGrid(), NAMES, capture.rasterizer.device))
     assert capture.fit(trainer) > 45

@@ -41,7 +41,7 @@ def plugin(tmp_path: Path, without_plugins: None) -> None:
     plugins.load_file(tmp_path / "counted.py")
 
 
-def decided(name: str, *overrides: str, count: int = 9, error: float | None = None, sky: float | None = None):
+def adapted_pipeline(name: str, *overrides: str, count: int = 9, error: float | None = None, sky: float | None = None):
     return adapted(load(name, list(overrides)), Measures(count, error, measure_sky=lambda: sky))
 
 
@@ -50,7 +50,7 @@ def decided(name: str, *overrides: str, count: int = 9, error: float | None = No
     [(4, None, 0.6), (11, 0.24, 0.6), (12, 0.25, 0.3), (25, 0.49, 0.3), (25, 0.5, 0.1), (39, 1, 0.1), (40, 1, None)],
 )
 def test_photos_recipe_adapts_to_image_count_and_sky(photographs, sky, most):
-    settings = decided("photos", count=photographs, sky=sky).settings
+    settings = adapted_pipeline("photos", count=photographs, sky=sky).settings
     few, training, init = photographs < 40, settings.optimize, settings.stages[0]
     modules = {one.type: one for one in training.modules}
     assert (init.transparent, init.count) == (("random", 100_000) if few else ("hull", 60_000))
@@ -86,10 +86,10 @@ def test_photos_recipe_shortens_schedules_with_steps():
 )
 def test_set_key_is_not_adapted(override, kept, tmp_path):
     """Around a key of a decision or inside of it; also where a run has decided."""
-    found = decided("smoke", ADAPT, override)
+    found = adapted_pipeline("smoke", ADAPT, override)
     assert found.settings.adapt.keep == kept
     assert not {one.key for one in found.decisions} & {*kept}
-    (tmp_path / "run.yaml").write_text(decided("smoke", ADAPT).text())
+    (tmp_path / "run.yaml").write_text(adapted_pipeline("smoke", ADAPT).text())
     again = load(str(tmp_path / "run.yaml"), [override])
     assert (again.settings.adapt.keep, again.undecided) == (kept, [])
     assert [one.key for one in again.decisions] == [one.key for one in found.decisions]
@@ -104,7 +104,7 @@ def test_key_without_a_decision_is_refused(override):
 
 def test_decisions_are_repeated_for_other_photographs(tmp_path):
     file = tmp_path / "run.yaml"
-    file.write_text(decided("smoke", ADAPT, "model.background={type: auto, chosen: on, reason: blue}").text())
+    file.write_text(adapted_pipeline("smoke", ADAPT, "model.background={type: auto, chosen: on, reason: blue}").text())
     assert adapted(load(str(file)), Measures(3)).settings.model.sh_degree == 1, "what a run decided stays"
     other = load(str(file), ["scene.path=two"])
     assert other.undecided == ["model.sh_degree", "optimize.modules.dropout"]
@@ -153,7 +153,7 @@ def test_undecided_keys_are_listed_before_preparation():
 )
 def test_impossible_decision_is_refused_in_one_sentence(adapt, complaint):
     with pytest.raises(ConfigError, match=complaint):
-        decided("smoke", f"adapt={adapt}", count=2)
+        adapted_pipeline("smoke", f"adapt={adapt}", count=2)
 
 
 @pytest.mark.parametrize(("count", "clear", "sky"), [(12, True, "100%"), (12, False, "0%"), (41, True, None)])

@@ -29,7 +29,7 @@ def edits(training: Training, recipe: Training) -> list[tuple[int, int]]:
 
 
 @functools.cache
-def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
+def recipe_and_edits(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
     recipe = load(name).settings
     return recipe, edits(recipe.training, recipe.training)
 
@@ -39,7 +39,7 @@ def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
 @given(data=st.data())
 def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
     """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
-    recipe, old = known(name)
+    recipe, old = recipe_and_edits(name)
     fewest, steps = min_steps(recipe.training), recipe.training.steps
     new = edits(in_steps(recipe, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
     assert [place for _, place in new] == [place for _, place in old]
@@ -53,7 +53,7 @@ def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
 def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
     """Also that of a run in minutes, whose cadences are not whole.  In the fewest steps a cadence may become 1, which
     means each step in any number of them."""
-    recipe, old = known(name)
+    recipe, old = recipe_and_edits(name)
     fewest, steps = min_steps(recipe.training) + 1, recipe.training.steps
     between = in_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
     new = edits(in_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
@@ -64,7 +64,7 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
 @settings(max_examples=3)
 @given(data=st.data())
 def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
-    recipe, old = known(name)
+    recipe, old = recipe_and_edits(name)
     steps = data.draw(st.integers(1, min_steps(recipe.training)))
     factor = Axis.from_factor(Fraction(steps, recipe.training.steps)).factor
     old, new = (
@@ -103,7 +103,7 @@ def test_a_cadence_below_a_step_is_refused():
 @given(data=st.data())
 def test_corrected_step_count_keeps_all_up_to_the_last_edit(name, data):
     """Whatever begins behind the last edit, such as an average, still does."""
-    recipe, old = known(name)
+    recipe, old = recipe_and_edits(name)
     last = last_edit(recipe.training)
     done = data.draw(st.integers(1, recipe.training.steps - 1))
     steps = data.draw(st.integers(max(done, last) + 2, 2 * recipe.training.steps + 2))

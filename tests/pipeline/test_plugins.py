@@ -342,7 +342,7 @@ def test_pipeline_with_a_missing_or_changed_plugin_is_refused(tmp_path):
         load(str(saved))
 
 
-def with_imports_of_the_package(text: str) -> str:
+def replace_public_imports(text: str) -> str:
     """Replace imports from clsplat.plugin by those from the modules that define the names."""
     plugin = ast.parse((ROOT / "clsplat" / "plugin.py").read_text("utf-8"))
     places = {name.name: node.module for node in plugin.body if isinstance(node, ast.ImportFrom) for name in node.names}
@@ -359,7 +359,7 @@ def test_plugin_gives_the_bits_of_built_in_code(tiny_scene, tmp_path):
         shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for name, room in {"opacity_entropy": "losses", "box_blur": "photos"}.items():
         text = (EXAMPLES / f"{name}.py").read_text("utf-8")
-        (inside / "clsplat" / room / f"{name}.py").write_text(with_imports_of_the_package(text), "utf-8")
+        (inside / "clsplat" / room / f"{name}.py").write_text(replace_public_imports(text), "utf-8")
         shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
         plugins.load_file(EXAMPLES / f"{name}.py")
     code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"

@@ -74,14 +74,14 @@ def test_turned_photographs_keep_exif_except_for_the_rotation(tmp_path):
         take(tmp_path / "p" / f"{i}.jpg", (64, 48), exif(6), seed=i)
     (tmp_path / "images").mkdir()
     gather(tmp_path / "p", tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])
-    source, turned = tmp_path / "p" / "0.jpg", tmp_path / "images" / "0.jpg"
-    assert not turned.is_symlink()
-    assert (read_header(source).orientation, read_header(turned).orientation) == (6, 1)
-    assert (read_header(turned).width, read_header(turned).height) == (48, 64)
-    assert read_exif_optics(turned) == read_exif_optics(source) == ("Maker", "Phone 1", 4.2, "")
-    assert read_exif_exposure(turned) == read_exif_exposure(source)
-    assert read_exif_exposure(turned).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
-    assert np.abs(read_image(turned).astype(int) - read_image(source, upright=True)).max() < 12
+    source, rotated_view = tmp_path / "p" / "0.jpg", tmp_path / "images" / "0.jpg"
+    assert not rotated_view.is_symlink()
+    assert (read_header(source).orientation, read_header(rotated_view).orientation) == (6, 1)
+    assert (read_header(rotated_view).width, read_header(rotated_view).height) == (48, 64)
+    assert read_exif_optics(rotated_view) == read_exif_optics(source) == ("Maker", "Phone 1", 4.2, "")
+    assert read_exif_exposure(rotated_view) == read_exif_exposure(source)
+    assert read_exif_exposure(rotated_view).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
+    assert np.abs(read_image(rotated_view).astype(int) - read_image(source, upright=True)).max() < 12
 
 
 def test_big_endian_and_missing_exif_are_handled(tmp_path):
@@ -275,7 +275,7 @@ def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
     }
 
 
-def turned(number: int) -> np.ndarray:
+def rotated_view(number: int) -> np.ndarray:
     """What a camera sees that turns before a far wall, by 6 degrees each time."""
     angle = math.radians(6 * number - 15)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
@@ -287,7 +287,7 @@ def turned(number: int) -> np.ndarray:
     return cv2.warpPerspective(blocks(1, 600, 300), far @ turn @ np.linalg.inv(near), (240, 180), flags=flags)
 
 
-def stranger(number: int) -> np.ndarray:
+def unrelated_photograph(number: int) -> np.ndarray:
     return blocks(10 + number, 240, 180)
 
 
@@ -311,12 +311,18 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("pixels", "sentence"),
     [
-        (turned, "look as if the camera only rotated in place"),
-        (lambda number: (turned if number else stranger)(number), "look as if the camera only rotated"),
-        (stranger, "no two of them show the same features"),
-        (lambda number: turned(1), "photographs are all the same"),
+        (rotated_view, "look as if the camera only rotated in place"),
+        (
+            lambda number: (rotated_view if number else unrelated_photograph)(number),
+            "look as if the camera only rotated",
+        ),
+        (unrelated_photograph, "no two of them show the same features"),
+        (lambda number: rotated_view(1), "photographs are all the same"),
         (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "none has features, where thousands"),
-        (lambda number: np.full((180, 240, 3), 9, np.uint8) if number else turned(1), "half of them have no features"),
+        (
+            lambda number: np.full((180, 240, 3), 9, np.uint8) if number else rotated_view(1),
+            "half of them have no features",
+        ),
     ],
     ids=["turned", "turned, with a stranger", "other places", "copies", "a wall", "a wall, with one of texture"],
 )
@@ -337,7 +343,7 @@ def test_featureless_photographs_end_with_one_sentence(tmp_path, dense):
 def test_only_performed_attempts_count(tmp_path, dense, caplog):
     """All pairs were matched, so that there are no more of them to try."""
     caplog.set_level("INFO")
-    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(4)])
+    matches, cameras = prepared(tmp_path, [unrelated_photograph(number) for number in range(4)])
     with pytest.raises(DataError, match="no two of them show the same features"):
         map_cameras(matches, cameras, attempts=3)
     tried = [text.rpartition(" with ")[2] for text in caplog.messages if "trying again" in text]
@@ -378,7 +384,9 @@ def test_model_counts_only_photographs_outside_larger_models(tmp_path):
 
 def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
     """Before there is one, too few photographs match to know."""
-    matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
+    matches, cameras = prepared(
+        tmp_path, [rotated_view(number) if number < 6 else unrelated_photograph(number) for number in range(14)]
+    )
     with pytest.raises(DataError, match=r"the \d of 14 photographs that were placed look as if"):
         map_cameras(matches, cameras)
     assert not (cameras / "sparse").exists()
@@ -387,7 +395,7 @@ def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
 def test_unrelated_photographs_are_not_searched_again(tmp_path, dense, monkeypatch, caplog):
     monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
     caplog.set_level("INFO")
-    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
+    matches, cameras = prepared(tmp_path, [unrelated_photograph(number) for number in range(6)])
     with pytest.raises(DataError, match="no two of them show the same features"):
         map_cameras(matches, cameras)
     assert "with denser features" not in caplog.text

@@ -34,7 +34,7 @@ from tests.support.commands import clsplat
 from tests.support.data_sets import data_set
 from tests.support.html_page import HOSTILE, Page
 from tests.support.models import splats
-from tests.support.orbit_scene import COUNT, SIZE, orbit, photograph, said, write
+from tests.support.orbit_scene import COUNT, SIZE, finding_text, orbit, photograph, write
 from tests.support.pictures import with_exif
 from tests.support.runs import train
 
@@ -103,7 +103,9 @@ def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
     seconds = {image.name: 0.01 * (4 if i > 11 else 1) for i, image in enumerate(images)}
     write_exposures(scene / "images", {name: CameraExposure(one, 2.0, 100.0) for name, one in seconds.items()})
     inspection = Inspection.from_folder(scene)
-    assert said(inspection, "warning").startswith(f"1 photograph is blurred ({images[3].name}): remove or retake them")
+    assert finding_text(inspection, "warning").startswith(
+        f"1 photograph is blurred ({images[3].name}): remove or retake them"
+    )
     notes = [finding.text for finding in inspection.findings if finding.level == "note"]
     assert notes[0].startswith(f"{images[5].name}, {images[9].name} look the same")
     assert f"jumps by more than a stop 1 time ({images[11].name} to {images[12].name}: 2.0)" in notes[1]
@@ -124,7 +126,7 @@ def test_a_missing_image(scene):
     (scene / "images" / "03.png").unlink()
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
-    assert "1 of 24 registered images are missing on disk (images/03.png) (searched: images): restore" in said(
+    assert "1 of 24 registered images are missing on disk (images/03.png) (searched: images): restore" in finding_text(
         inspection, "error"
     )
     assert inspection.verdict.startswith("cannot train: 1 of 24 registered images")
@@ -138,7 +140,7 @@ def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
     os.mkfifo(scene / "images" / "03.png")
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == []
-    assert "decoded (03.png): cannot be read (it is a pipe); copy or export" in said(inspection, "error")
+    assert "decoded (03.png): cannot be read (it is a pipe); copy or export" in finding_text(inspection, "error")
 
 
 @pytest.mark.parametrize(
@@ -147,8 +149,8 @@ def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
 def test_images_of_another_size(scene, size, word):
     photograph(scene / "images" / "05.png", size)
     inspection = Inspection.from_folder(scene)
-    assert word in said(inspection, "error")
-    assert f"05.png is {size[0]}x{size[1]}, its camera 64x48" in said(inspection, "error")
+    assert word in finding_text(inspection, "error")
+    assert f"05.png is {size[0]}x{size[1]}, its camera 64x48" in finding_text(inspection, "error")
     with pytest.raises(DataError):  # as training would
         load_image(read_scene(scene).views[5])
 
@@ -160,7 +162,7 @@ def test_larger_images_of_the_same_shape_are_allowed(tmp_path):
 
 def test_an_unreadable_image(scene):
     (scene / "images" / "05.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
-    assert "1 image file cannot be decoded (05.png)" in said(Inspection.from_folder(scene), "error")
+    assert "1 image file cannot be decoded (05.png)" in finding_text(Inspection.from_folder(scene), "error")
 
 
 def test_test_view_with_damaged_pixels(scene):
@@ -172,16 +174,16 @@ def test_test_view_with_damaged_pixels(scene):
     assert "08.png" in {view.name for view in read_scene(scene).split("test")}
     assert inspection.verdict == "cannot train: 1 image file cannot be decoded (08.png)"
     done = clsplat("inspect", scene, expect=3)
-    said = " ".join(done.stdout.split())
-    assert "1 image file cannot be decoded (08.png): not an image, or a damaged one" in said
-    assert "is wrong); copy or export them again" in said
+    printed = " ".join(done.stdout.split())
+    assert "1 image file cannot be decoded (08.png): not an image, or a damaged one" in printed
+    assert "is wrong); copy or export them again" in printed
 
 
 def test_nonfinite_pose_in_a_text_model(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 2, translation=(0.0, float("nan"), 4.0)))
     inspection = Inspection.from_folder(write(tmp_path, model, "txt"))
-    assert "the pose of '02.png' is quaternion" in said(inspection, "error")
+    assert "the pose of '02.png' is quaternion" in finding_text(inspection, "error")
     assert (len(inspection.parts.views), inspection.facts.registered) == (23, 24)
 
 
@@ -190,7 +192,7 @@ def test_truncated_file_is_one_error_among_others(scene, stem):
     file = scene / "sparse" / "0" / f"{stem}.bin"
     file.write_bytes(file.read_bytes()[:-5])
     inspection = Inspection.from_folder(scene)
-    assert f"{stem}.bin: byte " in said(inspection, "error")
+    assert f"{stem}.bin: byte " in finding_text(inspection, "error")
     assert len(inspection.parts.views) == (24 if stem == "points3D" else 0)
     assert inspection.facts.on_disk == 24
     assert (inspection.facts.points is None) == (stem == "points3D")
@@ -200,11 +202,11 @@ def test_truncated_file_is_one_error_among_others(scene, stem):
 def test_photographs_without_poses(tmp_path):
     photograph(tmp_path / "a.png")
     inspection = Inspection.from_folder(tmp_path)
-    assert "contains 1 photograph but no camera poses" in said(inspection, "error")
+    assert "contains 1 photograph but no camera poses" in finding_text(inspection, "error")
 
 
 def test_an_empty_folder(tmp_path):
-    assert "no dataset found" in said(Inspection.from_folder(tmp_path), "error")
+    assert "no dataset found" in finding_text(Inspection.from_folder(tmp_path), "error")
     with pytest.raises(DataError, match="no such folder"):
         Inspection.from_folder(tmp_path / "nowhere")
 
@@ -257,7 +259,7 @@ def test_an_unregistered_image(scene):
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.unregistered == ["images/other.png"]
     assert inspection.verdict == "ready to train"
-    assert "1 of 25 images on disk have no pose" in said(inspection, "note")
+    assert "1 of 25 images on disk have no pose" in finding_text(inspection, "note")
     for i in range(5):
         photograph(scene / "images" / f"other{i}.png")
     assert Inspection.from_folder(scene).verdict.startswith("trains, but 6 of 30 images on disk have no pose")
@@ -268,7 +270,7 @@ def test_outlier_camera(tmp_path):
     model = replace(model, images=changed(model.images, 4, translation=(0.0, 0.0, 4000.0)))
     inspection = Inspection.from_folder(write(tmp_path, model))
     assert inspection.facts.outlier_cameras == ["04.png"]
-    assert "1 camera is far away from all others (04.png)" in said(inspection, "warning")
+    assert "1 camera is far away from all others (04.png)" in finding_text(inspection, "warning")
     assert inspection.verdict.startswith("trains, but 1 camera is far away")
     assert "far away from all others" in inspection_page(inspection)
 
@@ -279,7 +281,7 @@ def test_two_models(scene):
     write_model(scene / "sparse" / "2", replace(model, images=model.images[:1]))
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.submodels == {"sparse/0": 24, "sparse/1": 6, "sparse/2": 1}
-    assert "COLMAP made 3 models and only sparse/0 (24 images) is used" in said(inspection, "warning")
+    assert "COLMAP made 3 models and only sparse/0 (24 images) is used" in finding_text(inspection, "warning")
 
 
 def test_names_that_differ_only_in_case(tmp_path):
@@ -287,7 +289,7 @@ def test_names_that_differ_only_in_case(tmp_path):
     images = changed(model.images, 1, name="A.png")
     images = changed(changed(changed(images, 2, name="a.png"), 3, name="left/x.png"), 4, name="right/x.png")
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=images)))
-    assert "A.png and a.png differ only in upper and lower case" in said(inspection, "warning")
+    assert "A.png and a.png differ only in upper and lower case" in finding_text(inspection, "warning")
     assert inspection.facts.folders == 3
 
 
@@ -296,13 +298,13 @@ def test_equal_poses(tmp_path):
     images = changed(model.images, 1, quaternion=model.images[0].quaternion)
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=images)))
     assert inspection.facts.same_pose == [["00.png", "01.png"]]
-    assert "00.png, 01.png have exactly the same pose" in said(inspection, "note")
+    assert "00.png, 01.png have exactly the same pose" in finding_text(inspection, "note")
 
 
 def test_coincident_cameras(tmp_path):
     model = orbit()
     images = [replace(model.images[0], name=image.name) for image in model.images]
-    assert "all cameras are at the same position" in said(
+    assert "all cameras are at the same position" in finding_text(
         Inspection.from_folder(write(tmp_path, replace(model, images=images))), "warning"
     )
 
@@ -312,18 +314,18 @@ def test_points_behind_all_cameras(tmp_path):
     flipped = [replace(image, translation=(0.0, 0.0, -4.0)) for image in model.images]  # all look outwards
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=flipped)))
     assert inspection.facts.points.behind == 1.0
-    assert "all 200 points are behind all training cameras" in said(inspection, "error")
+    assert "all 200 points are behind all training cameras" in finding_text(inspection, "error")
     moved = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
     assert 0.1 < inspection.facts.points.behind < 0.9
-    assert "% of the points are behind all cameras" in said(inspection, "warning")
+    assert "% of the points are behind all cameras" in finding_text(inspection, "warning")
 
 
 def test_points_outside_all_images(tmp_path):
     model = orbit()
     above = [replace(point, position=(0, 0, 4 + i % 7)) for i, point in enumerate(model.points)]
     inspection = Inspection.from_folder(write(tmp_path, replace(model, points=above)))
-    assert "only 0 % of the points project into two or more views" in said(inspection, "warning")
+    assert "only 0 % of the points project into two or more views" in finding_text(inspection, "warning")
 
 
 def test_nonfinite_or_very_far_points(tmp_path):
@@ -331,8 +333,8 @@ def test_nonfinite_or_very_far_points(tmp_path):
     points = [*model.points, PointEntry((float("nan"), 0, 0)), PointEntry((1e5, 0, 0)), PointEntry((0, 1e300, 0))]
     inspection = Inspection.from_folder(write(tmp_path, replace(model, points=points)))
     assert (inspection.facts.points.not_finite, inspection.facts.points.distant) == (2, 1)
-    assert "2 points are not finite" in said(inspection, "warning")
-    assert "1 point is more than 100 times" in said(inspection, "note")
+    assert "2 points are not finite" in finding_text(inspection, "warning")
+    assert "1 point is more than 100 times" in finding_text(inspection, "note")
 
 
 def test_views_with_few_points(scene):
@@ -347,13 +349,15 @@ def test_views_with_few_points(scene):
     (scene / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.points_per_view == {f"{i:02}.png": 5 if i == 3 else 50 for i in range(COUNT)}
-    assert "1 view shows fewer than 30 points (03.png: 5)" in said(inspection, "warning")
+    assert "1 view shows fewer than 30 points (03.png: 5)" in finding_text(inspection, "warning")
 
 
 def test_imprecise_poses(scene):
     rows = [struct.pack("<Q3d3BdQ", i, 0.1, 0.1, i / 200, 9, 9, 9, 2 + i / 100, 0) for i in range(200)]
     (scene / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
-    assert "the mean reprojection error of the points is 3.00 px" in said(Inspection.from_folder(scene), "warning")
+    assert "the mean reprojection error of the points is 3.00 px" in finding_text(
+        Inspection.from_folder(scene), "warning"
+    )
 
 
 def test_truncated_and_rotated_images(tmp_path):
@@ -363,8 +367,8 @@ def test_truncated_and_rotated_images(tmp_path):
     (path / "images" / "05.jpg").write_bytes(whole[: len(whole) // 2])
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.from_folder(path)
-    assert "the end is missing from 1 image file (05.jpg): copy" in said(inspection, "error")
-    assert "1 photograph is rotated by EXIF" in said(inspection, "note")
+    assert "the end is missing from 1 image file (05.jpg): copy" in finding_text(inspection, "error")
+    assert "1 photograph is rotated by EXIF" in finding_text(inspection, "note")
 
 
 def test_rotated_images_that_the_reader_turns(tmp_path):
@@ -372,7 +376,7 @@ def test_rotated_images_that_the_reader_turns(tmp_path):
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     photograph(path / "images" / "06.jpg", SIZE[::-1])
     file = path / "images" / "06.jpg"
-    assert "width and height are swapped" in said(Inspection.from_folder(path), "error")
+    assert "width and height are swapped" in finding_text(Inspection.from_folder(path), "error")
     file.write_bytes(with_exif(file.read_bytes(), "<", 6))
     assert Inspection.from_folder(path).findings == []
     assert load_image(read_scene(path).views[6]).shape == (48, 64, 3)
@@ -383,11 +387,11 @@ def test_masks(scene):
     photograph(scene / "masks" / "00.png")
     assert (Inspection.from_folder(scene).facts.photos.masks, Inspection.from_folder(scene).findings) == (1, [])
     photograph(scene / "masks" / "01.png", (32, 20))
-    assert "mask of 01.png is 32x20, its camera 64x48" in said(Inspection.from_folder(scene), "error")
+    assert "mask of 01.png is 32x20, its camera 64x48" in finding_text(Inspection.from_folder(scene), "error")
     with pytest.raises(DataError):
         load_mask(read_scene(scene).views[1])
     (scene / "masks" / "01.png").write_bytes(b"no image")
-    assert "1 image file cannot be decoded (mask of 01.png)" in said(Inspection.from_folder(scene), "error")
+    assert "1 image file cannot be decoded (mask of 01.png)" in finding_text(Inspection.from_folder(scene), "error")
 
 
 def test_few_views(tmp_path):

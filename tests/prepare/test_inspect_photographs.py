@@ -12,7 +12,7 @@ from clsplat.prepare.gather import list_photographs
 from clsplat.prepare.inspect.facts import compare_photos
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene.images import CameraExposure
-from tests.support.orbit_scene import photograph, said
+from tests.support.orbit_scene import finding_text, photograph
 
 
 def texts(inspection: Inspection, level: str) -> list[str]:
@@ -24,7 +24,7 @@ def test_inspected_folder_is_shell_quoted(tmp_path):
     for name in ("one/a.png", "one/b.png", "two/c.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
         photograph(scene / name)
-    assert said(Inspection.from_folder(scene), "error") == (
+    assert finding_text(Inspection.from_folder(scene), "error") == (
         f"{scene} contains 3 photographs but no camera poses: `clsplat run photos --scene '{scene}'` finds the cameras"
     )
 
@@ -51,7 +51,7 @@ def test_too_few_photographs_are_refused_as_in_preparation(tmp_path, names):
     inspection = Inspection.from_folder(tmp_path)
     with pytest.raises(DataError) as refused:
         list_photographs(tmp_path)
-    assert said(inspection, "error").endswith(str(refused.value).removeprefix(str(tmp_path)))
+    assert finding_text(inspection, "error").endswith(str(refused.value).removeprefix(str(tmp_path)))
     assert not texts(inspection, "warning"), "the error says what to convert"
 
 
@@ -60,11 +60,11 @@ def test_two_valid_photographs_are_too_few(tmp_path):
         photograph(tmp_path / name)
     (tmp_path / "c.jpg").write_text("text")
     inspection = Inspection.from_folder(tmp_path)
-    assert said(inspection, "error").endswith("only 2 of 3 photographs can be read; export them again")
-    assert said(inspection, "warning").startswith("1 of 3 photographs cannot be read: c.jpg")
+    assert finding_text(inspection, "error").endswith("only 2 of 3 photographs can be read; export them again")
+    assert finding_text(inspection, "warning").startswith("1 of 3 photographs cannot be read: c.jpg")
 
 
-def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
+def write_photographs(folder: Path, factors: list[float]) -> dict[str, Path]:
     """Photographs of one textured thing, each with its brightness by that of the first."""
     rng, files = np.random.default_rng(1), {}
     for i, factor in enumerate(factors):
@@ -74,7 +74,7 @@ def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
 
 
 def test_dark_photograph_is_reported_only_if_blurred(tmp_path):
-    files = shown(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
+    files = write_photographs(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
     assert compare_photos(files).blurred == []
     pixels = cv2.imread(str(files["3.png"]))
     cv2.imwrite(str(files["3.png"]), cv2.GaussianBlur(pixels, (0, 0), 1))
@@ -82,7 +82,7 @@ def test_dark_photograph_is_reported_only_if_blurred(tmp_path):
 
 
 def test_close_up_on_black_is_not_blurred(tmp_path):
-    files = shown(tmp_path, [1] * 9)
+    files = write_photographs(tmp_path, [1] * 9)
     for name in [*files][:6]:
         pixels = cv2.imread(str(files[name]))
         pixels[:, 10:] = 0
@@ -91,7 +91,7 @@ def test_close_up_on_black_is_not_blurred(tmp_path):
 
 
 def test_brightness_step_is_a_hint_without_exif_exposure(tmp_path):
-    files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
+    files = write_photographs(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
     ((a, b, ratio),) = compare_photos(files).steps
     assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
     (note,) = texts(Inspection.from_folder(tmp_path), "note")
@@ -106,7 +106,7 @@ def test_brightness_step_is_a_hint_without_exif_exposure(tmp_path):
 
 
 def test_larger_object_on_black_is_no_brightness_step(tmp_path):
-    files = shown(tmp_path, [1, 1, 1])
+    files = write_photographs(tmp_path, [1, 1, 1])
     for name, wide in zip(files, (10, 30, 10), strict=True):
         pixels = cv2.imread(str(files[name]))
         pixels[:, wide:] = 0

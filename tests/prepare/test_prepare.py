@@ -50,7 +50,7 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def do(steps: list[Step], photos: Path, root: Path) -> tuple[str, list[str]]:
+def run_steps(steps: list[Step], photos: Path, root: Path) -> tuple[str, list[str]]:
     """The text of the last result, and the letters of the steps that ran."""
     Copy.calls.clear()
     folder = prepare(plan(steps, photos, root), photos, root)
@@ -59,8 +59,8 @@ def do(steps: list[Step], photos: Path, root: Path) -> tuple[str, list[str]]:
 
 def test_second_preparation_does_nothing(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    assert do(steps, photos, root) == ("pab", ["a", "b"])
-    assert do(steps, photos, root) == ("pab", [])
+    assert run_steps(steps, photos, root) == ("pab", ["a", "b"])
+    assert run_steps(steps, photos, root) == ("pab", [])
 
 
 def test_left_out_photographs_are_reported_again(photos, tmp_path, monkeypatch, caplog):
@@ -78,17 +78,17 @@ def test_left_out_photographs_are_reported_again(photos, tmp_path, monkeypatch, 
 
 def test_steps_after_a_change_are_redone(photos, tmp_path):
     root, a, b, c = tmp_path / "runs" / "prepared", Copy(letter="a"), Copy(letter="b"), Copy(letter="c")
-    do([a, b, c], photos, root)
-    assert do([a, Copy(letter="x"), c], photos, root) == ("paxc", ["x", "c"])
-    assert do([a, b, c], photos, root) == ("pabc", [])  # the earlier result is still there
+    run_steps([a, b, c], photos, root)
+    assert run_steps([a, Copy(letter="x"), c], photos, root) == ("paxc", ["x", "c"])
+    assert run_steps([a, b, c], photos, root) == ("pabc", [])  # the earlier result is still there
     (photos / "q.txt").write_text("q")
-    assert do([a, b, c], photos, root) == ("pqabc", ["a", "b", "c"])
+    assert run_steps([a, b, c], photos, root) == ("pqabc", ["a", "b", "c"])
 
 
 def test_plan_gives_reasons(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     assert [one.why for one in plan(steps, photos, root)] == ["no result yet"] * 2
-    do(steps, photos, root)
+    run_steps(steps, photos, root)
     assert [one.why for one in plan(steps, photos, root)] == ["", ""]
     changed = plan([steps[0], Copy(letter="z")], photos, root)
     assert [one.why for one in changed] == ["", "letter is z, was b"]
@@ -99,17 +99,17 @@ def test_plan_gives_reasons(photos, tmp_path):
 
 def test_missing_intermediate_results_are_not_redone(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    do(steps, photos, root)
+    run_steps(steps, photos, root)
     first = plan(steps, photos, root)[0].folder
     first.rename(tmp_path / "elsewhere")
-    assert do(steps, photos, root) == ("pab", [])
+    assert run_steps(steps, photos, root) == ("pab", [])
 
 
 def test_failed_step_leaves_no_files(photos, tmp_path):
     root = tmp_path / "runs" / "prepared"
-    assert refusal(do, [Copy(letter="a"), Copy(letter="b", fail=True)], photos, root) == "broken"
+    assert refusal(run_steps, [Copy(letter="a"), Copy(letter="b", fail=True)], photos, root) == "broken"
     assert [path.name.split("-")[0] for path in root.iterdir()] == ["copy"]
-    assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
+    assert run_steps([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
 
 
 def test_error_names_the_users_photographs(photos, tmp_path, monkeypatch):
@@ -131,7 +131,7 @@ def test_error_names_the_users_photographs(photos, tmp_path, monkeypatch):
 def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     caplog.set_level("INFO")
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    do(steps, photos, root)
+    run_steps(steps, photos, root)
     last = next(one.folder for one in plan(steps, photos, root) if one.step.letter == "b")
     damaged = "record.json" if fault in ("no record", "no JSON", "a list") else "x.txt"
     (last / damaged).unlink()
@@ -143,9 +143,9 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is made again"
     assert [one.why for one in plan(steps, photos, root)] == ["", why]
     assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
-    assert do(steps, photos, root) == ("pab", ["b"])
+    assert run_steps(steps, photos, root) == ("pab", ["b"])
     assert f"copy runs again: {why}" in caplog.messages
-    assert do(steps, photos, root) == ("pab", [])
+    assert run_steps(steps, photos, root) == ("pab", [])
 
 
 class Linked(Copy):
@@ -195,7 +195,7 @@ def test_leftovers_of_a_killed_run_are_removed(photos, tmp_path):
     left = folder.with_name(f".{folder.name}")
     left.mkdir(parents=True)
     (left / "half.txt").write_text("half")
-    assert do(steps, photos, root) == ("pa", ["a"])
+    assert run_steps(steps, photos, root) == ("pa", ["a"])
     assert [path.name for path in root.iterdir()] == [folder.name]
     assert not (folder / "half.txt").exists()
 
@@ -269,9 +269,9 @@ def test_step_that_refuses_its_photographs_leaves_no_files(photos, tmp_path, mon
 def test_runs_inside_the_folder_of_photographs_do_not_count(photos, tmp_path):
     root, steps = photos / "runs" / "prepared", [Copy(letter="a")]
     before = fingerprint(photos, photos / "runs")
-    do(steps, photos, root)
+    run_steps(steps, photos, root)
     assert fingerprint(photos, photos / "runs") == before != fingerprint(photos, tmp_path)
-    assert do(steps, photos, root) == ("pa", [])
+    assert run_steps(steps, photos, root) == ("pa", [])
 
 
 # ---- as part of a pipeline
@@ -416,7 +416,7 @@ def test_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
 
 
 @pytest.fixture
-def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def recorded_steps(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The steps from photographs to cameras, replaced by ones that only write files and note that they ran."""
     ran: list[str] = []
 
@@ -435,27 +435,27 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ran
 
 
-def test_placing_resumes_from_a_stopped_run(photos, tmp_path, done):
+def test_placing_resumes_from_a_stopped_run(photos, tmp_path, recorded_steps):
     out = tmp_path / "out"
     assert refusal(place_photographs, photos, out, 1600, "SIMPLE_RADIAL", "auto", "global") == "broken"
     assert not (out / "sparse").exists()
     assert place_photographs(photos, out) == 5
-    assert done == ["find_features", "match_features", "map_cameras", "map_cameras"]
+    assert recorded_steps == ["find_features", "match_features", "map_cameras", "map_cameras"]
     assert (out / "sparse" / "0" / "cameras.bin").read_text() == "4"
     assert (out / "images").is_dir()
 
 
-def test_placing_does_not_resume_with_other_settings(photos, tmp_path, done):
+def test_placing_does_not_resume_with_other_settings(photos, tmp_path, recorded_steps):
     out = tmp_path / "out"
     place_photographs(photos, out)
     assert "already contains a model" in refusal(place_photographs, photos, out)
     shutil.rmtree(out / "sparse")
-    done.clear()
+    recorded_steps.clear()
     assert place_photographs(photos, out, matching="sequential") == 5
-    assert done == ["match_features", "map_cameras"]
+    assert recorded_steps == ["match_features", "map_cameras"]
 
 
-def test_concurrent_placing_in_a_folder_is_refused(photos, tmp_path, done, monkeypatch):
+def test_concurrent_placing_in_a_folder_is_refused(photos, tmp_path, recorded_steps, monkeypatch):
     make, refused = prepare_steps.MatchFeatures.make, []
 
     def begins_another(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -467,11 +467,11 @@ def test_concurrent_placing_in_a_folder_is_refused(photos, tmp_path, done, monke
     monkeypatch.setattr(prepare_steps.MatchFeatures, "make", begins_another)
     assert place_photographs(photos, tmp_path / "out") == 5
     assert [message.partition(";")[0] for message in refused] == [f"{tmp_path / 'out'}: is in use by this process"]
-    assert done == ["find_features", "match_features", "map_cameras"]
+    assert recorded_steps == ["find_features", "match_features", "map_cameras"]
     assert not (tmp_path / "out" / ".steps" / "run.lock").exists()
 
 
-def test_user_images_are_not_overwritten(photos, tmp_path, done):
+def test_user_images_are_not_overwritten(photos, tmp_path, recorded_steps):
     (tmp_path / "out" / "images").mkdir(parents=True)
     assert "already contains `images`" in refusal(place_photographs, photos, tmp_path / "out")
-    assert done == []
+    assert recorded_steps == []

@@ -41,22 +41,22 @@ def matches_of(folder: Path, cameras: Sequence[tuple[float, float]]) -> Path:
     return folder / "database.db"
 
 
-def told(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
+def no_depth_reason(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
     return why_no_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
 
 
 def test_rotating_camera_gives_no_depth(tmp_path):
-    assert "only rotated in place" in told(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
+    assert "only rotated in place" in no_depth_reason(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
 
 
 def test_camera_rotating_at_several_positions_gives_depth(tmp_path):
     """Each photograph matches those of its own spot best."""
-    assert told(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
+    assert no_depth_reason(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
 
 
 def test_copies_of_one_photograph_are_duplicates(tmp_path):
-    assert "are all the same" in told(tmp_path, [(0, 0)] * 4)
+    assert "are all the same" in no_depth_reason(tmp_path, [(0, 0)] * 4)
 
 
 def test_copies_of_two_photographs_are_not_all_duplicates(tmp_path):
-    assert told(tmp_path, [(0, -60), (0, -60), (0, 60), (0, 60)]) == "", "different places, twice each"
+    assert no_depth_reason(tmp_path, [(0, -60), (0, -60), (0, 60), (0, 60)]) == "", "different places, twice each"

@@ -37,7 +37,7 @@ from tests.support.refusals import refusal
 ROOT = Path(__file__).parents[2]
 
 
-def place(photos: Path, out: Path, **matching: object) -> Path:
+def map_photographs(photos: Path, out: Path, **matching: object) -> Path:
     for name in ("features", "matches", "cameras"):
         (out / name).mkdir(parents=True)
     find_features(photos, out / "features", FeatureOptions(480, 2048))
@@ -58,8 +58,8 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return place(photos, tmp_path_factory.mktemp("placed"))
+def mapped(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return map_photographs(photos, tmp_path_factory.mktemp("placed"))
 
 
 def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -71,31 +71,31 @@ def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(b - scale * a @ (u @ sign @ vt).T, axis=1)
 
 
-def pose_errors(placed: Path) -> np.ndarray:
+def pose_errors(mapped: Path) -> np.ndarray:
     """Distances of cameras from where they were, by the size of their path."""
     truth = {view.name: view.position for view in read_scene(data_set("fox_opencv")).views}
-    views = read_scene(placed).views
+    views = read_scene(mapped).views
     errors = aligned_errors(np.stack([v.position for v in views]), np.stack([truth[v.name] for v in views]))
     return errors / np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
 
 
-def test_cameras_match_the_ground_truth(placed):
-    errors = pose_errors(placed)
+def test_cameras_match_the_ground_truth(mapped):
+    errors = pose_errors(mapped)
     assert len(errors) == 14
     assert np.median(errors) < 0.01
     assert errors.max() < 0.03
 
 
-def test_cameras_are_reproducible(photos, placed, tmp_path):
-    again = place(photos, tmp_path)
+def test_cameras_are_reproducible(photos, mapped, tmp_path):
+    again = map_photographs(photos, tmp_path)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        assert (again / "sparse" / "0" / name).read_bytes() == (placed / "sparse" / "0" / name).read_bytes(), name
+        assert (again / "sparse" / "0" / name).read_bytes() == (mapped / "sparse" / "0" / name).read_bytes(), name
 
 
-def test_points_with_two_observations(placed, tmp_path):
+def test_points_with_two_observations(mapped, tmp_path):
     """The cameras stay, and the points of three photographs; those of pairs come with them."""
-    map_cameras(placed.with_name("matches"), tmp_path, min_track_length=2)
-    model, before = read_model(tmp_path / "sparse" / "0"), read_model(placed / "sparse" / "0")
+    map_cameras(mapped.with_name("matches"), tmp_path, min_track_length=2)
+    model, before = read_model(tmp_path / "sparse" / "0"), read_model(mapped / "sparse" / "0")
     assert not list(tmp_path.glob(".*"))
     for number, image in before.images.items():
         assert np.array_equal(model.images[number].cam_from_world().matrix(), image.cam_from_world().matrix())
@@ -107,7 +107,7 @@ def test_points_with_two_observations(placed, tmp_path):
     assert (views == 2).sum() > 0.5 * known
     assert errors[views == 2].max() <= 1.0
     once, again = (
-        triangulate_pairs(read_model(placed / "sparse" / "0"), placed.with_name("matches") / "database.db", tmp_path)
+        triangulate_pairs(read_model(mapped / "sparse" / "0"), mapped.with_name("matches") / "database.db", tmp_path)
         for _ in range(2)
     )
     points = [{number: point.xyz.tobytes() for number, point in found.points3D.items()} for found in (once, again)]
@@ -120,8 +120,8 @@ def read_model(folder: Path):
 
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
 def test_other_matching_modes(photos, tmp_path, matching):
-    placed = place(photos, tmp_path, matching=matching, neighbors=3)
-    assert len(read_scene(placed).views) >= 12
+    mapped = map_photographs(photos, tmp_path, matching=matching, neighbors=3)
+    assert len(read_scene(mapped).views) >= 12
 
 
 def test_photographs_without_features(tmp_path):
@@ -129,16 +129,16 @@ def test_photographs_without_features(tmp_path):
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
     with pytest.raises(DataError, match="none has features"):
-        place(tmp_path, tmp_path / "out")
+        map_photographs(tmp_path, tmp_path / "out")
 
 
 @pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
-def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, few, attempt):
+def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, five, attempt):
     """With so few features of each photograph."""
     monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(480, 1500))
     for name in ("features", "matches", "cameras"):
         (tmp_path / name).mkdir()
-    find_features(photos, tmp_path / "features", FeatureOptions(480, few))
+    find_features(photos, tmp_path / "features", FeatureOptions(480, five))
     match_features(tmp_path / "features", tmp_path / "matches")
     figures = map_cameras(tmp_path / "matches", tmp_path / "cameras")
     assert figures["attempt"] == attempt
@@ -178,7 +178,7 @@ def rows(database: Path) -> dict[str, list[tuple]]:
 
 
 @pytest.fixture(scope="module")
-def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def five(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five of the photographs, one of them turned by EXIF."""
     folder = tmp_path_factory.mktemp("few")
     for file in sorted(photos.iterdir())[:5]:
@@ -188,11 +188,11 @@ def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_features_are_extracted_once_despite_a_kill(few, tmp_path, monkeypatch):
+def test_features_are_extracted_once_despite_a_kill(five, tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", FeatureOptions(320, 500))
+    find_features(five, tmp_path / "whole", FeatureOptions(320, 500))
     killed = f"""
 import os, signal
 from pathlib import Path
@@ -202,37 +202,37 @@ def counted(*a):
     calls.append(a)
     return find(*a) if len(calls) < 3 else os.kill(os.getpid(), signal.SIGKILL)
 features.sift = counted
-features.find_features(Path({str(few)!r}), Path({str(tmp_path / "half")!r}), features.FeatureOptions(320, 500))
+features.find_features(Path({str(five)!r}), Path({str(tmp_path / "half")!r}), features.FeatureOptions(320, 500))
 """
     assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
     sift, sizes = features_tool.sift, []
     monkeypatch.setattr(features_tool, "sift", lambda *a: (sizes.append(a[0].shape), sift(*a))[1])
-    find_features(few, tmp_path / "half", FeatureOptions(320, 500))
+    find_features(five, tmp_path / "half", FeatureOptions(320, 500))
     assert len(sizes) == 3, "two of five were kept"
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
     for file in sorted((tmp_path / "whole" / "images").iterdir()):
         assert (tmp_path / "half" / "images" / file.name).read_bytes() == file.read_bytes()
 
 
-def test_a_database_without_all_photographs_starts_again(few, tmp_path):
+def test_a_database_without_all_photographs_starts_again(five, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", FeatureOptions(320, 500))
-    first = sorted(path.name for path in few.iterdir())[:2]
+    find_features(five, tmp_path / "whole", FeatureOptions(320, 500))
+    first = sorted(path.name for path in five.iterdir())[:2]
     (tmp_path / "half" / "images").mkdir()
     for name in first:
-        shutil.copy(few / name, tmp_path / "half" / "images")
+        shutil.copy(five / name, tmp_path / "half" / "images")
     database = str(tmp_path / "half" / "database.db")
     pycolmap.Database.open(database).close()
-    pycolmap.import_images(database, str(few), image_names=first)
-    find_features(few, tmp_path / "half", FeatureOptions(320, 500))
+    pycolmap.import_images(database, str(five), image_names=first)
+    find_features(five, tmp_path / "half", FeatureOptions(320, 500))
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
 
 
-def test_pairs_are_matched_once(photos, placed, tmp_path):
+def test_pairs_are_matched_once(photos, mapped, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
-    source, whole = placed.parent / "features", placed.parent / "matches"
+    source, whole = mapped.parent / "features", mapped.parent / "matches"
     half = tmp_path / "half"
     half.mkdir()
     shutil.copy(source / "database.db", half)
@@ -262,12 +262,12 @@ def test_pairs_are_matched_once(photos, placed, tmp_path):
     map_cameras(half, tmp_path / "cameras")
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (tmp_path / "cameras" / "sparse" / "0" / name).read_bytes() == (
-            placed / "sparse" / "0" / name
+            mapped / "sparse" / "0" / name
         ).read_bytes()
 
 
-def test_pairs_are_matched_once_despite_a_kill(placed, tmp_path):
-    source, database = placed.parent / "features", tmp_path / "database.db"
+def test_pairs_are_matched_once_despite_a_kill(mapped, tmp_path):
+    source, database = mapped.parent / "features", tmp_path / "database.db"
     killed = f"""
 import os, signal, threading, time
 from pathlib import Path
@@ -289,21 +289,21 @@ matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
     match_features(source, tmp_path)
     found = rows(database)
     assert len(found.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
-    assert found == rows(placed.parent / "matches" / "database.db")
+    assert found == rows(mapped.parent / "matches" / "database.db")
 
 
-def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
+def test_counting_pairs_loses_none(mapped, tmp_path, monkeypatch):
     """A reader in pycolmap's own process would release the locks of its writes."""
     monkeypatch.setattr(progress, "FIRST_POLL", 0.01)
     heard: set[int] = set()
     with listening(lambda what, done, total, seconds_left: heard.add(done)):
-        match_features(placed.parent / "features", tmp_path)
+        match_features(mapped.parent / "features", tmp_path)
     assert max(heard) == 14 * 13 // 2
     assert len(heard) > 2, "counts between none and all of them"
-    assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
+    assert rows(tmp_path / "database.db") == rows(mapped.parent / "matches" / "database.db")
 
 
-def test_extraction_reports_its_progress(few, tmp_path):
+def test_extraction_reports_its_progress(five, tmp_path):
     heard: list[int] = []
 
     def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -311,7 +311,7 @@ def test_extraction_reports_its_progress(few, tmp_path):
             heard.append(done)
 
     with listening(hear):
-        find_features(few, tmp_path, FeatureOptions(320, 500))
+        find_features(five, tmp_path, FeatureOptions(320, 500))
     assert heard == [0, 1, 2, 3, 4, 5]
 
 

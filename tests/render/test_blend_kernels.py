@@ -7,7 +7,7 @@ from clsplat.conformance.checks.blending import BACKGROUND, check_blend, check_l
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
-from tests.support.deviations import assert_within_bounds, same_of_schedules
+from tests.support.deviations import assert_schedules_agree, assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting
 
 
@@ -78,7 +78,7 @@ def test_schedules_give_the_same_image(device, rng):
         other = Device(device.info, schedule)
         other.tuning["LANES"] = lanes
         for a, b in zip(render(other, case), (image, transmittance), strict=True):
-            same_of_schedules(device, a, b)
+            assert_schedules_agree(device, a, b)
 
 
 @on_devices("count", [0, 1, 15, 16, 17, 65, 150])

@@ -20,7 +20,7 @@ from tests.support.devices import each_once, on_devices, on_one_setting
 COUNTS = (1, 15, 16, 17, 63, 64, 65, 200)
 
 
-def around(case: Case, rng: np.random.Generator, count: int) -> list[View]:
+def views_around(case: Case, rng: np.random.Generator, count: int) -> list[View]:
     """Cameras of several focal lengths and image sizes that look at the scene from somewhere near the case's."""
     views = []
     for i in range(count):
@@ -48,7 +48,7 @@ def refreshed(device: Device, case: Case, views: list[View], settings: Smoothing
 def test_filter_variance(device, rng, count, focal):
     case = random_case(rng, count)
     case.parameters["means"][::3] *= 4  # out of sight of some, or of all
-    views = around(case, rng, 7)
+    views = views_around(case, rng, 7)
     lengths = [view.camera.fx for view in views]
     if focal == "global_max":
         lengths = [max(lengths)] * 7
@@ -60,7 +60,7 @@ def test_filter_variance(device, rng, count, focal):
 @on_one_setting
 def test_a_shared_focal_length_makes_both_definitions_equal(device, rng):
     case = random_case(rng, 100)
-    views = [replace(view, camera=replace(view.camera, fx=40.0)) for view in around(case, rng, 5)]
+    views = [replace(view, camera=replace(view.camera, fx=40.0)) for view in views_around(case, rng, 5)]
     of_each = refreshed(device, case, views, Smoothing())
     np.testing.assert_array_equal(refreshed(device, case, views, Smoothing(focal="global_max")), of_each)
     assert len(np.unique(of_each)) > 20

@@ -15,7 +15,7 @@ from clsplat.conformance.reference.blending import box_derivatives, box_response
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
-from tests.support.deviations import same_of_schedules
+from tests.support.deviations import assert_schedules_agree
 from tests.support.devices import each_once, on_devices, on_one_setting
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -194,7 +194,7 @@ def test_schedules_give_the_same_image(device, rng):
     for schedule, lanes in (("wide", 16), ("wide", 8), ("simt", 1)):
         other = Device(device.info, schedule)
         other.tuning["LANES"] = lanes
-        same_of_schedules(device, render(other, case).image.get()[:, :50, :70], image[:, :50, :70])
+        assert_schedules_agree(device, render(other, case).image.get()[:, :50, :70], image[:, :50, :70])
 
 
 def test_depth_and_alpha(device, rng):

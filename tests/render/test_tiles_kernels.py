@@ -20,7 +20,7 @@ from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
 
 
-def lists_of(device, case, sort):
+def tile_lists(device, case, sort):
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists = frame.lists
@@ -42,7 +42,7 @@ def alpha_of(record, width, height):
 @on_devices("count, width, height", [(0, 40, 30), (1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)])
 def test_every_visible_pixel_is_in_a_listed_tile(device, rng, count, width, height):
     case = random_case(rng, count, width, height)
-    frame, tiles = lists_of(device, case, "radix")
+    frame, tiles = tile_lists(device, case, "radix")
     records, tile = frame.splats.get().astype(np.float64), frame.camera.tile
     listed = [set(t.tolist()) for t in tiles]
     assert all(len(s) == len(t) for s, t in zip(listed, tiles, strict=True))
@@ -94,9 +94,9 @@ def test_readers_accept_no_more_tiles_than_devices_can_name(rng):
 def test_both_sorts_list_front_to_back(device, rng, count):
     case = random_case(rng, count, 100, 70)
     case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths
-    frame, radix = lists_of(device, case, "radix")
+    frame, radix = tile_lists(device, case, "radix")
     depth = case.project().depth
-    _, bitonic = lists_of(device, case, "bitonic")
+    _, bitonic = tile_lists(device, case, "bitonic")
     for a, b in zip(radix, bitonic, strict=True):
         np.testing.assert_array_equal(a, b)
         if len(a) > 1:
@@ -107,8 +107,8 @@ def test_both_sorts_list_front_to_back(device, rng, count):
 @on_one_setting
 def test_auto_measures_and_agrees(device, rng):
     case = random_case(rng, 100, 60, 50)
-    _, chosen = lists_of(device, case, "auto")
-    _, radix = lists_of(device, case, "radix")
+    _, chosen = tile_lists(device, case, "auto")
+    _, radix = tile_lists(device, case, "radix")
     for a, b in zip(chosen, radix, strict=True):
         np.testing.assert_array_equal(a, b)
 

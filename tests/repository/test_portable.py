@@ -75,7 +75,7 @@ for code, *words in json.loads(sys.argv[1]):
 SYSTEMS = {"without POSIX": WITHOUT_POSIX.format(modules=sorted(POSIX_ONLY - {"posix"})), "like macOS": LIKE_MACOS}
 
 
-def lacking(folder: Path, *systems: str) -> dict[str, str]:
+def environment_without(folder: Path, *systems: str) -> dict[str, str]:
     """The environment of processes on such systems; `folder` is for what changes them."""
     (folder / "sitecustomize.py").write_text("".join(systems))
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
@@ -83,7 +83,7 @@ def lacking(folder: Path, *systems: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module", params=SYSTEMS)
 def system(request, tmp_path_factory) -> dict[str, str]:
-    return lacking(tmp_path_factory.mktemp("system"), SYSTEMS[request.param])
+    return environment_without(tmp_path_factory.mktemp("system"), SYSTEMS[request.param])
 
 
 def command(environment: dict[str, str], *arguments: str | Path, expect: int = 0, text: bool = True):
@@ -113,7 +113,7 @@ def test_every_test_module_is_imported(tmp_path):
     )
     files = sorted((ROOT / "tests").rglob("test_*.py"))
     modules = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files]
-    command(lacking(tmp_path, *SYSTEMS.values()), "every_test", "tests.conftest", *modules)
+    command(environment_without(tmp_path, *SYSTEMS.values()), "every_test", "tests.conftest", *modules)
 
 
 def test_synthetic_scene_is_written_trained_and_resumed(system, tmp_path):
@@ -158,7 +158,7 @@ def calls(path: Path) -> list[ast.Call]:
     return [node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
 
 
-def is_text_of_an_unknown_encoding(call: ast.Call) -> bool:
+def has_implicit_encoding(call: ast.Call) -> bool:
     """Whether a call reads or writes text in the encoding that the system happens to have."""
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
     owner = ast.unparse(call.func.value) if isinstance(call.func, ast.Attribute) else ""
@@ -181,13 +181,13 @@ def test_implicit_text_encoding_is_detected():
     found = "a.read_text()|a.write_text(b)|open(a)|open(a, 'w')|p.open('a')|subprocess.run(a, text=True)"
     fine = "a.read_text('utf-8')|write_text(a, b)|open(a, 'rb')|p.open('ab')|Job.open(a, b)|open(a, encoding='utf-8')"
     for code in found.split("|"):
-        assert is_text_of_an_unknown_encoding(ast.parse(code).body[0].value), code
+        assert has_implicit_encoding(ast.parse(code).body[0].value), code
     for code in fine.split("|"):
-        assert not is_text_of_an_unknown_encoding(ast.parse(code).body[0].value), code
+        assert not has_implicit_encoding(ast.parse(code).body[0].value), code
 
 
 def test_text_files_name_their_encoding():
-    found = [(path, call.lineno) for path in FILES for call in calls(path) if is_text_of_an_unknown_encoding(call)]
+    found = [(path, call.lineno) for path in FILES for call in calls(path) if has_implicit_encoding(call)]
     assert not found, "\n".join(f"{path}:{line}: takes the encoding of the system; name utf-8" for path, line in found)
 
 

@@ -58,7 +58,7 @@ vendors = pytest.mark.parametrize(
 )
 
 
-def need(vendor: str) -> None:
+def require_compiler(vendor: str) -> None:
     _, missing = versions_of([vendor])
     if missing:
         pytest.skip(missing[vendor])
@@ -300,16 +300,16 @@ def test_statistics_of_two_commits_are_compared(tmp_path):
 
 def test_accepted_faults_must_still_occur():
     fault, *rest = accepted.ACCEPTED
-    assert accepted.others([*accepted.ACCEPTED, "another"], everything=True) == ["another"]
-    assert accepted.others([fault + "0"], everything=False) == [fault + "0"]
-    gone = accepted.others([fault], everything=True)
+    assert accepted.unexpected_failures([*accepted.ACCEPTED, "another"], everything=True) == ["another"]
+    assert accepted.unexpected_failures([fault + "0"], everything=False) == [fault + "0"]
+    gone = accepted.unexpected_failures([fault], everything=True)
     assert len(gone) == len(rest)
     assert all("is accepted, and was not seen" in one for one in gone)
 
 
 @vendors
 def test_largest_kernels_stay_within_the_limits(vendor, target):
-    need(vendor)
+    require_compiler(vendor)
     work = [(build, target) for build in builds(["simt"], QUICK) if not build.variant]
     table, failures = compile_all(work)
     assert failures == []
@@ -327,7 +327,7 @@ def test_largest_kernels_stay_within_the_limits(vendor, target):
     ids=["spill", "local", "group"],
 )
 def test_planted_fault_is_detected(vendor, target, source, words, tmp_path):
-    need(vendor)
+    require_compiler(vendor)
     found = compile_one((planted(tmp_path, source), target))
     assert not isinstance(found, str), found
     (fault,) = figures.faults({Place(target, "simt", name): of for name, of in found.items()})
@@ -336,7 +336,7 @@ def test_planted_fault_is_detected(vendor, target, source, words, tmp_path):
 
 @vendors
 def test_kernel_build_error_names_kernel_and_line(vendor, target, tmp_path):
-    need(vendor)
+    require_compiler(vendor)
     found = compile_one((planted(tmp_path, LOCAL.format(group=64, floats=64) + "int broken(\n"), target))
     assert isinstance(found, str)
     assert found.startswith(f"{target}: planted.cl (simt) does not compile: planted.cl:")
@@ -366,7 +366,7 @@ def test_an_unknown_target_is_refused():
     assert "no target named gfx1; there are amd, nvidia, intel, gfx900" in done.stderr
 
 
-def figures_of_all_targets() -> figures.Table:
+def all_target_figures() -> figures.Table:
     counts = dict.fromkeys(page.COUNTS, 2)
     small = Figures(**(vars(FINE) | {"local": 0, "counts": counts}))
     kernels = [(small, "scale"), *((Figures(**(vars(FINE) | {"counts": counts})), name) for name in page.COUNTED)]
@@ -374,7 +374,7 @@ def figures_of_all_targets() -> figures.Table:
 
 
 def test_outdated_page_is_detected(tmp_path, monkeypatch):
-    table, versions = figures_of_all_targets(), dict.fromkeys(VENDORS, "a compiler 1.0")
+    table, versions = all_target_figures(), dict.fromkeys(VENDORS, "a compiler 1.0")
     monkeypatch.setattr(page, "PAGE", tmp_path / "performance.md")
     page.PAGE.write_text(f"before\n{page.BEGIN}\n{page.END}\nafter\n")
     page.write(table, versions, VENDOR_OF)

@@ -21,7 +21,7 @@ from tests.support.runs import FEW, digest, records, steps_saved, train
 pytestmark = pytest.mark.slow
 
 
-def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
+def fail_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
     """Let a run fail in a step, in different places of it."""
     counts = {"photograph": 0, "kernel": 0}
     get, call = Photographs.get, Kernel.__call__
@@ -50,7 +50,7 @@ def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exc
 def test_failure_within_a_step_saves_the_previous_step(
     where, step, tiny_scene, tmp_path, monkeypatch, few_steps, caplog
 ):
-    raised = fails_at(step, monkeypatch, where)
+    raised = fail_at(step, monkeypatch, where)
     with pytest.raises(raised):
         train(tiny_scene, tmp_path, *FEW)
     monkeypatch.undo()
@@ -144,7 +144,7 @@ def test_incomplete_step_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, 
 
 
 def test_failed_save_does_not_hide_the_first_error(tiny_scene, tmp_path, monkeypatch, caplog):
-    fails_at(6, monkeypatch, "photograph")
+    fail_at(6, monkeypatch, "photograph")
     save = checkpoint.save
 
     def full(run, keep=None):

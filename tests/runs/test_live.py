@@ -21,7 +21,7 @@ from clsplat.runs.live.live import Live
 from clsplat.runs.live.preview import AIMS, MAX_POINTS, QUALITY, SIDES, Credit, Curves, PageCamera, Preview
 from clsplat.scene.detect import read_scene
 from clsplat.sweeps.experiment import Job
-from tests.support.live import beside, trained
+from tests.support.live import in_background, trained
 from tests.support.runs import FEW, digest
 
 pytestmark = pytest.mark.slow
@@ -93,7 +93,7 @@ def test_live_page_does_not_change_the_bits(live, few_steps, tiny_scene, tmp_pat
         seen["end"] = state
 
     live.desk.pause(True)
-    with beside(look):
+    with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
         live.close()
     assert digest(tmp_path / "run") == digest(few_steps)
@@ -131,7 +131,7 @@ def test_a_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
         os.kill(os.getpid(), signal.SIGTERM)
 
     live.desk.pause(True)
-    with beside(stop), pytest.raises(Interrupted, match="stopped at step 1, saved in "):
+    with in_background(stop), pytest.raises(Interrupted, match="stopped at step 1, saved in "):
         trained(live, tiny_scene, tmp_path / "run")
 
 
@@ -149,7 +149,7 @@ def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, t
         client.get("resume")
 
     live.desk.pause(True)
-    with beside(look):
+    with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
 
 
@@ -162,7 +162,7 @@ def test_live_renders_wait_for_their_time_budget(live, tiny_scene, tmp_path):
         client.until(lambda state: state.get("drawn"))
         answers.append(client.get("frame.jpg?page=1&pace=moving&view=0")[0])
 
-    with beside(look):
+    with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
         live.close()
     assert answers == [204]

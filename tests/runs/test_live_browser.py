@@ -7,7 +7,7 @@ from clsplat.runs.live.server import FOLDER as LIVE
 from clsplat.runs.live.server import OWN, page
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import Page
-from tests.support.live import beside, trained
+from tests.support.live import in_background, trained
 
 pytestmark = [pytest.mark.slow, pytest.mark.large]
 NEWEST = "live.watch.live.newest"
@@ -73,7 +73,7 @@ def test_a_visit_from_the_first_step_to_the_end(tiny_scene, tmp_path):
             assert browser.run("document.getElementById('pause').hidden")
             assert browser.run("document.getElementById('state').textContent") == "finished · step 12 of 12"
 
-        with beside(visit):
+        with in_background(visit):
             trained(live, tiny_scene, tmp_path / "run")
             live.close()
         assert browser.errors == []

@@ -21,7 +21,7 @@ def server(monkeypatch):
     made.stop()
 
 
-def talk(server: Server, data: bytes) -> bytes:
+def exchange(server: Server, data: bytes) -> bytes:
     """Send bytes; return all that comes back until the other side closes."""
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(data)
@@ -38,7 +38,7 @@ def test_server_listens_only_on_loopback(server):
 
 def test_requests_of_one_connection_are_answered_in_order(server):
     one = b"GET /token/%s HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    answers = talk(server, one % b"a" + one % b"b")
+    answers = exchange(server, one % b"a" + one % b"b")
     assert answers.count(b"HTTP/1.1 200 OK") == 2
     assert answers.index(b"\r\n\r\na") < answers.index(b"\r\n\r\nb")
 
@@ -47,14 +47,14 @@ def test_requests_of_one_connection_are_answered_in_order(server):
 def test_other_methods_are_refused_and_close_the_connection(server, method):
     body = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n"
     head = method + b" /token/ HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(body)
-    found = talk(server, head + body)
+    found = exchange(server, head + body)
     assert found.startswith(b"HTTP/1.1 501")
     assert found.count(b"HTTP/1.1") == 1
     assert b"<" not in found
 
 
 def test_an_answer_forbids_frames_caches_and_referrers(server):
-    lines = talk(server, b"GET /token/x HTTP/1.1\r\nHost: localhost\r\n\r\n").decode().split("\r\n")
+    lines = exchange(server, b"GET /token/x HTTP/1.1\r\nHost: localhost\r\n\r\n").decode().split("\r\n")
     assert lines[0] == "HTTP/1.1 200 OK"
     assert lines[-1] == "x"
     for line in ("Cache-Control: no-store", "Referrer-Policy: no-referrer", "X-Frame-Options: DENY"):

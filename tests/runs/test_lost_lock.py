@@ -22,7 +22,7 @@ GONE = "run.lock was removed or replaced while this process held it"
 OTHER = json.dumps({"process": 4321, "host": "there", "time": 0, "command": "clsplat resume"})
 
 
-def taken(out: Path) -> dict[str, bytes]:
+def take_folder(out: Path) -> dict[str, bytes]:
     """Another process takes the folder and writes in it; what is there then."""
     (out / LOCK).unlink()
     (out / LOCK).write_text(OTHER)
@@ -62,7 +62,7 @@ def run(scene: Path, out: Path) -> None:
 
 @pytest.mark.parametrize(
     ("take", "failure"),
-    [(taken, None), (taken, KeyboardInterrupt()), (removed, None), (removed, RuntimeError("a defect"))],
+    [(take_folder, None), (take_folder, KeyboardInterrupt()), (removed, None), (removed, RuntimeError("a defect"))],
 )
 def test_a_run_that_lost_its_folder_writes_nothing_more(take, failure, tiny_scene, tmp_path, monkeypatch):
     """It loses the folder at step 8, in an edit before the second checkpoint; with a failure, that ends it, too."""
@@ -92,7 +92,7 @@ def test_emergency_save_skips_a_lost_folder(tiny_scene, tmp_path, monkeypatch):
 
     def failing(state, keep=None) -> None:
         if state.step == 8 and not before:
-            before.update(taken(state.out))
+            before.update(take_folder(state.out))
             raise RuntimeError("a defect")
         save(state, keep)
 
@@ -105,7 +105,7 @@ def test_emergency_save_skips_a_lost_folder(tiny_scene, tmp_path, monkeypatch):
 def test_heartbeat_stops_and_reports_a_lost_folder(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
-        before = taken(tmp_path / "run")
+        before = take_folder(tmp_path / "run")
         while status.lost is None:
             time.sleep(0.001)
         with pytest.raises(OutputError, match=GONE):
@@ -119,7 +119,7 @@ def test_run_ending_before_its_first_step_keeps_the_new_status(tmp_path):
 
     def ends() -> None:
         with run_folder.opened(RunState.read(tmp_path / "run"), "new"):
-            before.update(taken(tmp_path / "run"))
+            before.update(take_folder(tmp_path / "run"))
             raise ValueError("ends")
 
     with pytest.raises(ValueError, match="ends"):

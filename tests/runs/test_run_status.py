@@ -17,7 +17,7 @@ from tests.support.runs import write_status
 pytestmark = pytest.mark.slow
 
 
-def put(folder: Path, **values) -> dict:
+def write_and_read_status(folder: Path, **values) -> dict:
     """Write a status of a run whose process has ended, and return what is found."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -27,49 +27,51 @@ def put(folder: Path, **values) -> dict:
 
 
 def test_missing_process_counts_as_killed(tmp_path):
-    found = put(tmp_path)
+    found = write_and_read_status(tmp_path)
     assert found["state"] == "killed"
     assert "silent" not in found
 
 
 @pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
 def test_remote_run_is_judged_only_by_its_heartbeat(elsewhere, tmp_path):
-    found = put(tmp_path, **elsewhere)
+    found = write_and_read_status(tmp_path, **elsewhere)
     assert found["state"] == "running"
     assert 199 < found["silent"] < 300
     place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
     assert f"\n  no heartbeat for {found['silent']} s; {place}" in reading.status_text(found)
-    assert "no heartbeat" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
+    assert "no heartbeat" not in reading.status_text(write_and_read_status(tmp_path, time=time.time() - 2, **elsewhere))
 
 
 def test_a_stopped_process_has_no_heartbeat(tmp_path):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        found = put(tmp_path, process=process.pid)
+        found = write_and_read_status(tmp_path, process=process.pid)
         process.communicate(b"\n")
     assert f"no heartbeat for {found['silent']} s; process {process.pid}" in reading.status_text(found)
 
 
 def test_status_prints_stage_and_time_left(tmp_path):
     amount = Amount(done=3, total=20, unit="views")
-    found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
+    found = write_and_read_status(
+        tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6
+    )
     assert reading.status_text(found).splitlines()[0] == (
         f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
     )
 
 
 def test_status_prints_left_out_photographs(tmp_path):
-    found = put(tmp_path, state="done", progress=None)
+    found = write_and_read_status(tmp_path, state="done", progress=None)
     features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
     found["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
     assert "3 of 4 photographs placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
 
 
 def test_clock_ahead_is_noted_and_gives_no_negative_time(tmp_path):
-    found = put(tmp_path, host="a", time=time.time() + 500)
+    found = write_and_read_status(tmp_path, host="a", time=time.time() + 500)
     assert found["silent"] == 0
     assert 490 < found["ahead"] <= 500
     assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a; whether " in reading.status_text(found)
-    found = put(tmp_path, host="a", time=time.time() + 5)
+    found = write_and_read_status(tmp_path, host="a", time=time.time() + 5)
     assert "ahead" not in found
     assert "its clock" not in reading.status_text(found)
 
@@ -78,20 +80,20 @@ def test_clock_ahead_is_noted_and_gives_no_negative_time(tmp_path):
 def test_suggested_command_works(state, tmp_path):
     more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
     (tmp_path / "pipeline.yaml").touch()
-    text = reading.status_text(put(tmp_path, **more))
+    text = reading.status_text(write_and_read_status(tmp_path, **more))
     assert f"no checkpoint was saved; `clsplat resume {tmp_path}` starts it over" in text
-    gone = reading.status_text(put(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
+    gone = reading.status_text(write_and_read_status(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
     assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` starts" in gone
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step_000007.npz").touch()
-    text = reading.status_text(put(tmp_path, **more))
+    text = reading.status_text(write_and_read_status(tmp_path, **more))
     assert f"`clsplat resume {tmp_path}` continues it" in text
     assert "--restart" not in text
 
 
 def test_step_is_the_later_of_status_and_report(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
-    assert ": failed at step 8 of 9" in reading.status_text(put(tmp_path, state="failed"))
+    assert ": failed at step 8 of 9" in reading.status_text(write_and_read_status(tmp_path, state="failed"))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +110,7 @@ def test_step_is_the_later_of_status_and_report(tmp_path):
     ],
 )
 def test_a_damaged_status_is_refused(name, value, tmp_path):
-    put(tmp_path, host="a")
+    write_and_read_status(tmp_path, host="a")
     path = tmp_path / "status.json"
     status = {**json.loads(path.read_text()), name: "HERE"}
     path.write_text(json.dumps(status).replace('"HERE"', value))
@@ -117,7 +119,7 @@ def test_a_damaged_status_is_refused(name, value, tmp_path):
 
 
 def test_a_status_of_a_newer_version_is_refused(tmp_path):
-    put(tmp_path)
+    write_and_read_status(tmp_path)
     path = tmp_path / "status.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))
     assert "of a newer clsplat" in refusal(reading.run_status, RunState.read(tmp_path))
@@ -125,7 +127,7 @@ def test_a_status_of_a_newer_version_is_refused(tmp_path):
 
 def test_status_has_no_terminal_escapes(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": ' + "9" * 4000 + "}\n")
-    found = put(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
+    found = write_and_read_status(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
     text = reading.status_text(found)
     assert "\x1b" not in text
     assert "[31mhi" in text

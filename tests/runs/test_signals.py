@@ -46,7 +46,7 @@ def pipeline(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(pipeline: str, tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def uninterrupted(pipeline: str, tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("signals") / "run"
     Job.open(pipeline, tiny_scene, out).run()
     return out
@@ -76,7 +76,7 @@ PLACES = {  # what is called for the n-th time when the signal comes -> the mess
 
 @pytest.mark.parametrize("place", PLACES)
 def test_long_stage_ends_early_with_saved_state_and_is_repeated(
-    place, pipeline, undisturbed, tiny_scene, tmp_path, monkeypatch
+    place, pipeline, uninterrupted, tiny_scene, tmp_path, monkeypatch
 ):
     module, name, call, message = PLACES[place]
     with monkeypatch.context() as patch:
@@ -88,9 +88,9 @@ def test_long_stage_ends_early_with_saved_state_and_is_repeated(
     assert list((tmp_path / "checkpoints").glob("*.npz"))
     Job.resume(tmp_path).run()
     assert read_status(tmp_path)["state"] == "done"
-    assert digest(tmp_path) == digest(undisturbed)
-    for file in (undisturbed / "renders").rglob("*.png"):
-        assert (tmp_path / file.relative_to(undisturbed)).read_bytes() == file.read_bytes()
+    assert digest(tmp_path) == digest(uninterrupted)
+    for file in (uninterrupted / "renders").rglob("*.png"):
+        assert (tmp_path / file.relative_to(uninterrupted)).read_bytes() == file.read_bytes()
 
 
 def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):

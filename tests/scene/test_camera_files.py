@@ -72,7 +72,7 @@ def scene_of(rng, tmp_path):
     return make
 
 
-def same(old, new, prefix=""):
+def assert_same_scene(old, new, prefix=""):
     assert [prefix + view.name for view in old.views] == [view.name for view in new.views]
     for a, b in zip(old.views, new.views, strict=True):
         np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=4e-15)
@@ -90,7 +90,7 @@ def test_colmap_round_trip(model, lenses, scene_of, tmp_path):
     assert [file.name for file in files] == ["cameras.bin", "images.bin", "points3D.bin"]
     assert len(read_cameras(tmp_path / "out/sparse/0")) == lenses
     found = clsplat.read_scene(tmp_path / "out")
-    same(scene, found)
+    assert_same_scene(scene, found)
     assert [view.lens for view in found.views] == [view.lens for view in scene.views]
 
 
@@ -99,7 +99,7 @@ def test_nerfstudio_round_trip(model, lenses, scene_of, tmp_path, rng):
     scene = scene_of(model, lenses)
     clsplat.write_cameras(scene, tmp_path / "out", "nerfstudio", images="copy")
     found = clsplat.read_scene(tmp_path / "out")
-    same(scene, found, "images/")
+    assert_same_scene(scene, found, "images/")
     assert (found.train, found.test) == (scene.train, scene.test)
     rays = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
     for a, b in zip(scene.views, found.views, strict=True):

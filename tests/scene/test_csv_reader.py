@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Reader
 from clsplat.scene.detect import is_scene, read_scene
-from tests.support.orbit_scene import orbit, said, write
+from tests.support.orbit_scene import finding_text, orbit, write
 from tests.support.refusals import refusal
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "csv_reader.py"
@@ -64,14 +64,14 @@ def test_inspection_matches_that_of_colmap(scene):
     for name in ("registered", "train", "test", "on_disk", "missing", "unregistered", "cameras", "photos"):
         assert getattr(found.facts, name) == getattr(expected.facts, name), name
     assert found.facts.extent == pytest.approx(expected.facts.extent)
-    assert said(found, "note").startswith("there are no points")
+    assert finding_text(found, "note").startswith("there are no points")
 
 
 @pytest.mark.usefixtures("_plugin")
 def test_a_missing_photograph_is_named(scene):
     (scene / "images" / "03.png").unlink()
     assert "03.png" in refusal(read_scene, scene / "images")
-    assert "03.png" in said(Inspection.from_folder(scene / "images"), "error")
+    assert "03.png" in finding_text(Inspection.from_folder(scene / "images"), "error")
 
 
 @pytest.mark.usefixtures("_plugin")

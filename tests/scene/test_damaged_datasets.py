@@ -231,7 +231,7 @@ def json_text(path: Path, text: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
     """Exit code, output and seconds of every case."""
     base = tmp_path_factory.mktemp("damaged")
     for i, (make, _, _) in enumerate(CASES.values()):
@@ -259,8 +259,8 @@ def fault_of(name: str, result: dict[str, object]) -> str:
 
 
 @pytest.mark.large
-def test_damaged_dataset_gives_one_sentence_and_a_code(said):
-    faults = [fault for name in CASES if (fault := fault_of(name, said[name]))]
+def test_damaged_dataset_gives_one_sentence_and_a_code(results):
+    faults = [fault for name in CASES if (fault := fault_of(name, results[name]))]
     assert not faults, "\n".join(faults)
 
 
@@ -276,7 +276,7 @@ def main(base: Path, count: int) -> None:
         start = time.process_time()  # waiting for other processes does not count
         out = base.parent / f"{base.name}-out" / f"{i:02d}"
         arguments = ["run", "smoke", "--scene", str(base / f"{i:02d}"), "--out", str(out)]
-        cases.append(one_run([*arguments, "--set", "optimize.steps=2"]))
+        cases.append(run_command_line([*arguments, "--set", "optimize.steps=2"]))
         cases[-1]["seconds"] = time.process_time() - start
     print(json.dumps({"cases": cases, "peak": peak_memory()}))
 
@@ -293,7 +293,7 @@ def peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def one_run(arguments: list[str]) -> dict[str, object]:
+def run_command_line(arguments: list[str]) -> dict[str, object]:
     """Run the command line; catch what it prints as errors, and how it ends."""
     from clsplat import cli
     from clsplat.core import terminal

@@ -128,22 +128,22 @@ def views_of(count: int, *scales: float) -> list[View]:
     return list(make_scene(Path("none"), views, set(), None).downscaled(*scales).views)
 
 
-def drawn(views: list[View], order: str, steps: int | list[int], seed: int = 0) -> list[View]:
+def draw_views(views: list[View], order: str, steps: int | list[int], seed: int = 0) -> list[View]:
     """The views of some steps, or of all from 1 to `steps`."""
     pool, chosen = ViewPool(views, seed), variants(Order)[order]()
     return [chosen.at(pool, step) for step in (range(1, steps + 1) if isinstance(steps, int) else steps)]
 
 
-def shares(views: list[View], order: str, steps: int) -> dict[float, float]:
-    found = Counter(view.downscale for view in drawn(views, order, steps))
+def scale_fractions(views: list[View], order: str, steps: int) -> dict[float, float]:
+    found = Counter(view.downscale for view in draw_views(views, order, steps))
     return {scale: count / steps for scale, count in found.items()}
 
 
 def test_order_decides_how_often_scales_are_drawn():
     views = views_of(10, 1, 2, 4, 8)
-    assert shares(views, "uniform", 400) == {1: 0.25, 2: 0.25, 4: 0.25, 8: 0.25}
-    assert shares(views, "shuffle", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
-    stack = shares(views, "stack", 20_000)
+    assert scale_fractions(views, "uniform", 400) == {1: 0.25, 2: 0.25, 4: 0.25, 8: 0.25}
+    assert scale_fractions(views, "shuffle", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
+    stack = scale_fractions(views, "stack", 20_000)
     assert stack[1] == pytest.approx(0.475, abs=0.015)
     for scale in (2, 4, 8):
         assert stack[scale] == pytest.approx(0.175, abs=0.015)
@@ -152,13 +152,13 @@ def test_order_decides_how_often_scales_are_drawn():
 @pytest.mark.parametrize("order", ["uniform", "shuffle", "stack"])
 def test_the_order_depends_on_seed_and_step_alone(order):
     views = views_of(7, 1, 2)
-    straight = drawn(views, order, 60, seed=3)
-    assert drawn(views, order, [50, 3, 21], seed=3) == [straight[step - 1] for step in (50, 3, 21)]
-    assert drawn(views, order, 60, seed=4) != straight
+    straight = draw_views(views, order, 60, seed=3)
+    assert draw_views(views, order, [50, 3, 21], seed=3) == [straight[step - 1] for step in (50, 3, 21)]
+    assert draw_views(views, order, 60, seed=4) != straight
 
 
 def test_every_view_is_drawn_before_any_repeats():
     views = views_of(7, 1, 2)
-    found = drawn(views, "uniform", 28)
+    found = draw_views(views, "uniform", 28)
     for epoch in (found[:14], found[14:]):
         assert len({(view.name, view.downscale) for view in epoch}) == 14

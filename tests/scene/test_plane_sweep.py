@@ -115,15 +115,15 @@ def test_pixels_are_placed_at_exact_depths(table):
 
 
 @pytest.fixture(scope="module")
-def everywhere(table):
+def all_points(table):
     """Points on all pixels."""
     return swept(table, lambda view: None)
 
 
-def test_transparent_pixels_give_no_points(table, everywhere):
+def test_transparent_pixels_give_no_points(table, all_points):
     shown = {view.name: opaque_pixels(view) for view in table[0]}
     assert not any((shown[name] & np.isinf(depth)).any() for name, depth in table[1].items())
-    assert 500 < len(swept(table, opaque_pixels)) < len(everywhere)
+    assert 500 < len(swept(table, opaque_pixels)) < len(all_points)
 
 
 def test_masked_pixels_give_no_points(table, tmp_path):
@@ -157,8 +157,8 @@ def test_missing_surfaces_are_added(rng):
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
 
-def test_added_points_are_reproducible(table, everywhere):
-    first, second = everywhere, swept(table, lambda view: None)
+def test_added_points_are_reproducible(table, all_points):
+    first, second = all_points, swept(table, lambda view: None)
     for name in ("positions", "colors"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     assert len(swept_points(table[0], LOOK_AT, before_a_sky, 700, 0)) == 700 < len(first)

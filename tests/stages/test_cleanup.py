@@ -44,7 +44,7 @@ stages:
 
 
 @pytest.fixture(scope="module")
-def spoilt(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flawed_model(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """27 Gaussians in a cube, and four more that should not be: faint, far, out of sight, wide before a camera."""
     scene = read_scene(tiny_scene)
     view = scene.split("train")[0]
@@ -82,15 +82,15 @@ def opened(scene: Path, model: Path, out: Path) -> Run:
 
 
 @pytest.mark.parametrize("row", RULES)
-def test_each_rule_removes_its_target(tiny_scene, spoilt, tmp_path, row):
-    run = opened(tiny_scene, spoilt, tmp_path / "run")
+def test_each_rule_removes_its_target(tiny_scene, flawed_model, tmp_path, row):
+    run = opened(tiny_scene, flawed_model, tmp_path / "run")
     before = run.model.gaussians.get("means")
     Cleanup(stage="cleanup", rules=[RULES[row]]).act(run)
     np.testing.assert_array_equal(run.model.gaussians.get("means"), np.delete(before, row, axis=0))
 
 
-def test_all_rules_remove_and_report_their_targets(tiny_scene, spoilt, tmp_path, caplog):
-    run, caplog.handler.level = opened(tiny_scene, spoilt, tmp_path / "run"), 0
+def test_all_rules_remove_and_report_their_targets(tiny_scene, flawed_model, tmp_path, caplog):
+    run, caplog.handler.level = opened(tiny_scene, flawed_model, tmp_path / "run"), 0
     before = {name: run.model.gaussians.get(name) for name in run.model.gaussians.trained}
     with caplog.at_level("INFO", logger="clsplat"):
         Cleanup(stage="cleanup", rules=list(RULES.values())).act(run)
@@ -107,14 +107,14 @@ def test_large_screen_size_is_kept_by_default():
     assert Cleanup(stage="cleanup").rules == [RULES[row] for row in (FAINT, FAR, USELESS)]
 
 
-def test_one_view_suffices_by_default(tiny_scene, spoilt, tmp_path):
-    run = opened(tiny_scene, spoilt, tmp_path / "run")
+def test_one_view_suffices_by_default(tiny_scene, flawed_model, tmp_path):
+    run = opened(tiny_scene, flawed_model, tmp_path / "run")
     Cleanup(stage="cleanup", rules=[PruneUseless(views_below=2)]).act(run)
     assert run.model.gaussians.count < 30, "others than the one out of sight"
 
 
-def test_removing_every_gaussian_is_refused(tiny_scene, spoilt, tmp_path):
-    run = opened(tiny_scene, spoilt, tmp_path / "run")
+def test_removing_every_gaussian_is_refused(tiny_scene, flawed_model, tmp_path):
+    run = opened(tiny_scene, flawed_model, tmp_path / "run")
     before = run.model.gaussians.get("means")
     with pytest.raises(NumericError, match="cleanup: its rules would remove all Gaussians; weaken them"):
         Cleanup(stage="cleanup", rules=[PruneFaint(opacity_below=0.9)]).act(run)
@@ -122,9 +122,9 @@ def test_removing_every_gaussian_is_refused(tiny_scene, spoilt, tmp_path):
     assert run.is_consistent
 
 
-def test_undeclared_rewriting_rule_does_not_change_the_model(tiny_scene, spoilt, tmp_path, monkeypatch):
+def test_undeclared_rewriting_rule_does_not_change_the_model(tiny_scene, flawed_model, tmp_path, monkeypatch):
     monkeypatch.setattr(MergeNeighbors, "rewrites", False)
-    run = opened(tiny_scene, spoilt, tmp_path / "run")
+    run = opened(tiny_scene, flawed_model, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
     with pytest.raises(ConfigError, match=r"a rule changes .* of Gaussians that stay; use it in densify"):
         Cleanup(stage="cleanup", rules=[MergeNeighbors()]).act(run)

@@ -208,7 +208,7 @@ stages:
 
 
 @pytest.fixture(scope="module")
-def many(source: Path) -> Path:
+def varied_harmonics(source: Path) -> Path:
     """A model with more harmonics than a small palette has vectors."""
     tables, rng = load(source).tables(), np.random.default_rng(1)
     of = rng.integers(0, len(tables["means"]), 3000)
@@ -218,13 +218,13 @@ def many(source: Path) -> Path:
     return file
 
 
-def test_sog_stores_the_trained_harmonics(many, tiny_scene, tmp_path):
-    (tmp_path / "palette.yaml").write_text(PALETTE.replace("MODEL", json.dumps(str(many))))
+def test_sog_stores_the_trained_harmonics(varied_harmonics, tiny_scene, tmp_path):
+    (tmp_path / "palette.yaml").write_text(PALETTE.replace("MODEL", json.dumps(str(varied_harmonics))))
     run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"))
     model, back = load(run.out / "point_cloud.ply"), load(run.out / "model.sog")
     assert len(np.unique(model.sh_rest, axis=0)) <= 1024 < len(model)
     assert len(np.unique(model.sh_rest)) <= 256
-    assert not np.array_equal(model.sh_base, load(many).sh_base), "the other tables were trained"
+    assert not np.array_equal(model.sh_base, load(varied_harmonics).sh_base), "the other tables were trained"
     ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
     np.testing.assert_array_equal(ours[0], theirs[0])
     np.testing.assert_array_equal(ours[1], theirs[1])
@@ -245,8 +245,8 @@ ROUNDED = PALETTE.replace(
 ).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")
 
 
-def test_rounded_tables_are_frozen_and_written_exactly(many, tiny_scene, tmp_path):
-    (tmp_path / "rounded.yaml").write_text(ROUNDED.replace("MODEL", json.dumps(str(many))))
+def test_rounded_tables_are_frozen_and_written_exactly(varied_harmonics, tiny_scene, tmp_path):
+    (tmp_path / "rounded.yaml").write_text(ROUNDED.replace("MODEL", json.dumps(str(varied_harmonics))))
     out = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "rounded.yaml")).out
     before, after, back = (load(out / name).tables() for name in ("before.ply", "point_cloud.ply", "model.sog"))
     changed = [name for name in before if not np.array_equal(before[name], after[name])]
@@ -275,14 +275,14 @@ LEARNED = PALETTE.replace(
 
 
 @pytest.fixture(scope="module")
-def learned(many: Path, tiny_scene: Path, tmp_path_factory) -> Path:
+def palette_run(varied_harmonics: Path, tiny_scene: Path, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("learned")
-    (out / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(many))))
+    (out / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(varied_harmonics))))
     return train(tiny_scene, out / "run", pipeline=str(out / "palette.yaml")).out
 
 
-def test_gaussians_train_their_shared_vector_together(learned):
-    before, after = (load(learned / f"{name}.ply").sh_rest for name in ("before", "after"))
+def test_gaussians_train_their_shared_vector_together(palette_run):
+    before, after = (load(palette_run / f"{name}.ply").sh_rest for name in ("before", "after"))
     vectors, labels = np.unique(before, axis=0, return_inverse=True)
     assert len(vectors) <= 1024 < len(before)
     pairs = np.unique(np.concatenate([labels.reshape(-1, 1), after], axis=1), axis=0)
@@ -290,8 +290,8 @@ def test_gaussians_train_their_shared_vector_together(learned):
     assert not np.array_equal(before, after)
 
 
-def test_trained_palette_is_rounded_to_sog_precision(learned):
-    after, model, back = (load(learned / name) for name in ("after.ply", "point_cloud.ply", "model.sog"))
+def test_trained_palette_is_rounded_to_sog_precision(palette_run):
+    after, model, back = (load(palette_run / name) for name in ("after.ply", "point_cloud.ply", "model.sog"))
     assert len(np.unique(model.sh_rest)) <= 256 < len(np.unique(after.sh_rest))
     assert len(np.unique(model.sh_rest, axis=0)) <= 1024
     np.testing.assert_allclose(model.sh_rest, after.sh_rest, atol=0.01)
@@ -300,8 +300,8 @@ def test_trained_palette_is_rounded_to_sog_precision(learned):
     np.testing.assert_array_equal(ours[1], theirs[1])
 
 
-def test_palette_training_resumes_with_the_same_bits(learned, many, tiny_scene, tmp_path):
-    (tmp_path / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(many))))
+def test_palette_training_resumes_with_the_same_bits(palette_run, varied_harmonics, tiny_scene, tmp_path):
+    (tmp_path / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(varied_harmonics))))
     checked = load_pipeline(str(tmp_path / "palette.yaml"), [f"scene.path='{tiny_scene}'", "optimize.log_every=1"])
     run = opening.open_run(checked, tmp_path / "run", None)
 
@@ -312,7 +312,7 @@ def test_palette_training_resumes_with_the_same_bits(learned, many, tiny_scene, 
         runner.execute(checked, run, "resume", stop)
     train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"), resume=True)
     for name in ("point_cloud.ply", "model.sog"):
-        assert (tmp_path / "run" / name).read_bytes() == (learned / name).read_bytes()
+        assert (tmp_path / "run" / name).read_bytes() == (palette_run / name).read_bytes()
 
 
 def test_share_palette_needs_a_palette(tmp_path):

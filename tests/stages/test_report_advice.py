@@ -16,7 +16,7 @@ from clsplat.training.modules.sky_choice import sky_advice
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
 
-def around(degrees: list[float], outward: bool = False) -> list[View]:
+def views_around(degrees: list[float], outward: bool = False) -> list[View]:
     """Views on a circle around the origin that look at it, or away from it, named after their angles."""
     found = []
     for angle in degrees:
@@ -75,15 +75,15 @@ def test_added_sky_is_reported_with_its_reason():
 
 
 def test_few_images_are_reported():
-    assert "only 1 training photograph" in "".join(from_capture(around([0]), around([0])))
-    many = around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
+    assert "only 1 training photograph" in "".join(from_capture(views_around([0]), views_around([0])))
+    many = views_around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
     assert not [*from_capture(many, many)]
 
 
 @pytest.mark.parametrize("turn", [0, 250])
 def test_the_widest_gap_around_a_scene_is_found(turn):
     angles = [turn + 12 * i for i in range(26)]  # 300 degrees, and 60 without any
-    degrees, one, other = widest_gap(around(angles))
+    degrees, one, other = widest_gap(views_around(angles))
     assert degrees == pytest.approx(60, abs=1)
     assert (one, other) == (f"at {angles[-1]:g}", f"at {angles[0]:g}")
 
@@ -91,11 +91,11 @@ def test_the_widest_gap_around_a_scene_is_found(turn):
 @pytest.mark.parametrize(
     "views",
     [
-        around([0, 10]),
-        around([12 * i for i in range(30)]),  # all around
-        around([10 * i for i in range(13)]),  # from one side
-        around([0, 90, 180, 270]),  # evenly
-        around([12 * i for i in range(26)], outward=True),
+        views_around([0, 10]),
+        views_around([12 * i for i in range(30)]),  # all around
+        views_around([10 * i for i in range(13)]),  # from one side
+        views_around([0, 90, 180, 270]),  # evenly
+        views_around([12 * i for i in range(26)], outward=True),
     ],
     ids=["two", "all around", "one side", "evenly", "outward"],
 )
@@ -104,4 +104,4 @@ def test_even_coverage_has_no_gap(views):
 
 
 def test_coincident_cameras_have_no_gap():
-    assert widest_gap([around([0])[0]] * 5) is None
+    assert widest_gap([views_around([0])[0]] * 5) is None

@@ -228,9 +228,9 @@ def scaled(node: Any, factor: float) -> Any:
     """Return settings with all numbers of steps multiplied."""
     if isinstance(node, dict):
         return {
-            key: at(value, factor, key)
+            key: scaled_steps(value, factor, key)
             if key in STEP_KEYS and isinstance(value, int)
-            else bounded(key, scaled(value, factor))
+            else limited_value(key, scaled(value, factor))
             for key, value in node.items()
         }
     if isinstance(node, list) and node and all(is_point(item) for item in node):
@@ -238,7 +238,7 @@ def scaled(node: Any, factor: float) -> Any:
     return [scaled(item, factor) for item in node] if isinstance(node, list) else node
 
 
-def bounded(key: str, value: Any) -> Any:
+def limited_value(key: str, value: Any) -> Any:
     return min(value, SIZES[key]) if key in SIZES and isinstance(value, int) else value
 
 
@@ -247,7 +247,7 @@ def is_point(item: Any) -> bool:
     return isinstance(item, list) and len(item) == 2 and all(type(part) in (int, float) for part in item)
 
 
-def at(steps: int, factor: float, key: str) -> int:
+def scaled_steps(steps: int, factor: float, key: str) -> int:
     """Return a scaled number of steps; a stop stays behind the last act before it, and 1 is each step."""
     if key == "stop":
         return math.floor((steps - 1) * factor) + 1

@@ -56,5 +56,5 @@ class Fake:
         return Ticket()
 
 
-def wanted(*costs: float) -> list[PendingCell]:
+def pending_cells(*costs: float) -> list[PendingCell]:
     return [PendingCell(CellRun(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]

@@ -16,7 +16,7 @@ def assert_within_bounds(deviations: Iterable[Deviation]) -> None:
     assert not [deviation.text for deviation in found if not deviation.passes]
 
 
-def same_of_schedules(device: Device, found: NDArray[np.float32], expected: NDArray[np.float32]) -> None:
+def assert_schedules_agree(device: Device, found: NDArray[np.float32], expected: NDArray[np.float32]) -> None:
     """Fail if the schedules compute different values: on a CPU, other bits; a GPU's compiler may fuse
     multiplications and additions in one schedule that it leaves apart in the other.
     """

@@ -26,10 +26,10 @@ def joined(*parts: Any) -> Any:
     return pytest.param(*values, marks=marks)
 
 
-def text_of(value: Any) -> str:
+def case_name(value: Any) -> str:
     """A short text of a value for the name of a case."""
     if isinstance(value, tuple | list) and len(value) < 5:
-        return "x".join(map(text_of, value))
+        return "x".join(map(case_name, value))
     text = (
         value
         if isinstance(value, str | int | float) or value is None
@@ -49,7 +49,7 @@ def on_devices(names: str, rows: Iterable[Any]) -> pytest.MarkDecorator:
     for name in NAMES:
         for i, row in zip(range(max(len(found), len(settings))), itertools.cycle(found), strict=False):
             setting = settings[(i + i // len(settings)) % len(settings)]
-            text = "-".join([name, setting, *map(text_of, row.values)])
+            text = "-".join([name, setting, *map(case_name, row.values)])
             cases.append(pytest.param((name, setting), *row.values, marks=row.marks, id=text))
     return pytest.mark.parametrize(f"device, {names}", cases, indirect=["device"])
 

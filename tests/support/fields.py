@@ -64,7 +64,7 @@ def resumed(finished: Path, scene: Path, out: Path, pipeline: str) -> Path:
     return out
 
 
-def alone(scene: Path, out: Path, pipeline: str) -> Path:
+def train_single_threaded(scene: Path, out: Path, pipeline: str) -> Path:
     """A run with one thread."""
     command = [sys.executable, "-c", ALONE, scene, out, pipeline]
     subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, cwd=Path(__file__).parents[2])

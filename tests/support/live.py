@@ -24,7 +24,7 @@ def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
 
 
 @contextmanager
-def beside(act):
+def in_background(act):
     """Run a function in a thread; fail where it fails."""
     faults = []
 

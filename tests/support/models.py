@@ -53,7 +53,7 @@ def splats(rng: np.random.Generator, count: int = 600, degree: int = 3, mode: st
     return SplatFile({name: table.astype(np.float32) for name, table in tables.items()}, numbers, mode)
 
 
-def there_and_back(
+def round_trip(
     path: Path, source: SplatFile, options: Writing | None = None, reading: Reading | None = None
 ) -> SplatFile:
     """Write a model and read it."""
@@ -82,7 +82,7 @@ def assert_close(found: SplatFile, expected: SplatFile, turned: float, **bounds:
         assert difference.max(initial=0) <= bound, f"{name}: {difference.max()} > {bound}"
 
 
-def parts(data):
+def split_glb(data):
     """The JSON and the binary chunk of a .glb file, whose lengths are checked."""
     magic, version, length = struct.unpack_from("<4s2I", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
@@ -95,7 +95,7 @@ def parts(data):
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
-def glued(tree, binary):
+def join_glb(tree, binary):
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(binary))

@@ -44,7 +44,7 @@ def photograph(file: Path, size: tuple[int, int] = SIZE) -> None:
     file.write_bytes(data.tobytes())
 
 
-def said(inspection: Inspection, level: str) -> str:
+def finding_text(inspection: Inspection, level: str) -> str:
     """The one finding of a level."""
     (text,) = [finding.text for finding in inspection.findings if finding.level == level]
     return text

@@ -70,14 +70,14 @@ class Yard:
 def missing(folder: Path, vector: np.ndarray, rng: np.random.Generator, exact: tuple[str, ...] = ()) -> Path:
     """Write a yard whose photographs show all points so far from where cameras do, but for some photographs."""
     yard = Yard(rng)
-    seen = {view.name: shown(view, yard.points.positions) for view in yard.views}
+    seen = {view.name: visible_rows(view, yard.points.positions) for view in yard.views}
     missed = {name: np.tile(vector * (name not in exact), (len(rows), 1)) for name, rows in seen.items()}
     yard.write(folder)
     write_model(folder / "sparse" / "0", yard.views, yard.points, Tracks(yard.points.positions, seen, missed))
     return folder
 
 
-def shown(view: View, positions: np.ndarray) -> np.ndarray:
+def visible_rows(view: View, positions: np.ndarray) -> np.ndarray:
     """The rows of the points that lie in the image of a view."""
     x, y, z = view.world_to_camera[:, :3] @ positions.T.astype(float) + view.world_to_camera[:, 3:]
     return np.flatnonzero((z > 0.1) & (np.abs(x) < z) & (np.abs(y) < z))

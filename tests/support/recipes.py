@@ -29,12 +29,12 @@ def short(name: str, scene: Path, *overrides: str, saved: int = 4) -> Pipeline:
     pipeline = load(name, [f"scene.path='{scene}'", opaque, *sensitive, *overrides])
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
-    stages = [often(old, stage, saved) if isinstance(stage, Optimize) else stage for old, stage in pairs]
+    stages = [with_frequent_edits(old, stage, saved) if isinstance(stage, Optimize) else stage for old, stage in pairs]
     kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
     return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
 
 
-def often(old: Stage, loop: Optimize, saved: int) -> Optimize:
+def with_frequent_edits(old: Stage, loop: Optimize, saved: int) -> Optimize:
     """Edits every few steps; without resets to faint, from which so few steps do not recover."""
     assert isinstance(old, Optimize)
     during = [

@@ -78,7 +78,7 @@ def models(out: Path) -> dict[str, str]:
     return {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 
-def undisturbed(sweep: Sweep, out: Path) -> dict[str, str]:
+def hashes_without_store(sweep: Sweep, out: Path) -> dict[str, str]:
     """The hashes of the same cells, run one after the other without a store."""
     found = load_experiment(str(sweep.file))
     assert found is not None

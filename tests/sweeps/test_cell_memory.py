@@ -5,7 +5,7 @@ import pytest
 from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.engines import Dispatcher
 from clsplat.sweeps.task import Outcome
-from tests.support.cells import Fake, wanted
+from tests.support.cells import Fake, pending_cells
 
 FULL, DONE = Outcome("failed", "", 5, "memory: too small"), Outcome("published")
 SMALL, LARGE = (DeviceSlot("w", name, "x", memory=memory) for name, memory in (("s", 1), ("l", 2)))
@@ -14,7 +14,9 @@ OTHER = DeviceSlot("w", "o", "y", memory=3)
 
 def states(store, options, engine, is_same=True, costs=(1,)):
     found = []
-    Dispatcher(store, engine, is_same, options, ended=lambda cell, end: found.append(end.state)).run(wanted(*costs))
+    Dispatcher(store, engine, is_same, options, ended=lambda cell, end: found.append(end.state)).run(
+        pending_cells(*costs)
+    )
     return found
 
 
@@ -33,7 +35,7 @@ def test_cell_that_does_not_fit_goes_to_a_larger_device(store, options, caplog):
 
 @pytest.mark.parametrize(("is_same", "ends"), [(True, ["failed"]), (False, ["published"])])
 def test_only_devices_that_may_run_a_cell_are_tried(store, options, is_same, ends):
-    (one,) = wanted(1)
+    (one,) = pending_cells(1)
     store.add(one.on("x"))
     engine = Fake(FULL, *[DONE] * (not is_same), slots=(SMALL, OTHER) if not is_same else (SMALL,))
     assert states(store, options, engine, is_same) == ends

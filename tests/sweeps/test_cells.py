@@ -23,7 +23,7 @@ from clsplat.sweeps.engines import CellLost, Dispatcher, InlineEngine, PendingCe
 from clsplat.sweeps.status import overview_text, store_status
 from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, BitsMismatch, CellAttempt, Store
 from clsplat.sweeps.task import CellOptions, Outcome, run_cell
-from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, wanted
+from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, pending_cells
 
 WAITS = "import os, sys\nwhile os.read(0, 9): pass\nsys.exit(130)"
 
@@ -38,7 +38,7 @@ pathlib.Path(sys.argv[2], "told.txt").write_text(made)
 """
 
 
-def told(store: Store) -> list[str]:
+def event_names(store: Store) -> list[str]:
     return [event["event"] for event in store.events()]
 
 
@@ -73,7 +73,7 @@ def test_a_cell_is_published_once_and_then_skipped(store, options):
     assert not (result / LEASE).exists()
     assert json.loads((result / MANIFEST).read_text())["bits"] == first.bits
     assert run_cell(CELL, store, command("raise SystemExit(1)"), options) == first
-    assert told(store) == ["start", "end", "publish", "skip"]
+    assert event_names(store) == ["start", "end", "publish", "skip"]
     assert json.loads((store.folder(CELL.key).path / "spec.json").read_text()) == SPEC
 
 
@@ -82,7 +82,7 @@ def test_damaged_result_is_run_again(store, options):
     (store.folder(CELL.key).result / "point_cloud.ply").write_bytes(b"bitz")
     assert run_cell(CELL, store, command(WRITES), options).state == "published"
     assert (store.folder(CELL.key).result / "point_cloud.ply").read_bytes() == b"bits"
-    assert told(store).count("publish") == 2
+    assert event_names(store).count("publish") == 2
 
 
 @pytest.mark.parametrize(("bits", "state"), [(b"bits", "published"), (b"others", "different")])
@@ -98,7 +98,7 @@ def test_first_of_two_writers_publishes_and_the_second_compares(store, options, 
     assert outcome.state == state
     assert (folder.result / "point_cloud.ply").read_bytes() == b"bits"
     if state == "published":
-        assert told(store)[-1] == "second"
+        assert event_names(store)[-1] == "second"
     else:
         assert "gave other bits" in outcome.message
         drive = Dispatcher(store, Fake(outcome), True, options)
@@ -118,9 +118,9 @@ def test_exit_code_decides_whether_a_cell_is_retried(store, options, code, start
         end += "n = sum(not one.is_symlink() for one in p.parent.iterdir()); sys.exit(130 if n == 1 else 0)"
     outcome = run_cell(CELL, store, command(end), options)
     if code == 130:
-        assert (outcome.state, told(store).count("start")) == ("published", 2)
+        assert (outcome.state, event_names(store).count("start")) == ("published", 2)
         return
-    assert (outcome.state, told(store).count("start")) == ("failed", starts)
+    assert (outcome.state, event_names(store).count("start")) == ("failed", starts)
     assert outcome.exit_code == (code if code > 0 else 1)
     assert outcome.message == ("as it is" if code > 0 else "its process ended with signal 9")
     failed = json.loads((store.folder(CELL.key).path / "failed.json").read_text())
@@ -141,9 +141,9 @@ def test_unwritable_result_counts_as_a_failure(store, options, monkeypatch, time
     monkeypatch.setattr("clsplat.sweeps.store.sync_below", sync)
     outcome = run_cell(CELL, store, command(WRITES), options)
     if times == 1:
-        assert (outcome.state, told(store).count("start")) == ("published", 2)
+        assert (outcome.state, event_names(store).count("start")) == ("published", 2)
         return
-    assert (outcome.state, outcome.exit_code, told(store).count("start")) == ("failed", 7, 3)
+    assert (outcome.state, outcome.exit_code, event_names(store).count("start")) == ("failed", 7, 3)
     assert "cannot be written (No space left on device)" in outcome.message
     assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
 
@@ -156,7 +156,7 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, opt
     count = len(list((few_steps / CHECKPOINTS).iterdir()))
     assert count > 1
     assert run_cell(CELL, store, command(saves), replace(options, retries=2)).state == "failed"
-    assert told(store).count("start") == count + 2
+    assert event_names(store).count("start") == count + 2
 
 
 def test_failure_with_a_newer_damaged_checkpoint_counts(few_steps, store, options):
@@ -166,7 +166,7 @@ def test_failure_with_a_newer_damaged_checkpoint_counts(few_steps, store, option
     newest.write_bytes(newest.read_bytes()[:-100])
     starts = "import os, sys; sys.exit(2 if len(os.listdir(os.path.dirname(sys.argv[2]))) > 6 else 6)"
     assert run_cell(CELL, store, command(starts), options).exit_code == 6
-    assert told(store).count("start") == options.retries
+    assert event_names(store).count("start") == options.retries
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
@@ -247,7 +247,7 @@ def test_process_frozen_past_its_attempt_uses_the_result(store, options, monkeyp
     other.manifest()
     outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), options)
     assert outcome.state == "published"
-    assert told(store) == ["start", "skip"]
+    assert event_names(store) == ["start", "skip"]
 
 
 def test_process_frozen_after_its_run_uses_the_result(store, options, monkeypatch):
@@ -263,7 +263,7 @@ def test_process_frozen_after_its_run_uses_the_result(store, options, monkeypatc
     monkeypatch.setattr("clsplat.sweeps.task._require_same_scene", sleeps)
     outcome = run_cell(CELL, store, command(WRITES), options)
     assert (outcome.state, outcome.message) == ("published", "")
-    assert told(store) == ["start", "end", "skip"]
+    assert event_names(store) == ["start", "end", "skip"]
     assert not folder.attempts()
 
 
@@ -328,7 +328,9 @@ def test_longest_cell_is_first_and_a_lost_one_restarts(store, options):
     done = Outcome("published")
     engine = Fake(CellLost, done, done, done)
     ended = []
-    Dispatcher(store, engine, True, options, ended=lambda cell, outcome: ended.append(cell.name)).run(wanted(1, 3, 2))
+    Dispatcher(store, engine, True, options, ended=lambda cell, outcome: ended.append(cell.name)).run(
+        pending_cells(1, 3, 2)
+    )
     assert [name for name, *_ in engine.started] == ["3", "3", "2", "1"]
     assert ended == ["3", "2", "1"]
 
@@ -338,25 +340,25 @@ SLOTS = (DeviceSlot("w", "one", "x"), DeviceSlot("w", "two", "y"), DeviceSlot("w
 
 def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, options):
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS)
-    Dispatcher(store, engine, True, options).run(wanted(1, 2, 3))
+    Dispatcher(store, engine, True, options).run(pending_cells(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {"y"}
 
 
 def test_cell_stays_in_the_class_it_started_in(store, options):
-    (one,) = wanted(9)
+    (one,) = pending_cells(9)
     store.add(one.on("x"))
     engine = Fake(*[Outcome("published")] * 4, slots=SLOTS)
-    Dispatcher(store, engine, False, options).run([one, *wanted(1, 2, 3)])
+    Dispatcher(store, engine, False, options).run([one, *pending_cells(1, 2, 3)])
     assert engine.started[0] == ("9", "one", "x")
     assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
 
 
 @pytest.mark.parametrize("published", ["x", "y", None])
 def test_class_with_most_results_breaks_ties(store, options, published):
-    for one in wanted(1, 2) if published else []:
+    for one in pending_cells(1, 2) if published else []:
         run_cell(one.on(published), store, command(WRITES), options)
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS[1::-1])
-    Dispatcher(store, engine, True, options).run(wanted(1, 2, 3))
+    Dispatcher(store, engine, True, options).run(pending_cells(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {published or "x"}
 
 
@@ -366,7 +368,7 @@ def test_sweep_whose_class_has_no_device_left_names_the_others(store, options, m
     looks = iter(range(40))
     drive.is_stopped = lambda: next(looks) == 39
     with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer one of that class"):
-        drive.run(wanted(1))
+        drive.run(pending_cells(1))
 
 
 def test_running_cells_do_not_rescan_waiting_ones(store, options, monkeypatch):
@@ -380,7 +382,7 @@ def test_running_cells_do_not_rescan_waiting_ones(store, options, monkeypatch):
         return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
 
     engine.start = start
-    Dispatcher(store, engine, False, options).run(wanted(*range(5)))
+    Dispatcher(store, engine, False, options).run(pending_cells(*range(5)))
     assert len(looks) == 5
 
 
@@ -391,7 +393,7 @@ def test_device_that_suits_no_cell_is_checked_once(store, options, monkeypatch):
         Dispatcher, "_fits", lambda drive, one, slot, _: looks.append(slot.bits) or suits(drive, one, slot, _)
     )
     monkeypatch.setattr("clsplat.sweeps.engines.POLL_INTERVAL_S", 0.0)
-    engine, begun = Fake(slots=SLOTS[:2]), wanted(*range(5))
+    engine, begun = Fake(slots=SLOTS[:2]), pending_cells(*range(5))
     for one in begun:
         store.add(one.on("x"))
 
@@ -406,7 +408,7 @@ def test_device_that_suits_no_cell_is_checked_once(store, options, monkeypatch):
 
 def test_a_signal_stops_a_sweep(store, options):
     with pytest.raises(Interrupted, match="and --resume"):
-        Dispatcher(store, Fake(), True, options, is_stopped=lambda: True).run(wanted(1))
+        Dispatcher(store, Fake(), True, options, is_stopped=lambda: True).run(pending_cells(1))
 
 
 def test_inline_engine_runs_a_cell(store, options, monkeypatch):

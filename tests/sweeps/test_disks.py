@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.cells import KILLS
-from tests.support.sweeps import Sweep, undisturbed, until
+from tests.support.sweeps import Sweep, hashes_without_store, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not KILLS, reason="CLSPLAT_KILLS=20 runs it: a minute")]
 CELLS = 2
@@ -22,7 +22,7 @@ CELLS = 2
 @pytest.fixture(scope="module")
 def expected(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("expected")
-    return undisturbed(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
+    return hashes_without_store(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.cells import KILLS
-from tests.support.sweeps import Sweep, kill, runs_below, undisturbed, until, workers_below
+from tests.support.sweeps import Sweep, hashes_without_store, kill, runs_below, until, workers_below
 
 psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
@@ -29,10 +29,10 @@ CELLS = 6 if KILLS > 2 else 2
 @pytest.fixture(scope="module")
 def expected(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("expected")
-    return undisturbed(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
+    return hashes_without_store(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
 
 
-def left_behind(folder: Path) -> "list[psutil.Process]":
+def remaining_runs(folder: Path) -> "list[psutil.Process]":
     """Runs of a sweep in a folder that are still there, whoever began them."""
     words = [(one, one.info["cmdline"] or []) for one in psutil.process_iter(["cmdline"])]
     return [one for one, own in words if "--attended" in own and any(str(folder) in word for word in own)]
@@ -59,7 +59,7 @@ def test_killing_workers_runs_and_drivers_loses_nothing(tiny_scene, tmp_path, ex
     assert killed >= KILLS, "there were too few checkpoints to wait for"
     assert sweep.events("publish") == CELLS
     assert sweep.events("start") > CELLS
-    until(lambda: not left_behind(tmp_path), 90)
+    until(lambda: not remaining_runs(tmp_path), 90)
     print(f"{killed} kills, {sweep.events('start')} starts, {sweep.events('publish')} published, hashes as undisturbed")
 
 
@@ -91,7 +91,7 @@ def test_signal_saves_and_the_command_resumes_elsewhere(tiny_scene, tmp_path, ex
     errors = process.communicate()[1]
     assert process.returncode == 130
     assert "Traceback" not in errors
-    assert not left_behind(tmp_path)
+    assert not remaining_runs(tmp_path)
     moved = sweep.store.root.rename(tmp_path / "elsewhere")  # as another mount point would
     sweep.on.write_text(sweep.on.read_text().replace(str(sweep.store.root), str(moved)))
     process = sweep.start()
@@ -151,7 +151,7 @@ def test_sweep_resumes_after_its_scheduler_is_killed(tiny_scene, tmp_path, expec
         errors = processes[1].communicate(timeout=200)[1]
         assert processes[1].returncode == 4, errors
         assert "the scheduler ended; start it, and run the sweep again with --resume" in errors
-    until(lambda: not left_behind(tmp_path), 90)
+    until(lambda: not remaining_runs(tmp_path), 90)
     with scheduler(port, processes):
         processes += [offer(port), sweep.start()]
         errors = processes[-1].communicate()[1]

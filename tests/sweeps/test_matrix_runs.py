@@ -216,12 +216,12 @@ def _cut(scene: Path, out: Path) -> None:
     photograph.write_bytes(photograph.read_bytes()[:200])
 
 
-def _in_the_way(scene: Path, out: Path) -> None:
+def _write_foreign_render(scene: Path, out: Path) -> None:
     (out / "seed=0" / "renders").mkdir(parents=True)
     (out / "seed=0" / "renders" / "mine.png").write_text("mine")
 
 
-def _a_run(scene: Path, out: Path) -> None:
+def _write_foreign_run(scene: Path, out: Path) -> None:
     (out / "seed=0").mkdir(parents=True)
     (out / "seed=0" / "pipeline.yaml").write_text("name: mine\n")
 
@@ -231,8 +231,8 @@ CAUSES: dict[str, tuple[int, str, str, Callable[[Path, Path], None] | None]] = {
     "a damaged photograph": (3, "", "", _cut),
     "no such device": (4, "nowhere", "", None),
     "a file that a stage needs": (3, "", "evaluate.lpips=missing.onnx", None),
-    "files of somebody else": (2, "", "", _in_the_way),
-    "another run": (2, "", "", _a_run),
+    "files of somebody else": (2, "", "", _write_foreign_render),
+    "another run": (2, "", "", _write_foreign_run),
 }
 
 

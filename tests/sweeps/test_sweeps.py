@@ -44,7 +44,7 @@ def file(tiny_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def on(tmp_path: Path) -> Path:
+def execution_file(tmp_path: Path) -> Path:
     path = tmp_path / "on.yaml"
     path.write_text(f"{{engine: inline, store: '{tmp_path / 'store'}'}}\n")
     return path
@@ -67,8 +67,8 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return ends
 
 
-def test_matrix_folder_is_the_same_with_a_store(file, on, runs, few_steps, tmp_path):
-    out = commands.run(file, out=tmp_path / "out", on=on)
+def test_matrix_folder_is_the_same_with_a_store(file, execution_file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out", on=execution_file)
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["tiny-seed=0", "tiny-seed=1"]
     assert "sweep: 2 runs" in (out / "compare.html").read_text()
     status = json.loads((out / "status.json").read_text())
@@ -83,7 +83,7 @@ def test_matrix_folder_is_the_same_with_a_store(file, on, runs, few_steps, tmp_p
     shutil.rmtree(out / "tiny-seed=1")
     (out / "tiny-seed=0" / "metrics.json").unlink()  # as a kill while it was placed would leave it
     runs["seed"] = "it is not run again"
-    assert commands.resume(out, on=on) == out
+    assert commands.resume(out, on=execution_file) == out
     for cell in ("tiny-seed=0", "tiny-seed=1"):
         assert (out / cell / "metrics.json").is_file()
     assert [event["event"] for event in store.events()].count("start") == 2
@@ -107,13 +107,13 @@ def test_job_array_tasks_run_the_cells_of_a_matrix(file, runs, tmp_path):
     assert [cell["state"] for cell in store_status(store)["cells"]] == ["published"] * 2
 
 
-def test_run_continued_in_a_matrix_folder_is_no_cell(file, on, runs, few_steps, tmp_path):
-    out = commands.run(file, out=tmp_path / "out", on=on)
+def test_run_continued_in_a_matrix_folder_is_no_cell(file, execution_file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out", on=execution_file)
     one = out / "tiny-seed=0"
     model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
     model.unlink()
     model.write_bytes(b"another")
-    commands.run(file, out=out, start="resume", on=on)
+    commands.run(file, out=out, start="resume", on=execution_file)
     assert model.read_bytes() == expected
     pipeline = one / "pipeline.yaml"
     pipeline.unlink()
@@ -122,28 +122,28 @@ def test_run_continued_in_a_matrix_folder_is_no_cell(file, on, runs, few_steps, 
     with pytest.raises(
         ClsplatError, match=r"seed=0: the run was continued with other settings .*; move that folder"
     ) as error:
-        commands.run(file, out=out, start="resume", on=on)
+        commands.run(file, out=out, start="resume", on=execution_file)
     assert error.value.exit_code == 2
     assert "# trained" in pipeline.read_text(), "it stays"
-    commands.run(file, out=out, start="restart", on=on)
+    commands.run(file, out=out, start="restart", on=execution_file)
     assert pipeline.read_bytes() == (few_steps / "pipeline.yaml").read_bytes()
     assert not (one / "checkpoints" / "step_000020.npz").exists()
 
 
-def test_failing_cell_keeps_the_others_and_sets_the_exit_code(file, on, runs, tmp_path):
+def test_failing_cell_keeps_the_others_and_sets_the_exit_code(file, execution_file, runs, tmp_path):
     runs["seed: 1"] = 3
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:
-        commands.run(file, out=tmp_path / "out", on=on)
+        commands.run(file, out=tmp_path / "out", on=execution_file)
     assert error.value.exit_code == 3
     assert "tiny-seed=1 failed and is not shown" in (tmp_path / "out" / "compare.html").read_text()
     assert commands.status(tmp_path / "store")["counts"] == {"failed": 1, "published": 1}
 
 
-def test_unreadable_scene_fails_only_its_cells(file, on, runs, tmp_path):
+def test_unreadable_scene_fails_only_its_cells(file, execution_file, runs, tmp_path):
     (tmp_path / "empty").mkdir()
     file.write_text(file.read_text().replace("scenes: [", f"scenes: ['{tmp_path / 'empty'}', "))
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, empty-seed=0: ") as error:
-        commands.run(file, out=tmp_path / "out", on=on)
+        commands.run(file, out=tmp_path / "out", on=execution_file)
     assert error.value.exit_code == 3
     assert json.loads((tmp_path / "out" / "status.json").read_text())["done"] == 4
     assert commands.status(tmp_path / "store")["counts"] == {"published": 2}
@@ -163,35 +163,35 @@ def test_cell_command_runs_a_cell_by_number(file, runs, tmp_path):
 
 
 def test_on_option_replaces_the_execution_of_a_file(file, tmp_path):
-    on = tmp_path / "lab.yaml"
+    execution_file = tmp_path / "lab.yaml"
     file.write_text(f"execution: {{engine: local}}\n{file.read_text()}")
     job = Job.open(str(file), out=tmp_path / "out")
     assert job.work.execution.store_folder(job.out) == tmp_path / "out" / "store", "a store is in the run folder"
-    on.write_text("{engine: 'dask://far:1', insecure: true, store: away, retries: 4}\n")
-    job = Job.open(str(file), out=tmp_path / "out", execution=read_execution(on))
+    execution_file.write_text("{engine: 'dask://far:1', insecure: true, store: away, retries: 4}\n")
+    job = Job.open(str(file), out=tmp_path / "out", execution=read_execution(execution_file))
     assert (job.work.execution.engine, job.work.execution.store) == ("dask://far:1", "away")
     assert not {"execution", "far", "away", "insecure"} & set(re.findall(r"\w+", job.work.text))
     with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
-        Job.open("smoke", execution=read_execution(on))
+        Job.open("smoke", execution=read_execution(execution_file))
 
 
-def test_sweep_resumes_only_in_its_first_store(file, on, runs, tmp_path):
+def test_sweep_resumes_only_in_its_first_store(file, execution_file, runs, tmp_path):
     out = tmp_path / "out"
     runs["seed: 1"] = 6
     with pytest.raises(ClsplatError, match="1 of 2 cells failed"):
-        commands.run(file, out=out, on=on)
+        commands.run(file, out=out, on=execution_file)
     with pytest.raises(
         ConfigError, match=r"out: was started with --on; its cells are in .*store: give --on FILE again"
     ):
         commands.resume(out)
 
 
-def test_existing_result_is_not_run_again(file, on, runs, tmp_path, monkeypatch):
+def test_existing_result_is_not_run_again(file, execution_file, runs, tmp_path, monkeypatch):
     monkeypatch.setattr(RunState, "is_whole", lambda state, pipeline: state.out.name == "tiny-seed=0")
-    out = commands.run(file, out=tmp_path / "out", on=on)
+    out = commands.run(file, out=tmp_path / "out", on=execution_file)
     shutil.rmtree(tmp_path / "store")
     shutil.rmtree(out / "tiny-seed=1")
-    commands.resume(out, on=on)
+    commands.resume(out, on=execution_file)
     assert [cell["name"] for cell in store_status(tmp_path / "store")["cells"]] == ["tiny-seed=1"]
     assert json.loads((out / "status.json").read_text())["done"] == 2
 
@@ -199,9 +199,9 @@ def test_existing_result_is_not_run_again(file, on, runs, tmp_path, monkeypatch)
 def test_cells_run_unchanged_without_a_store(file, tmp_path, monkeypatch):
     ran = []
     monkeypatch.setattr(Job, "run", lambda job, *options: ran.append(options))
-    on = tmp_path / "lab.yaml"
-    on.write_text("engine: inline\n")
-    commands.run(file, out=tmp_path / "out", on=on)
+    execution_file = tmp_path / "lab.yaml"
+    execution_file.write_text("engine: inline\n")
+    commands.run(file, out=tmp_path / "out", on=execution_file)
     assert ran == [(None, None, None)]
 
 
@@ -251,10 +251,10 @@ def test_invalid_execution_is_refused_with_its_line(tmp_path, text, words):
     ],
 )
 def test_invalid_file_for_on_is_refused_with_its_line(tmp_path, text, words):
-    on = tmp_path / "lab.yaml"
-    on.write_text(f"{{{text}}}\n")
+    execution_file = tmp_path / "lab.yaml"
+    execution_file.write_text(f"{{{text}}}\n")
     with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words}"):
-        read_execution(on)
+        read_execution(execution_file)
 
 
 def test_schema_has_the_execution_keys():
@@ -317,10 +317,10 @@ def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeyp
 
 
 def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
-    on = tmp_path / "lab.yaml"
-    on.write_text("engine: dask://127.0.0.1:1\n")
+    execution_file = tmp_path / "lab.yaml"
+    execution_file.write_text("engine: dask://127.0.0.1:1\n")
     with pytest.raises(ConfigError, match="--device: with a scheduler, workers choose the devices"):
-        commands.run(file, out=tmp_path / "out", on=on, device="pocl")
+        commands.run(file, out=tmp_path / "out", on=execution_file, device="pocl")
 
 
 def test_local_scheduler_needs_no_tls():
@@ -418,18 +418,18 @@ def test_local_engine_runs_cells_in_parallel_on_loopback(tmp_path, monkeypatch):
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
 
 
-def test_only_the_cell_with_a_changed_spec_fails(file, on, runs, tmp_path):
-    commands.run(file, out=tmp_path / "out", on=on)
+def test_only_the_cell_with_a_changed_spec_fails(file, execution_file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out", on=execution_file)
     store = Store(tmp_path / "store")
     (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
     (store.folder(key).path / "spec.json").write_text("{}")
     runs["seed"] = "no cell is run again"
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .* to run it again"):
-        commands.run(file, out=tmp_path / "out", start="resume", on=on)
+        commands.run(file, out=tmp_path / "out", start="resume", on=execution_file)
 
 
-def test_damaged_store_records_do_not_stop_status(file, on, runs, tmp_path):
-    commands.run(file, out=tmp_path / "out", on=on)
+def test_damaged_store_records_do_not_stop_status(file, execution_file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out", on=execution_file)
     store = Store(tmp_path / "store")
     before = store_status(store.root)
     (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')

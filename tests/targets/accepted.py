@@ -13,7 +13,7 @@ ACCEPTED = {
 }
 
 
-def others(failures: Iterable[str], everything: bool) -> list[str]:
+def unexpected_failures(failures: Iterable[str], everything: bool) -> list[str]:
     """Return the failures that are not accepted and, where `everything` was compiled, those that did not occur."""
     found = list(failures)
     gone = [f"'{fault}' is accepted, and was not seen: remove it" for fault in ACCEPTED if fault not in found]

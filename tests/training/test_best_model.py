@@ -63,7 +63,7 @@ def pipeline(tmp_path_factory) -> str:
 
 
 @pytest.fixture(scope="module")
-def best(tiny_scene, tmp_path_factory, pipeline) -> Path:
+def best_run(tiny_scene, tmp_path_factory, pipeline) -> Path:
     return train(tiny_scene, tmp_path_factory.mktemp("best") / "run", pipeline=pipeline).out
 
 
@@ -96,75 +96,75 @@ def equal_ends(one: Path, other: Path) -> None:
 # ---- the best model
 
 
-def test_training_leaves_the_best_model_on_validation_views(best):
-    measured = psnr_of(best, "validation")
+def test_training_leaves_the_best_model_on_validation_views(best_run):
+    measured = psnr_of(best_run, "validation")
     assert sorted(measured) == list(range(4, STEPS + 1, 4))
     assert max(measured, key=measured.__getitem__) == BEST
-    found = read_ply(best / "point_cloud.ply").parameters
-    _, expected = checkpoint.load(best / "checkpoints" / f"step_{BEST:06d}.npz")
+    found = read_ply(best_run / "point_cloud.ply").parameters
+    _, expected = checkpoint.load(best_run / "checkpoints" / f"step_{BEST:06d}.npz")
     for name in PARAMETERS:
         np.testing.assert_array_equal(found[name], expected[f"gaussians/{name}"], err_msg=name)
     assert len(found["means"]) < len(
-        checkpoint.load(best / "checkpoints" / f"step_{STEPS:06d}.npz")[1]["gaussians/means"]
+        checkpoint.load(best_run / "checkpoints" / f"step_{STEPS:06d}.npz")[1]["gaussians/means"]
     )
 
 
-def test_metrics_are_those_of_the_best_model(best):
-    found = metrics(best)
+def test_metrics_are_those_of_the_best_model(best_run):
+    found = metrics(best_run)
     assert found["kept"]["step"] == BEST
     assert found["kept"]["ended"] == found["steps"] == STEPS
     assert found["kept"]["evaluations"] == 5
-    assert found["validation"]["1"]["psnr"] == found["kept"]["validation"] == psnr_of(best, "validation")[BEST]
+    assert found["validation"]["1"]["psnr"] == found["kept"]["validation"] == psnr_of(best_run, "validation")[BEST]
     assert found["validation"]["1"]["views"] == 2
-    assert found["train"]["1"]["psnr"] == found["kept"]["train"] == psnr_of(best, "train")[BEST]
+    assert found["train"]["1"]["psnr"] == found["kept"]["train"] == psnr_of(best_run, "train")[BEST]
     assert found["train"]["1"]["views"] == 6
-    assert found["test"]["1"]["psnr"] == psnr_of(best, "test")[BEST]
-    assert f"best     model of step {BEST}" in "\n".join(summary(best))
-    assert summary(best)[-1].endswith("in a browser"), "more steps were no better"
+    assert found["test"]["1"]["psnr"] == psnr_of(best_run, "test")[BEST]
+    assert f"best     model of step {BEST}" in "\n".join(summary(best_run))
+    assert summary(best_run)[-1].endswith("in a browser"), "more steps were no better"
 
 
-def test_report_shows_three_splits_and_the_best_step(best):
-    page = (best / "report.html").read_text()
+def test_report_shows_three_splits_and_the_best_step(best_run):
+    page = (best_run / "report.html").read_text()
     for text in (*NAMES.values(), f"the model of step {BEST} is the best", "That model is kept"):
         assert text in page
 
 
 @pytest.mark.parametrize("last", [2, BEST, STEPS])
-def test_run_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, best, last):
-    out = shutil.copytree(best, tmp_path / "run")
+def test_run_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, best_run, last):
+    out = shutil.copytree(best_run, tmp_path / "run")
     for path in checkpoint.saved(out):
         if int(path.stem.removeprefix("step_")) > last:
             path.unlink()
     for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
         (out / name).unlink()
     train(tiny_scene, out, pipeline=pipeline, resume=True)
-    equal_ends(out, best)
+    equal_ends(out, best_run)
 
 
-def test_patience_ends_a_training(tiny_scene, tmp_path, pipeline, best):
+def test_patience_ends_a_training(tiny_scene, tmp_path, pipeline, best_run):
     run = train(tiny_scene, tmp_path / "run", *PATIENT, pipeline=pipeline)
     assert run.step == BEST + 2 * 4
     assert metrics(run.out)["kept"]["ended"] == run.step
-    assert digest(run.out) == digest(best)
+    assert digest(run.out) == digest(best_run)
     assert checkpoint.saved(run.out)[-1].name == f"step_{run.step:06d}.npz", "of the end, to train longer"
     longer = train(tiny_scene, run.out, "optimize.patience=99", pipeline=pipeline, resume=True)
     assert longer.step == STEPS
-    assert digest(run.out) == digest(best)
+    assert digest(run.out) == digest(best_run)
 
 
-def grown(out: Path) -> dict[int, bool]:
+def growth_by_step(out: Path) -> dict[int, bool]:
     """By step, whether an edit has added Gaussians."""
     return {line["step"]: line["after"] > line["before"] for line in lines(out) if line["kind"] == "densify"}
 
 
-def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeline, best):
-    assert grown(best) == {9: True, 12: True, 15: True, 18: True}
+def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeline, best_run):
+    assert growth_by_step(best_run) == {9: True, 12: True, 15: True, 18: True}
     out = train(tiny_scene, tmp_path / "1", "densify.patience=1", pipeline=pipeline).out
-    assert grown(out) == {9: True, 12: False, 15: False, 18: False}
+    assert growth_by_step(out) == {9: True, 12: False, 15: False, 18: False}
     assert metrics(out)["kept"]["growth_ended"] == 12
-    assert digest(out) == digest(best), "of a step before"
+    assert digest(out) == digest(best_run), "of a step before"
     until = train(tiny_scene, tmp_path / "until", "densify.grow_until=12", pipeline=pipeline).out
-    assert grown(until) == grown(out)
+    assert growth_by_step(until) == growth_by_step(out)
     again = shutil.copytree(tmp_path / "1", tmp_path / "again")
     for path in checkpoint.saved(again):
         if int(path.stem.removeprefix("step_")) > 14:
@@ -178,7 +178,7 @@ def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeli
 def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
     found = Measured(step=30, train=20, validation=20)
-    best = Best(
+    best_run = Best(
         measured=found,
         degree=0,
         metrics={},
@@ -188,15 +188,15 @@ def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
         last=found,
         growth_ended=20,
     )
-    run = SimpleNamespace(best=best.model_copy(update={"refit": "begun"}), is_refit=True)
+    run = SimpleNamespace(best=best_run.model_copy(update={"refit": "begun"}), is_refit=True)
     training = as_trained(pipeline, run).settings.training
     density = next(stage for stage in training.during if stage.stage == "densify")
     assert (training.steps, density.patience, density.grow_until) == (30, None, 20)
 
 
-def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, best):
+def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, best_run):
     longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=24", pipeline=pipeline)
-    out = shutil.copytree(best, tmp_path / "run")
+    out = shutil.copytree(best_run, tmp_path / "run")
     train(tiny_scene, out, "optimize.steps=24", pipeline=pipeline, resume=True)
     assert digest(out) == digest(longer.out)
     assert sorted(psnr_of(out, "validation")) == list(range(4, 25, 4))
@@ -248,11 +248,11 @@ def test_twenty_measurements_are_added_by_default(pipeline):
 # ---- training again on all
 
 
-def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pipeline, refit, best):
+def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pipeline, refit, best_run):
     plain = ("scene.validation=0", "optimize.keep=last", f"optimize.steps={BEST}")
     expected = train(tiny_scene, tmp_path / "plain", *plain, pipeline=pipeline).out
     assert digest(refit) == digest(expected)
-    assert digest(refit) != digest(best)
+    assert digest(refit) != digest(best_run)
     found = metrics(refit)
     assert found["steps"] == found["kept"]["step"] == BEST
     assert found["kept"]["refit"] is True
@@ -260,7 +260,7 @@ def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pi
     own = [line for line in lines(refit) if line.get("split") != "validation"]
     assert own == lines(expected), "metrics.jsonl is of the model that is left"
     assert psnr_of(refit, "validation", "trial.jsonl") == {
-        step: psnr for step, psnr in psnr_of(best, "validation").items() if step <= BEST + 2 * 4
+        step: psnr for step, psnr in psnr_of(best_run, "validation").items() if step <= BEST + 2 * 4
     }
     assert (
         f"Training is then repeated on all training photographs for {BEST} steps" in (refit / "report.html").read_text()
@@ -291,13 +291,13 @@ def test_refit_does_not_resume_with_other_steps(tiny_scene, tmp_path, pipeline, 
 
 
 @pytest.mark.parametrize("settings", [(), REFIT], ids=["best", "refit"])
-def test_trainer_gives_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, settings, best, refit):
+def test_trainer_gives_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, settings, best_run, refit):
     given = {"optimize.patience": 2, "optimize.refit": True}
     trainer = Trainer(tiny_scene, pipeline, set={key: given[key] for key in [*given][: len(settings)]})
     steps = [report.step for report in trainer.steps()]
     assert steps == ([*range(1, 17), *range(1, BEST + 1)] if settings else [*range(1, STEPS + 1)])
     trainer.model.save(tmp_path / "model.ply")
-    expected = refit if settings == REFIT else best
+    expected = refit if settings == REFIT else best_run
     assert (tmp_path / "model.ply").read_bytes() == (expected / "point_cloud.ply").read_bytes()
 
 
@@ -305,18 +305,18 @@ def test_trainer_gives_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, setting
 
 
 @pytest.mark.parametrize("split", ["validation", "test"])
-def test_validation_images_do_not_change_the_model(tiny_scene, tmp_path, pipeline, split, best):
+def test_validation_images_do_not_change_the_model(tiny_scene, tmp_path, pipeline, split, best_run):
     """Those for validation choose the step, and nothing else; those for testing nothing."""
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     settings = load(pipeline, [f"scene.path='{scene}'"]).settings.scene
     for view in settings.read(scene)[0].split(split):
         cv2.imwrite(str(view.image_path), 0 * cv2.imread(str(view.image_path)))
     run = train(scene, tmp_path / "run", pipeline=pipeline)
-    last = [checkpoint.load(out / "checkpoints" / f"step_{STEPS:06d}.npz")[1] for out in (run.out, best)]
+    last = [checkpoint.load(out / "checkpoints" / f"step_{STEPS:06d}.npz")[1] for out in (run.out, best_run)]
     for name in PARAMETERS:
         np.testing.assert_array_equal(last[0][f"gaussians/{name}"], last[1][f"gaussians/{name}"])
-    assert psnr_of(run.out, split) != psnr_of(best, split)
-    assert (digest(run.out) == digest(best)) == (split == "test")
+    assert psnr_of(run.out, split) != psnr_of(best_run, split)
+    assert (digest(run.out) == digest(best_run)) == (split == "test")
 
 
 # ---- what is refused
@@ -371,8 +371,8 @@ NOW = Measured(step=8, train=30.0, validation=20.0)
 FOUND = Best(measured=NOW, degree=0, metrics={}, evaluations=1, since_best=0, first_overfit=None, last=NOW)
 
 
-def test_a_checkpoint_without_its_best_model_is_damaged(best):
-    state, tables = checkpoint.load(best / "checkpoints" / "step_000014.npz")
+def test_a_checkpoint_without_its_best_model_is_damaged(best_run):
+    state, tables = checkpoint.load(best_run / "checkpoints" / "step_000014.npz")
     own, _ = split(tables, best_model.FOLDER)
     assert state.best is not None
     assert state.best.measured.step == BEST
@@ -386,7 +386,7 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
             best_model.check(state.best, wrong)
     with pytest.raises(DataError, match="no record of one"):
         best_model.check(None, own)
-    assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], best_model.FOLDER)[0] == {}
+    assert split(checkpoint.load(best_run / "checkpoints" / "step_000002.npz")[1], best_model.FOLDER)[0] == {}
 
 
 # ---- in words

@@ -63,15 +63,15 @@ GRID = (*FEW, "optimize.modules.bilateral_grid={grid_shape: [3, 2, 4]}")
 
 
 @pytest.fixture(scope="module")
-def ended(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run of twelve steps with a grid of each photograph; nothing is changed in it."""
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "grids", *GRID)
 
 
 @pytest.fixture
-def with_grids(ended: Run) -> Path:
+def with_grids(finished: Run) -> Path:
     """Its folder."""
-    return ended.out
+    return finished.out
 
 
 def test_key_accepts_cells_per_axis():
@@ -163,11 +163,11 @@ def test_best_model_has_the_grids_of_its_step(tiny_scene, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [[1, 1, 1], [4, 3, 2]])
-def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
+def test_training_resumes_its_grids_and_restarts_with_others(finished, cells):
     """Also with as many of them."""
-    run, before = copy(ended), ended.modules["bilateral_grid"]
-    run.modules = dict(ended.modules)
-    (same,) = attach_modules(ended.settings.training.modules, run, 24)
+    run, before = copy(finished), finished.modules["bilateral_grid"]
+    run.modules = dict(finished.modules)
+    (same,) = attach_modules(finished.settings.training.modules, run, 24)
     assert same.scalars == before.scalars
     assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
     (other,) = attach_modules([BilateralGrid(grid_shape=cells)], run, 24)
@@ -177,12 +177,12 @@ def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
 
 
 @pytest.mark.slow
-def test_memory_plan_counts_grids_first(ended):
-    views, tile = ended.scene.split("train"), int(ended.device.tuning["TILE"])
+def test_memory_plan_counts_grids_first(finished):
+    views, tile = finished.scene.split("train"), int(finished.device.tuning["TILE"])
     width, height = (-(-side // tile) * tile for side in (views[0].camera.width, views[0].camera.height))
 
     def fixed(*modules) -> int:
-        run, training = copy(ended), ended.settings.training.model_copy(update={"modules": [*modules]})
+        run, training = copy(finished), finished.settings.training.model_copy(update={"modules": [*modules]})
         stages = [training if one.stage == "optimize" else one for one in run.settings.stages]
         run.settings = run.settings.model_copy(update={"stages": stages})
         return run.memory_plan(memory.first_tables(0)).fixed

@@ -51,33 +51,33 @@ def test_curves_are_monotone_and_go_from_black_to_white(rng):
 
 
 @pytest.fixture(scope="module")
-def ended(tiny_scene, tmp_path_factory) -> Run:
+def finished(tiny_scene, tmp_path_factory) -> Run:
     """A finished run of twelve steps; nothing is changed in it."""
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "response", *RESPONSE)
 
 
 @pytest.mark.slow
-def test_resumed_run_has_the_same_bits(ended, tiny_scene, tmp_path):
-    run = train(tiny_scene, killed(ended.out, tmp_path / "run"), *RESPONSE, resume=True)
-    assert digest(run.out) == digest(ended.out)
-    assert run.modules["camera_response"].scalars == ended.modules["camera_response"].scalars
+def test_resumed_run_has_the_same_bits(finished, tiny_scene, tmp_path):
+    run = train(tiny_scene, killed(finished.out, tmp_path / "run"), *RESPONSE, resume=True)
+    assert digest(run.out) == digest(finished.out)
+    assert run.modules["camera_response"].scalars == finished.modules["camera_response"].scalars
 
 
 @pytest.mark.slow
-def test_test_views_use_their_cameras_response(ended, tmp_path):
-    measured = ended.metrics["test"]["1"]
-    assert evaluate(ended.out)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
-    rows = json.loads((ended.out / camera_response.FILE).read_text())["photographs"]
+def test_test_views_use_their_cameras_response(finished, tmp_path):
+    measured = finished.metrics["test"]["1"]
+    assert evaluate(finished.out)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
+    rows = json.loads((finished.out / camera_response.FILE).read_text())["photographs"]
     assert len(rows) == 10, "of test views too: all have one camera"
     assert len({tuple(row.values()) for row in rows.values()}) == 1
-    (ended.out / camera_response.FILE).rename(tmp_path / camera_response.FILE)
+    (finished.out / camera_response.FILE).rename(tmp_path / camera_response.FILE)
     try:
-        assert evaluate(ended.out)["test"]["1"]["psnr"] != pytest.approx(measured["psnr"], abs=1e-4)
-        (ended.out / camera_response.FILE).write_text('{"photographs": {"a": {"center_x": 0}}}')
+        assert evaluate(finished.out)["test"]["1"]["psnr"] != pytest.approx(measured["psnr"], abs=1e-4)
+        (finished.out / camera_response.FILE).write_text('{"photographs": {"a": {"center_x": 0}}}')
         with pytest.raises(DataError, match="expected 17 finite numbers for each photograph"):
-            evaluate(ended.out)
+            evaluate(finished.out)
     finally:
-        (tmp_path / camera_response.FILE).rename(ended.out / camera_response.FILE)
+        (tmp_path / camera_response.FILE).rename(finished.out / camera_response.FILE)
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def rewritten(text: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_plugins")
-def test_plugin_copy_of_the_module_gives_the_same_bits(ended, tiny_scene, tmp_path):
+def test_plugin_copy_of_the_module_gives_the_same_bits(finished, tiny_scene, tmp_path):
     """The shipped file with its imports from clsplat.plugin, another type, and its kernel next to it is the example."""
     shipped = Path(camera_response.__file__).read_text("utf-8")
     own = rewritten(shipped).replace(
@@ -118,6 +118,6 @@ def test_plugin_copy_of_the_module_gives_the_same_bits(ended, tiny_scene, tmp_pa
     clsplat.load_plugin(EXAMPLE)
     settings = [setting.replace("camera_response", "lens_and_curves") for setting in RESPONSE]
     run = train(tiny_scene, tmp_path / "run", *settings)
-    assert digest(run.out) == digest(ended.out)
-    assert run.modules["lens_and_curves"].scalars == ended.modules["camera_response"].scalars
-    assert run.metrics == ended.metrics
+    assert digest(run.out) == digest(finished.out)
+    assert run.modules["lens_and_curves"].scalars == finished.modules["camera_response"].scalars
+    assert run.metrics == finished.metrics

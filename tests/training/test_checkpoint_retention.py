@@ -25,7 +25,7 @@ def run(tiny_scene, tmp_path):
 
 
 @pytest.fixture
-def stuck(monkeypatch):
+def locked_names(monkeypatch):
     """Files of these names cannot be removed or renamed, as on Windows where another program reads them."""
     names = set()
     for function in ("unlink", "rename"):
@@ -44,8 +44,8 @@ def names_of(run) -> list[str]:
     return sorted(path.name for path in (run.out / "checkpoints").iterdir())
 
 
-def test_unremovable_older_checkpoint_stays_and_is_reported(run, stuck, caplog):
-    stuck.add("step_000001.npz")
+def test_unremovable_older_checkpoint_stays_and_is_reported(run, locked_names, caplog):
+    locked_names.add("step_000001.npz")
     for _ in range(2):
         checkpoint.save(run, keep=1)
     assert names_of(run) == ["step_000001.npz", "step_000002.npz"]
@@ -53,18 +53,18 @@ def test_unremovable_older_checkpoint_stays_and_is_reported(run, stuck, caplog):
     assert "cannot be removed (in use); it stays" in record.getMessage()
 
 
-def test_unremovable_failed_state_does_not_hide_the_advice(run, stuck):
-    stuck.add("failed_000000.npz")
+def test_unremovable_failed_state_does_not_hide_the_advice(run, locked_names):
+    locked_names.add("failed_000000.npz")
     (run.out / "checkpoints" / "failed_000000.npz").touch()
     run.model.gaussians["means"].fill(np.nan)
     with pytest.raises(NotFiniteError, match=r"the state is in .*failed_000002.npz; .*resumes from step_000001.npz"):
         checkpoint.save(run)
 
 
-def test_unrenamable_damaged_checkpoint_does_not_count(run, stuck, caplog):
+def test_unrenamable_damaged_checkpoint_does_not_count(run, locked_names, caplog):
     later = run.out / "checkpoints" / "step_000009.npz"
     later.touch()
-    stuck.add(later.name)
+    locked_names.add(later.name)
     checkpoint.drop_later(run.out, run.out / "checkpoints" / "step_000001.npz")
     assert "step_000009.npz: cannot be renamed (in use)" in caplog.text
     checkpoint.save(run, keep=1)

@@ -26,13 +26,13 @@ GAIN = "optimize.modules.exposure={}"
 
 
 @pytest.fixture(scope="module")
-def as_they_are(tmp_path_factory) -> Path:
+def plain_scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "as_they_are"
     write_dataset(folder, SyntheticOptions(size=48, train=12, test=3, seed=0), workers=1)
     return folder
 
 
-def changed(source: Path, out: Path, rng: np.random.Generator) -> dict[str, float]:
+def write_with_gains(source: Path, out: Path, rng: np.random.Generator) -> dict[str, float]:
     """Copy a dataset, the training photographs times gains of e^N(0, 0.25); return their logarithms by name."""
     shutil.copytree(source, out)
     found = {}
@@ -55,9 +55,9 @@ def held_out(run: Path) -> float:
     return float(np.mean(found))
 
 
-def test_known_exposures_are_recovered_from_scratch(as_they_are, rng, tmp_path):
+def test_known_exposures_are_recovered_from_scratch(plain_scene, rng, tmp_path):
     """Exposures begin alike, for the dataset has no tracks."""
-    truth = changed(as_they_are, tmp_path / "gain_scene", rng)
+    truth = write_with_gains(plain_scene, tmp_path / "gain_scene", rng)
     shutil.copytree(tmp_path / "gain_scene", tmp_path / "none_scene")
     for name, more in (("gain", (GAIN,)), ("none", ())):
         train(tmp_path / f"{name}_scene", tmp_path / name, *FEW, *more)

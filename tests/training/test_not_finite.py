@@ -16,7 +16,7 @@ from tests.support.runs import FEW, digest, steps_saved, train
 pytestmark = pytest.mark.slow
 
 
-def breaks_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def break_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the means not finite in a step."""
     train_one = Run.editing_tables
     run_step = {}
@@ -41,7 +41,7 @@ def breaks_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_nonfinite_state_is_never_a_checkpoint(step, log_every, tiny_scene, tmp_path, monkeypatch, few_steps):
     out, settings = tmp_path / "run", (*FEW, f"optimize.log_every={log_every}")
-    breaks_at(step, monkeypatch)
+    break_at(step, monkeypatch)
     with pytest.raises(NumericError, match=r"not finite: means.*the state is in .*failed_0000\d\d.npz") as error:
         train(tiny_scene, out, *settings)
     assert len(steps_saved(out)) == 2

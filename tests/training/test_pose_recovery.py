@@ -35,7 +35,7 @@ def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
     return max(angles), float(np.linalg.norm(centers, axis=1).max())
 
 
-def learned(
+def pose_errors(
     rng: np.random.Generator, info, jitter: float, zoom: float = 1.0
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Errors of cameras before and after they are learned, and of the focal length after it as a factor.
@@ -85,7 +85,7 @@ def learned(
 
 
 def test_exact_cameras_do_not_drift(rng, info):
-    before, after, factor = learned(rng, info, 0.0)
+    before, after, factor = pose_errors(rng, info, 0.0)
     print(np.degrees(after[0]), after[1], factor)
     assert before[0] < 1e-9
     assert np.degrees(after[0]) < 0.02
@@ -94,7 +94,7 @@ def test_exact_cameras_do_not_drift(rng, info):
 
 
 def test_wrong_focal_length_is_recovered_with_poses(rng, info):
-    before, after, factor = learned(rng, info, 1.0, 0.98)
+    before, after, factor = pose_errors(rng, info, 1.0, 0.98)
     print(factor, np.degrees(after[0]), after[1])
     assert np.degrees(before[0]) > 0.4
     assert factor == pytest.approx(1, abs=0.001)

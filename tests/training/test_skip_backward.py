@@ -72,7 +72,7 @@ def decisions(skip: SkipBackward, visits: list[tuple[str, float]]) -> list[bool]
     return found
 
 
-def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> list[tuple[str, float]]:
+def random_losses(rng: np.random.Generator, views: int, steps: int, noise: float) -> list[tuple[str, float]]:
     """Losses of views in random order, which fall and are noisy."""
     falling = np.exp(-np.arange(steps) / steps) * (1 + noise * rng.standard_normal(steps))
     return [(f"view {rng.integers(views)}", float(loss)) for loss in falling]
@@ -87,7 +87,7 @@ def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> l
 )
 def test_rule_matches_plain_sums(rng, least, views, noise, decay):
     skip = SkipBackward(start=0, warm_up=40, decay=decay, min_fraction=least)
-    visits = made_up(rng, views, 160, noise)
+    visits = random_losses(rng, views, 160, noise)
     found = decisions(skip, visits)
     assert found == slow_rule(skip, visits)
     assert not any(found[:40])
@@ -151,7 +151,7 @@ def test_stretched_recipe_skips_later_with_the_same_warm_up():
 # ---- steps
 
 
-def begun(scene: Path, out: Path, *overrides: str) -> tuple[Run, Iterator[ViewLosses]]:
+def start_run(scene: Path, out: Path, *overrides: str) -> tuple[Run, Iterator[ViewLosses]]:
     """A run before its first step, and its steps."""
     checked = load("smoke", [f"scene.path='{scene}'", *overrides])
     run = opening.open_run(checked, out, None)
@@ -169,7 +169,7 @@ def state(run: Run) -> dict[str, Any]:
 
 @pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a filter that learns"])
 def test_skipped_step_changes_nothing(tiny_scene, tmp_path, more):
-    run, steps = begun(tiny_scene, tmp_path, FROM_5, *NO_EDITS, *more)
+    run, steps = start_run(tiny_scene, tmp_path, FROM_5, *NO_EDITS, *more)
     before, skipped = state(run), []
     for view in steps:
         after = state(run)
@@ -190,7 +190,7 @@ def test_skipped_step_changes_nothing(tiny_scene, tmp_path, more):
 def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_path):
     """Photographs are half as large up to step 19."""
     sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
-    run, steps = begun(tiny_scene, tmp_path, SKIP + "={start: 2, warm_up: 40}", sizes, *NO_EDITS)
+    run, steps = start_run(tiny_scene, tmp_path, SKIP + "={start: 2, warm_up: 40}", sizes, *NO_EDITS)
     for _ in range(36):
         next(steps)
     averages = [name.split("/")[2] for name in run.modules["skip_backward"].scalars if name.startswith("skip/loss/")]
@@ -199,7 +199,7 @@ def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_pat
 
 
 def test_failure_after_the_decision_saves_the_previous_step(tiny_scene, tmp_path, monkeypatch):
-    run, steps = begun(tiny_scene, tmp_path, FROM_5)
+    run, steps = start_run(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
     before = state(run), dict(run.modules["skip_backward"].scalars)
@@ -227,7 +227,7 @@ def test_no_loss_is_read_before_the_start(tiny_scene, tmp_path, monkeypatch):
         "later": (f"{SKIP}.start=9",),
         "from 5": (FROM_5,),
     }.items():
-        _, steps = begun(tiny_scene, tmp_path / name, *settings, *NO_EDITS)
+        _, steps = start_run(tiny_scene, tmp_path / name, *settings, *NO_EDITS)
         for _ in range(9):
             next(steps)
     assert reads["none"] == reads["later"] == reads["from 5"] - 4 * 2, "four steps, with two losses"

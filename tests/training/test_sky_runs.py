@@ -52,7 +52,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Yard, Path]:
 
 
 @pytest.fixture(scope="module")
-def learned(yard, tmp_path_factory) -> Path:
+def sky_run(yard, tmp_path_factory) -> Path:
     """A run that finds out by itself that there is a sky."""
     out = tmp_path_factory.mktemp("runs") / "yard"
     asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
@@ -64,13 +64,13 @@ def learned(yard, tmp_path_factory) -> Path:
 # ---- the oracle
 
 
-def test_painted_sky_is_recovered(yard, learned):
+def test_painted_sky_is_recovered(yard, sky_run):
     """From places that no photograph was taken from, where no Gaussian covers it.
 
     The sky is infinitely far: there is no distance that Gaussians could be nearer than. Alpha finds those before it at
     any distance, and each as much as it shows.
     """
-    capture, model = yard[0], clsplat.load(learned)
+    capture, model = yard[0], clsplat.load(sky_run)
     renderer = clsplat.Renderer(model)
     view = capture.views[4]  # held out
     picture, above = renderer.render(view), capture.rays(view)[..., 1] < -0.05
@@ -79,8 +79,8 @@ def test_painted_sky_is_recovered(yard, learned):
     error = np.mean((rendered[above] - truth[above]) ** 2)
     assert 10 * np.log10(255**2 / error) > 35
     assert picture.alpha[above].mean() < 0.02
-    without = evaluate_without(learned, model)
-    assert evaluate(learned)["test"]["1"]["psnr"] > without + 3
+    without = evaluate_without(sky_run, model)
+    assert evaluate(sky_run)["test"]["1"]["psnr"] > without + 3
 
 
 def evaluate_without(out: Path, model) -> float:
@@ -105,13 +105,13 @@ def test_sky_ends_at_the_horizon(pitch, rows, share):
     assert SkyEvidence(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
 
 
-def test_decision_is_recorded_with_its_reason(learned):
-    found = load(str(learned / "pipeline.yaml")).settings.model.background
+def test_decision_is_recorded_with_its_reason(sky_run):
+    found = load(str(sky_run / "pipeline.yaml")).settings.model.background
     assert isinstance(found, Auto)
     assert found.chosen == "on"
     assert found.reason.startswith("9 of 9 photographs show bright or blue regions above the horizon, without points")
     assert "in 15% or more" in found.reason
-    assert f"model.background: on, since {found.reason}" in (learned / "log.txt").read_text()
+    assert f"model.background: on, since {found.reason}" in (sky_run / "log.txt").read_text()
 
 
 def test_key_changes_no_bits_without_visible_sky(tiny_scene, tmp_path, few_steps, rng):
@@ -208,24 +208,24 @@ def test_best_model_has_the_sky_of_its_step(tiny_scene, tmp_path):
 # ---- where it goes
 
 
-def test_a_run_folder_is_rendered_and_measured_with_its_sky(learned):
-    measured = json.loads((learned / "metrics.json").read_text())["test"]["1"]
-    assert evaluate(learned)["test"]["1"]["psnr"] == measured["psnr"]
-    assert "point_cloud_sky.json" in json.loads((learned / "checksums.json").read_text())
+def test_a_run_folder_is_rendered_and_measured_with_its_sky(sky_run):
+    measured = json.loads((sky_run / "metrics.json").read_text())["test"]["1"]
+    assert evaluate(sky_run)["test"]["1"]["psnr"] == measured["psnr"]
+    assert "point_cloud_sky.json" in json.loads((sky_run / "checksums.json").read_text())
 
 
-def test_model_file_without_its_sky_is_reported(learned, tmp_path, caplog):
-    shutil.copy(learned / "point_cloud.ply", tmp_path / "alone.ply")
+def test_model_file_without_its_sky_is_reported(sky_run, tmp_path, caplog):
+    shutil.copy(sky_run / "point_cloud.ply", tmp_path / "alone.ply")
     assert clsplat.load(tmp_path / "alone.ply").sky is None
     assert "was trained with a sky; put alone_sky.json next to it" in caplog.text
-    model = clsplat.load(learned)
+    model = clsplat.load(sky_run)
     model.save(tmp_path / "moved.ply")
     np.testing.assert_array_equal(clsplat.load(tmp_path / "moved.ply").sky.texels, model.sky.texels)
 
 
-def test_other_model_of_the_same_name_ignores_the_sky(learned, tmp_path, caplog):
+def test_other_model_of_the_same_name_ignores_the_sky(sky_run, tmp_path, caplog):
     """Not by a file that another program wrote there, nor by our own of a model without one."""
-    model = clsplat.load(learned)
+    model = clsplat.load(sky_run)
     model.save(tmp_path / "scene.ply")
     model.save(tmp_path / "scene.spz")
     assert all(clsplat.load(tmp_path / name).sky for name in ("scene.ply", "scene.spz")), "they share it"
@@ -238,12 +238,12 @@ def test_other_model_of_the_same_name_ignores_the_sky(learned, tmp_path, caplog)
     assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
 
 
-def test_exported_splats_show_the_sky_without_its_file(yard, learned, tmp_path):
+def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path):
     out = tmp_path / "run"
-    shutil.copytree(learned, out)
+    shutil.copytree(sky_run, out)
     run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), RunState.read(out), None, "resume")
     assert not (out / "point_cloud_sky.json").exists()
-    model, before = clsplat.load(out), clsplat.load(learned)
+    model, before = clsplat.load(out), clsplat.load(sky_run)
     assert len(model) == len(before) + 10_000
     assert model.sky is None
     view = yard[0].views[4]
@@ -251,8 +251,8 @@ def test_exported_splats_show_the_sky_without_its_file(yard, learned, tmp_path):
     assert np.abs(found - expected).mean() < 0.02
 
 
-def test_sky_gaussians_match_its_colors_in_all_directions(rng, learned):
-    model = clsplat.load(learned)
+def test_sky_gaussians_match_its_colors_in_all_directions(rng, sky_run):
+    model = clsplat.load(sky_run)
     baked = with_sky_splats(model, 500)
     added = baked[len(model) :]
     directions = added.means - np.median(model.means, axis=0)
@@ -276,8 +276,8 @@ def test_invalid_sky_is_refused(tiny_scene, yard, tmp_path, caplog):
         assert [text in caplog.text for text in (transparent, nothing)] == said
 
 
-def test_rotated_model_has_a_rotated_sky(rng, learned):
-    model = clsplat.load(learned)
+def test_rotated_model_has_a_rotated_sky(rng, sky_run):
+    model = clsplat.load(sky_run)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     direction = np.array([0.3, -0.8, 0.2])
     found = sample_texels(model.transformed(rotation=turn).sky.texels, turn @ direction)

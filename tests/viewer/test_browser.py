@@ -83,7 +83,7 @@ def opened(browser, page):
     return browser
 
 
-def shown(browser) -> np.ndarray:
+def screenshot(browser) -> np.ndarray:
     """The screen, [H, W, 3]."""
     browser.rest()
     return cv2.imdecode(np.frombuffer(browser.picture(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
@@ -109,7 +109,7 @@ def test_page_matches_the_renderer(small, tmp_path, kind, degree, count):
 def test_photograph_aligns_with_the_render(opened):
     """The photograph is a JPEG of the render: where it is shown, the screen hardly changes, and where it is shifted it
     does."""
-    plain = shown(opened)
+    plain = screenshot(opened)
     opened.click("[data-comparison=fade]")
     opened.run("viewer.photographs.share = 1; viewer.photographs.place()")
     left, top, width, height = opened.run(
@@ -117,7 +117,7 @@ def test_photograph_aligns_with_the_render(opened):
     )
     assert width / height == pytest.approx(112 / 80, abs=0.01)
     middle = np.s_[int(top + 20) : int(top + height - 90), int(left + 20) : int(left + width - 20)]
-    covered = shown(opened)[middle]
+    covered = screenshot(opened)[middle]
     same = psnr(covered, plain[middle])
     shifted = psnr(covered, np.roll(plain, 4, axis=1)[middle])
     assert same > shifted + 3
@@ -189,12 +189,12 @@ def test_orbiting_keeps_the_distance_and_stays_below_the_top(opened):
 def test_url_contains_the_camera(browser, page, opened):
     opened.drag((200, 150), (260, 170))
     opened.rest()
-    address, pose, picture = opened.run("location.hash"), opened.run(POSE), shown(opened)
+    address, pose, picture = opened.run("location.hash"), opened.run(POSE), screenshot(opened)
     assert address.startswith("#")
     browser.call("Page.navigate", url="about:blank")
     browser.open(page, address)
     np.testing.assert_allclose(browser.run(POSE), pose, atol=1e-6)
-    assert np.abs(shown(browser).astype(int) - picture)[100:300].mean() < 0.5
+    assert np.abs(screenshot(browser).astype(int) - picture)[100:300].mean() < 0.5
     for wrong in (
         "#nonsense",
         "#1,2,3;0,0,0,0;1,1,1,1,1,1",
@@ -207,15 +207,15 @@ def test_url_contains_the_camera(browser, page, opened):
 
 
 def test_display_modes(opened):
-    pictures = [shown(opened)]
+    pictures = [screenshot(opened)]
     for key in "234":
         opened.key(key)
-        pictures.append(shown(opened))
+        pictures.append(screenshot(opened))
     for i, one in enumerate(pictures):
         for other in pictures[:i]:
             assert np.abs(one[100:300].astype(int) - other[100:300]).mean() > 1
     opened.key("1")
-    assert np.array_equal(shown(opened)[100:300], pictures[0][100:300])
+    assert np.array_equal(screenshot(opened)[100:300], pictures[0][100:300])
 
 
 def test_settings_help_and_hidden_controls(opened):
@@ -223,7 +223,7 @@ def test_settings_help_and_hidden_controls(opened):
     opened.click("#settings")
     assert not opened.run(hidden("'panel'"))
     opened.click("[data-background=black]")
-    assert shown(opened)[200, 5].max() < 60
+    assert screenshot(opened)[200, 5].max() < 60
     opened.run(
         "(slider => { slider.value = 25; slider.dispatchEvent(new Event('input')); })(document.getElementById('share'))"
     )
@@ -313,7 +313,7 @@ def test_two_models_share_a_camera(browser, tmp_path):
     stand = Viewpoint.from_points(model.means, (), None)
     Page("two", {"a": pack(model), "b": pack(other)}, stand, "black").write(tmp_path / "page.html")
     browser.open(tmp_path / "page.html")
-    picture = shown(browser)[70:400]
+    picture = screenshot(browser)[70:400]
     left, right = picture[:, :250], picture[:, 250:]
     assert min(left.mean(), right.mean()) > 5
     assert np.abs(left.astype(int) - right).mean() > 5

@@ -36,7 +36,7 @@ def positions(views):
     return np.stack([view.position for view in views])
 
 
-def turns(views):
+def azimuths(views):
     """The angles of views about the z axis."""
     place = positions(views)
     return np.arctan2(place[:, 1], place[:, 0])
@@ -54,7 +54,7 @@ def test_orbit_circles_a_camera_ring_once_at_its_distance(name, rng):
     place = positions(found)
     np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), 3, rtol=0.05)
     np.testing.assert_allclose(place[:, 2], 1, atol=0.05)
-    steps = np.diff(np.unwrap(turns(found)))
+    steps = np.diff(np.unwrap(azimuths(found)))
     assert (np.sign(steps) == np.sign(steps[0])).all()
     assert abs(steps.sum()) == pytest.approx(2 * np.pi * 35 / 36, rel=0.02)
     for view in found:
@@ -77,8 +77,8 @@ def test_ellipse_matches_the_extent_of_the_cameras(rng):
 def test_ellipse_of_one_sided_cameras_swings_on_their_side(rng):
     views = ring(np.linspace(-0.8, 0.8, 15))
     found = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
-    assert np.abs(turns(found)).max() < 0.9
-    assert np.ptp(turns(found)) > 0.8
+    assert np.abs(azimuths(found)).max() < 0.9
+    assert np.ptp(azimuths(found)) > 0.8
     moves = np.linalg.norm(np.diff(positions([*found, found[0]]), axis=0), axis=1)
     assert moves.max() < 0.5, "the last frame leads to the first"
 

@@ -21,7 +21,7 @@ def model(rng: np.random.Generator, count: int, degree: int = 2, mode: str = "de
     return Model(**tables, rendering=Rendering(screen_variance=0.1, compensate=float(mode == "mip")))
 
 
-def wide(source: Model) -> dict[str, np.ndarray]:
+def float64_tables(source: Model) -> dict[str, np.ndarray]:
     return {name: table.astype(np.float64) for name, table in source.tables().items()}
 
 
@@ -48,7 +48,7 @@ def moments(tables: dict[str, np.ndarray], row: int) -> tuple[float, np.ndarray,
 
 
 def test_merged_pair_has_the_moments_of_its_mixture(rng):
-    tables = wide(model(rng, 40))
+    tables = float64_tables(model(rng, 40))
     first, second = np.arange(0, 40, 2), np.arange(1, 40, 2)
     found = merge(tables, first, second, surface)
     for pair, (i, j) in enumerate(zip(first, second, strict=True)):
@@ -67,7 +67,7 @@ def test_merged_pair_has_the_moments_of_its_mixture(rng):
 
 @pytest.mark.parametrize("size", [surface, volume])
 def test_a_mixture_is_symmetric_in_its_pair(rng, size):
-    tables = wide(model(rng, 20))
+    tables = float64_tables(model(rng, 20))
     one, two = np.arange(10), np.arange(10, 20)
     there, back = merge(tables, one, two, size), merge(tables, two, one, size)
     for found in (there, back):
@@ -82,7 +82,7 @@ def test_mass_and_mean_are_preserved(rng, count):
     source = model(rng, count)
     found = decimate(source)
     assert len(found) == (count + 1) // 2
-    before, after = wide(source), wide(found)
+    before, after = float64_tables(source), float64_tables(found)
     mass = [mass_of(tables, surface) for tables in (before, after)]
     np.testing.assert_allclose(mass[1].sum(), mass[0].sum(), rtol=1e-5)
     mean = [(one[:, None] * tables["means"]).sum(axis=0) for one, tables in zip(mass, (before, after), strict=True)]
@@ -128,7 +128,7 @@ def test_coincident_duplicates_merge(rng):
 def test_coincident_gaussians_need_no_extra_work(rng):
     """A round pairs them all: a tree of places alone, or of rows, takes quadratic time here."""
     one = model(rng, 1, degree=0)
-    rows = [len(pairs) for pairs in match_pairs(wide(one[np.zeros(30_000, int)]))]
+    rows = [len(pairs) for pairs in match_pairs(float64_tables(one[np.zeros(30_000, int)]))]
     assert rows == [15_000, 15_000]
 
 
@@ -139,7 +139,7 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
         mixture, "mass_of", lambda tables, size: rows.append(len(tables["means"])) or mass_of(tables, size)
     )
     monkeypatch.setattr(lod, "mass_of", mixture.mass_of, raising=False)
-    source = wide(model(rng, 300))
+    source = float64_tables(model(rng, 300))
     whole = match_pairs(source)
     monkeypatch.setattr(lod, "BLOCK", 50)
     for one, two in zip(match_pairs(source), whole, strict=True):

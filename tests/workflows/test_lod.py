@@ -104,24 +104,24 @@ def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch)
 
 
 @pytest.fixture
-def alone(few_steps: Path, tmp_path: Path) -> Path:
+def model_file(few_steps: Path, tmp_path: Path) -> Path:
     """The file of a model whose photographs are not known."""
     file = tmp_path / "model.ply"
     file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
     return file
 
 
-def test_merging_without_training_is_reported(alone, tmp_path):
-    found = CliRunner().invoke(app, ["lod", str(alone), str(tmp_path / "site"), "--steps", "0"])
+def test_merging_without_training_is_reported(model_file, tmp_path):
+    found = CliRunner().invoke(app, ["lod", str(model_file), str(tmp_path / "site"), "--steps", "0"])
     assert found.exit_code == 0, found.output
     assert "model.ply: no photos: levels are merged without training" in found.output
 
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
-def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
+def test_options_that_need_photographs_are_refused_without_them(option, model_file, tmp_path):
     message = rf"model\.ply: has no known photos, which --{option} needs; give --scene, or leave --{option} out$"
     with pytest.raises(ConfigError, match=message):
-        clsplat.write_levels(alone, tmp_path / "site", **{option: STEPS})
+        clsplat.write_levels(model_file, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
 
 
@@ -183,10 +183,10 @@ def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_leftovers_of_a_killed_process_are_removed(alone, tmp_path):
+def test_leftovers_of_a_killed_process_are_removed(model_file, tmp_path):
     for name in (f".site.{NO_PROCESS}-0.partial", f".other.{NO_PROCESS}-0.partial"):
         (tmp_path / name / "0_0").mkdir(parents=True)
-    clsplat.write_levels(alone, tmp_path / "site", levels=2)
+    clsplat.write_levels(model_file, tmp_path / "site", levels=2)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f".other.{NO_PROCESS}-0.partial", "model.ply", "site"]
 
 
