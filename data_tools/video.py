@@ -91,14 +91,14 @@ def _file(out: Path, number: int) -> Path:
 
 
 def _are_places(chosen: Any) -> bool:
-    """Whether these are frames of a video, in its order."""
+    """Return whether these are frames of a video, in its order."""
     if not isinstance(chosen, list) or not all(type(place) is int and place >= 0 for place in chosen):
         return False
     return bool(chosen) and sorted(set(chosen)) == chosen
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a frame was written and can be read."""
+    """Return whether a frame was written and can be read."""
     try:
         return bool(image_size(path))
     except DataError:

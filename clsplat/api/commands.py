@@ -331,11 +331,11 @@ def run_cell(
 
     index: of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
     """
-    from clsplat.runs.model_file import overrides_of
+    from clsplat.runs.model_file import with_scene_path
     from clsplat.sweeps.batch import run_one
 
     load_plugins()
-    return run_one(str(pipeline), Path(store), overrides_of(overrides(set), path_of(scene)), index, device)
+    return run_one(str(pipeline), Path(store), with_scene_path(overrides(set), path_of(scene)), index, device)
 
 
 def cancel(store: PathLike, cell: str | None = None) -> str:
@@ -443,10 +443,10 @@ def view(
     photographs: which photos to include, up to `photograph_budget` MB; splats: include only this number of Gaussians,
     the most important ones.
     """
-    from clsplat.runs import film
+    from clsplat.runs import video as videos
 
     load_plugins()
-    return film.view(
+    return videos.view(
         [Path(model) for model in models],
         path_of(scene),
         Path(out),

@@ -89,16 +89,16 @@ def render_path(
     replaced; DataError for unreadable files, and if the path is impossible with the cameras; NumericError for
     images that are not finite; OutputError if files cannot be written; and errors of the device.
     """
-    from clsplat.runs import film
+    from clsplat.runs import video as videos
     from clsplat.viewer.video.plan import VideoRequest
 
     load_plugins()
     request, place = (
         VideoRequest.parse(str(path), frames, fps, size, times),
-        film.FilmTarget(path_of(video), Path(out), kind),
+        videos.VideoTarget(path_of(video), Path(out), kind),
     )
-    extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha))
-    return film.film(Path(model), path_of(scene), place, request, extras, downscale=downscale, device=device)
+    extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, alpha))
+    return videos.make_video(Path(model), path_of(scene), place, request, extras, downscale=downscale, device=device)
 
 
 def camera_path(

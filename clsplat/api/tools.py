@@ -55,12 +55,12 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
     from clsplat.core.files import check_result_path
     from clsplat.prepare.inspect.findings import Inspection
     from clsplat.prepare.inspect.page import write_page
-    from clsplat.runs.model_file import photographs_of
+    from clsplat.runs.model_file import photo_folder
 
     load_plugins()
     if page is not None:
         check_result_path(Path(page), ".html")
-    inspection = Inspection.from_folder(photographs_of(Path(scene)))
+    inspection = Inspection.from_folder(photo_folder(Path(scene)))
     if page is not None:
         write_page(inspection, Path(page))
     return inspection

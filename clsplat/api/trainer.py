@@ -24,9 +24,9 @@ from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import opening, outputs, run_folder, runner
-from clsplat.runs.failures import failures_recorded
-from clsplat.runs.model_file import as_setting
-from clsplat.runs.opening import RunScene, settle
+from clsplat.runs.failures import recording_failures
+from clsplat.runs.model_file import path_setting
+from clsplat.runs.opening import RunScene, resolve_choices
 from clsplat.runs.run_folder import Start
 from clsplat.runs.state import RunState
 from clsplat.runs.stepwise import is_trained, run_until_training, train
@@ -91,7 +91,7 @@ class Trainer:
         self._lock = threading.RLock()
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
-        place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
+        place = [f"scene.path={path_setting(folder)}"] if folder.is_dir() else []
         self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
         _check(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
@@ -108,11 +108,11 @@ class Trainer:
         rasterizer = self.pipeline.settings.rasterizer
         opened = open_checked(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
-            status = holding.enter_context(run_folder.opened(before, start, step=0))
-            with failures_recorded(status, as_raised=True):
-                scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
+            status = holding.enter_context(run_folder.open_run_folder(before, start, step=0))
+            with recording_failures(status, as_raised=True):
+                scene_of_run = RunScene.from_scene(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
-                self.pipeline = settle(self.pipeline, self._run)
+                self.pipeline = resolve_choices(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
                 (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists files of stages that a trainer does not run
                 with saved_on_failure(self._run):
@@ -157,7 +157,7 @@ class Trainer:
             raise ClsplatError(f"{self!r} {why}; create another, with start='resume' if `out` has a checkpoint")
         try:
             with (
-                failures_recorded(self._run.status, as_raised=True),
+                recording_failures(self._run.status, as_raised=True),
                 stopping_on_signals(finish_step),
                 saved_on_failure(self._run),
             ):

@@ -207,7 +207,7 @@ def _remove_partial_folders(folder: Path) -> None:
 
 
 def _is_abandoned(name: str) -> bool:
-    """Whether a file or folder is temporary and no process of this machine is writing it any more."""
+    """Return whether a file or folder is temporary and no process of this machine is writing it any more."""
     if not (match := PARTIAL.fullmatch(name)) or name in _open:
         return False
     process = int(match[1])
@@ -318,7 +318,7 @@ def check_not_run_file(path: Path) -> None:
 
 
 def _belongs_to(run: Path, path: Path) -> bool:
-    """Whether a run wrote a file in its folder; files missing in a finished run's checksums belong to the user."""
+    """Return whether a run wrote a file in its folder; files not in a finished run's checksums belong to the user."""
     name = path.absolute().relative_to(run).as_posix()
     try:
         listed = read_json(run / CHECKSUMS)

@@ -106,7 +106,7 @@ class _Node:
         return self._key(name)
 
     def is_keyed(self, name: str) -> bool:
-        """Whether the name is the type of a list item, and not an index."""
+        """Return whether the name is the type of a list item, and not an index."""
         keyed_by_type = any(base.keyed_by_type for base in bases(self.inside))
         return (
             keyed_by_type
@@ -169,7 +169,7 @@ class _Node:
         return [item for item in items if isinstance(item.data, dict) and "stage" in item.data]
 
     def _may_hold(self, key: str) -> bool:
-        """Whether a list may contain stages: it does, or its type is unknown."""
+        """Return whether a list may contain stages: it does, or its type is unknown."""
         kinds = bases(inside_list(self.annotation(key)))
         return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 

@@ -9,9 +9,17 @@ from clsplat.core.errors import DataError, pluralize
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.estimate import estimate_time
-from clsplat.runs.opening import ReadScene, check_start, known, listed, open_run, read_run_scene, settle
+from clsplat.runs.opening import (
+    ReadScene,
+    check_start,
+    expected_measures,
+    open_run,
+    photo_names,
+    read_run_scene,
+    resolve_choices,
+)
 from clsplat.runs.outputs import check_output_paths
-from clsplat.runs.run_folder import Start, check_run_folder, start_of
+from clsplat.runs.run_folder import Start, check_run_folder, choose_start
 from clsplat.runs.runner import check_run, restore
 from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
@@ -33,50 +41,49 @@ def describe(
     read: ReadScene = read_run_scene,
     with_time: bool = False,
 ) -> str:
-    """Return a line for each stage of a run in a folder, which is left as it is.
+    """Return what a run in a folder would do, a line for each stage; nothing is written.
 
     read: reads the scene; with_time: whether to add an estimate of the time of a new run.
-    Raises what the run would raise before its first stage, but errors of its photos only if they are prepared.
+    Raises the errors that the run would raise before its first stage; those of its photos only if they are prepared.
     """
     out = state.out
-    begun = start_of(pipeline, state, start)
-    if begun is None:
+    chosen = choose_start(pipeline, state, start)
+    if chosen is None:
         return f"{out}: up to date"
-    start = begun
+    start = chosen
     check_output_paths(pipeline, state)
     check_run_folder(state, start)
     check_unused(out)
     planned = pipeline.preparation(out)
-    lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
+    lines = [f"  {step.step.stage:<14} {step.why or 'done'}" for step in planned]
     run, verdict = None, "would run"
-    if any(one.why for one in planned):
+    if any(step.why for step in planned):
         opened, _ = check_start(pipeline, out, device, start)
     else:
         run = open_run(pipeline, out, device, start, read=read)
         opened = run.device
-        pipeline = settle(pipeline, run, log_reasons=False)  # the description has them
+        pipeline = resolve_choices(pipeline, run, log_reasons=False)  # the description includes them
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would continue from step {run.step}" if resumed else "nothing to resume; would run"
         check_run(pipeline, run)
-    names = listed(pipeline, planned, out) if run is None else []
-    measures, refusal = _known(pipeline, names)
+    names = photo_names(pipeline, planned, out) if run is None else []
+    measures, refusal = _expect_measures(pipeline, names)
     lines += [*refusal, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
     if undecided := pipeline.undecided:
         lines.append(f"  adapt          the photos decide {', '.join(undecided)}")
-    lines += [
-        f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _has_work(stage, run)
-    ]
-    lines += _on_host(pipeline, run) if run else []
+    described = [stage for stage in pipeline.stages if _has_work(stage, run)]
+    lines += [f"  {stage.stage:<14} {_describe_stage(stage, run)}".rstrip() for stage in described]
+    lines += _describe_offloading(pipeline, run) if run else []
     if with_time and start != "resume":
         lines += estimate_time(pipeline, planned, names, measures, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
-def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
-    """Return the measures of photos to prepare, or a line that says why the run will be refused."""
+def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
+    """Return the expected measures of the photos to prepare, or a line with the reason why the run will be refused."""
     try:
-        return known(pipeline, names), []
+        return expected_measures(pipeline, names), []
     except DataError as error:
         return None, [f"  photos         if all {len(names)} photos get a camera, the run is refused: {error}"]
 
@@ -87,8 +94,8 @@ def check_unused(out: Path) -> None:
         LOG.info("%s: was in use on another machine; the run would wait up to a minute for its heartbeat", out)
 
 
-def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
-    """Return the memory plan if spherical harmonics will be in host memory."""
+def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
+    """Return a line with the memory plan if spherical harmonics will be in host memory."""
     first = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
     if first is None:
         return []
@@ -101,13 +108,13 @@ def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
 
 
 def _has_work(stage: Stage, run: Run | None) -> bool:
-    """Whether a stage does anything: it does not if its split has no views."""
+    """Return whether a stage does anything; evaluation and rendering need views in their split."""
     return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
 
 
-def _detail(stage: Stage, run: Run | None) -> str:
+def _describe_stage(stage: Stage, run: Run | None) -> str:
     if isinstance(stage, Training):
-        return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
+        return f"{stage.steps} steps; " + ", ".join(map(_describe_cadence, stage.during))
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
@@ -115,8 +122,8 @@ def _detail(stage: Stage, run: Run | None) -> str:
     return ""
 
 
-def _cadence(stage: Scheduled) -> str:
-    """Return when a stage acts."""
+def _describe_cadence(stage: Scheduled) -> str:
+    """Return when a scheduled stage runs."""
     limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
     text = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
     return f"{stage.stage} every {stage.every}" + (f" ({text})" if text else "")

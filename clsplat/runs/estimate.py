@@ -23,26 +23,26 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
 
-PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and Gaussian of a training step, of one AVX-512 core
+PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian of a training step, on one AVX-512 core
 WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per weight of a field and per level of its grid, for each sample
-LAUNCHES = 1.0e-3  # s of any step
+LAUNCHES = 1.0e-3  # s per step, whatever its size
 SLOWER = 6.0  # factor for older processors and larger Gaussians than in the benchmark
-MIN_GAUSSIANS = 5000  # of a small capture, while the points are unknown
-MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; captures end at 0.1 to 1
+MIN_GAUSSIANS = 5000  # initial number for a small capture, while the points are unknown
+MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; typical captures end at 0.1 to 1
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimated time of a part of a run, s, as a minimum and a maximum, and why."""
+    """The estimated time of a part of a run, s, from minimum to maximum, with an explanation."""
 
     name: str
     seconds: tuple[float, float]
-    why: str
+    reason: str
 
     @property
     def text(self) -> str:
         """The estimate in one line."""
-        return f"  {self.name:<14} {minutes_text(self.seconds)}: {self.why}"
+        return f"  {self.name:<14} {minutes_text(self.seconds)}: {self.reason}"
 
 
 def estimate_time(
@@ -53,30 +53,30 @@ def estimate_time(
     device: Device,
     run: Run | None,
 ) -> list[str]:
-    """Return a line for the whole run, and one for each part.
+    """Return a line with the time of the run, and one for each part; empty if nothing can be estimated.
 
-    names, measures: of the photos to prepare; run: with its scene, if that is prepared.
+    names, measures: of the photos to prepare; run: only if the scene is prepared already.
     """
-    parts = list(_of_preparation(planned, len(names))) if names else []
+    parts = list(_preparation_estimates(planned, len(names))) if names else []
     if (capture := _capture(pipeline, planned, names, run)) is not None:
         settings = (adapted(pipeline, measures) if measures and run is None else pipeline).settings
         trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-        parts += [_of_training(training, *capture, device.info.units) for training in trainings]
+        parts += [_training_estimate(training, *capture, device.info.units) for training in trainings]
     fields = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
-    parts += [_of_field(training, device.info.units) for training in fields]
+    parts += [_field_estimate(training, device.info.units) for training in fields]
     if not parts:
         return []
     low, high = (sum(part.seconds[end] for part in parts) for end in (0, 1))
-    total = f"expected: {minutes_text((low, high))}, roughly, without evaluation, renders and pages"
+    total = f"expected: {minutes_text((low, high))}, roughly, without evaluation, renders, and pages"
     return [total, *(part.text for part in parts)]
 
 
-def _of_preparation(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Estimate]:
+def _preparation_estimates(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Estimate]:
     """Estimate the preparation steps that are due."""
-    for due in planned:
-        if due.why and (each := due.step.seconds) is not None:
-            count, name = due.step.pieces(photographs)
-            yield Estimate(due.step.stage, (each[0] * count, each[1] * count), f"{count:,} {name}")
+    for planned_step in planned:
+        if planned_step.why and (seconds := planned_step.step.seconds) is not None:
+            count, name = planned_step.step.pieces(photographs)
+            yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {name}")
 
 
 def _capture(
@@ -104,29 +104,29 @@ def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
     return None
 
 
-def _of_training(training: Optimize, size: tuple[int, int], first: int, units: int) -> Estimate:
+def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, units: int) -> Estimate:
     """Estimate a training, for the smallest and the largest number of steps and Gaussians."""
     pixels = size[0] * size[1]
-    most = max(first, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
-    low, high = step_seconds(units, size, first)[0], step_seconds(units, size, most)[1]
+    maximum = max(initial, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
+    low, high = step_seconds(units, size, initial)[0], step_seconds(units, size, maximum)[1]
     steps = training.min_steps, training.steps * (2 if training.refit else 1)
-    of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (first, most)))
-    why = f"{of_steps} steps of {_ms(low, high)}, with {of_counts} Gaussians at {size[0]}x{size[1]} px"
-    return Estimate(training.stage, (steps[0] * low, steps[1] * high), why)
+    steps_text, counts_text = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (initial, maximum)))
+    reason = f"{steps_text} steps of {_ms(low, high)}, with {counts_text} Gaussians at {size[0]}x{size[1]} px"
+    return Estimate(training.stage, (steps[0] * low, steps[1] * high), reason)
 
 
-def _of_field(training: TrainField, units: int) -> Estimate:
+def _field_estimate(training: TrainField, units: int) -> Estimate:
     """Estimate a training of a field, whose steps all take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
-    of_sample = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
-    low = LAUNCHES + samples * of_sample / units
-    why = f"{training.steps:,} steps of {_ms(low, SLOWER * low)}, of {training.rays:,} rays"
-    return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), why)
+    sample_seconds = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
+    low = LAUNCHES + samples * sample_seconds / units
+    reason = f"{training.steps:,} steps of {_ms(low, SLOWER * low)}, of {training.rays:,} rays"
+    return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), reason)
 
 
 def max_gaussians(training: Optimize, pixels: int) -> float | None:
-    """Return the limit of the number of Gaussians by the settings of a training; None without one.
+    """Return the maximum number of Gaussians by the settings of a training; None if there is no limit.
 
     pixels: of an image.
     """
@@ -140,12 +140,12 @@ def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, 
 
     units: compute units of the device; size: of an image, px; count: of Gaussians.
     """
-    least = LAUNCHES + (PIXEL * size[0] * size[1] + GAUSSIAN * count) / units
-    return least, SLOWER * least
+    seconds = LAUNCHES + (PIXEL * size[0] * size[1] + GAUSSIAN * count) / units
+    return seconds, SLOWER * seconds
 
 
 def minutes_text(seconds: Sequence[float]) -> str:
-    """Return two times, s, as a range of minutes."""
+    """Format a minimum and a maximum time, s, as a range of minutes."""
     minutes = [max(0.1, end / 60) for end in seconds]
     return _range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
 

@@ -1,4 +1,4 @@
-"""Record failures: of a run, in its status.json, and of parts, such as cells, without which the rest continues."""
+"""Record failures: of a run, in its status.json, and of parts, such as cells, while the other parts continue."""
 
 import logging
 from collections.abc import Iterator
@@ -12,16 +12,16 @@ LOG = logging.getLogger("clsplat")
 
 
 class Failures(dict[str, ClsplatError]):
-    """The parts that failed, by their names."""
+    """The errors of the parts that failed, by name."""
 
     def __init__(self, parts: str) -> None:
-        """parts: their name in messages, such as cells."""
+        """parts: a plural noun for messages, such as "cells"."""
         super().__init__()
         self._parts = parts
 
     @contextmanager
-    def kept(self, name: str) -> Iterator[None]:
-        """Record a failure of the block as that of a part, without raising it.  Raises Interrupted."""
+    def recording(self, name: str) -> Iterator[None]:
+        """Record an error of the block as a failure of the part, instead of raising it.  Raises Interrupted."""
         try:
             yield
         except Interrupted:
@@ -38,25 +38,25 @@ class Failures(dict[str, ClsplatError]):
         """Return the error of each part in one line."""
         return {name: one_line(error) for name, error in self.items()}
 
-    def whole(self, count: int, what: str = "failed") -> ClsplatError:
-        """Return one error for all, with the exit code of the first.  count: number of all parts."""
+    def summary(self, count: int, verb: str = "failed") -> ClsplatError:
+        """Return a single error with the exit code of the first failure.  count: number of all parts."""
         name, first = next(iter(self.items()))
-        whole = ClsplatError(f"{len(self)} of {count} {self._parts} {what}; the first, {name}: {first}")
-        whole.exit_code = first.exit_code
-        return whole
+        error = ClsplatError(f"{len(self)} of {count} {self._parts} {verb}; the first, {name}: {first}")
+        error.exit_code = first.exit_code
+        return error
 
 
 @contextmanager
-def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
+def recording_failures(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
     """Turn any failure of the block into a ClsplatError, and write it to status.json.
 
-    as_raised: raise the failure itself instead.
+    as_raised: re-raise the original exception instead.
     """
     try:
         yield
     except BaseException as error:
-        is_stopped = isinstance(error, KeyboardInterrupt) and not as_raised
-        failure = _stopped(status) if is_stopped else as_clsplat_error(error)
+        is_interrupt = isinstance(error, KeyboardInterrupt) and not as_raised
+        failure = _interrupted(status) if is_interrupt else as_clsplat_error(error)
         with suppress(OutputError):  # the failure itself is more important
             state: Literal["interrupted", "failed"] = "interrupted" if isinstance(failure, Interrupted) else "failed"
             status.end(state, failure.exit_code, one_line(failure))
@@ -65,10 +65,10 @@ def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[N
         raise failure from error
 
 
-def _stopped(status: StatusFile) -> Interrupted:
-    """Return the error of a run that a signal ended at once, with how to continue it."""
+def _interrupted(status: StatusFile) -> Interrupted:
+    """Return the error of a run that a signal ended at once, with advice on how to continue."""
     now, resume = status.now, f"`clsplat resume {shell_quote(status.out)}`"
-    if not (status.has_run and now.step):  # its folder is as it was before
+    if not (status.has_run and now.step):  # the folder is unchanged
         return Interrupted("stopped at once; run the same command again to continue")
     if now.checkpoint:
         return Interrupted(f"stopped at once; {resume} continues from {now.checkpoint}")

@@ -58,28 +58,28 @@ def read(file: Path) -> Loaded:
     return load_field(file) if is_field(file) else load(file)
 
 
-def painter_of(loaded: Loaded, device: Device, background: Background) -> Painter:
-    """Return its painter on a device; Gaussians with this background, a field with its own."""
+def make_painter(loaded: Loaded, device: Device, background: Background) -> Painter:
+    """Return a painter of a model on a device.  background: for Gaussians; a field has its own."""
     if isinstance(loaded, FieldModel):
         return loaded.upload(device)
     return SplatPainter(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
 
 
 def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
-    """Return points of the content, [M, 3]: the means of Gaussians, or for a field the points of the scene, if any."""
+    """Return points of the content, [M, 3]: the means of Gaussians, or the points of the scene, if any, for a field."""
     if isinstance(loaded, Model):
         return loaded.means
     points = scene.points if scene else None
     return np.zeros((0, 3), np.float32) if points is None else points.positions
 
 
-def moves(loaded: Loaded) -> bool:
-    """Whether it is a model of a moving scene."""
+def is_moving(loaded: Loaded) -> bool:
+    """Return whether a model has motion."""
     return isinstance(loaded, Model) and loaded.motion is not None
 
 
 def size_of(loaded: Loaded) -> dict[str, int | None]:
-    """Return its size, with the keys of metrics.json."""
+    """Return the number of Gaussians or of network parameters, with the keys of metrics.json."""
     if isinstance(loaded, Model):
         return {"gaussians": len(loaded)}
     return {"gaussians": None, "parameters": loaded.shape.learned}
@@ -94,7 +94,7 @@ class ModelSource:
 
     file: Path
     folder: Path  # of the photos
-    settings: SceneSettings  # how to read them
+    settings: SceneSettings  # for reading the photos
     scene_name: str  # on pages
     alpha: Alpha | None = None  # None: as the model file says
 
@@ -102,83 +102,83 @@ class ModelSource:
     def of(cls, model: Path, scene: Path | None) -> "ModelSource":
         """Find the photos of a run folder, or of a file that a run exported; other files need `scene`.
 
-        `scene`, a dataset folder or run folder, replaces the photos of the model's run.  Raises DataError or
-        ConfigError if one is unknown.
+        `scene`, a dataset folder or run folder, replaces the photos of the model's run.  Raises DataError if a file is
+        missing, and ConfigError if the scene is unknown.
         """
-        run = run_of(model)
+        run = find_run(model)
         trained = scene if scene is not None and has_pipeline(scene) else run
         if trained is None and scene is None:
             if model.is_dir() and not model_file(model).is_file():
-                raise _no_model(model)
+                raise _missing_model_error(model)
             if not model.exists():
                 raise DataError(f"{model}: not found; expected a model file or a run folder")
             raise ConfigError(
-                f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
+                f"{model}: a model file does not name its scene; give the folder of the scene, or a run folder"
             )
         settings = load_pipeline(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
-        file = shown_of_run(model) if run == model else model
+        file = trained_file(model) if run == model else model
         if run == model and not file.is_file():
-            raise _no_model(model, file.name)
-        given = scene if scene is not None else run or model
-        folder = photographs_of(given)
-        name = scene_name(settings.path if settings.path and has_pipeline(given) else folder)
+            raise _missing_model_error(model, file.name)
+        source = scene if scene is not None else run or model
+        folder = photo_folder(source)
+        name = scene_name(settings.path if settings.path and has_pipeline(source) else folder)
         return cls(file, folder, settings, name, settings.alpha)
 
     def scene(self, model: Model | FieldModel) -> Scene:
-        """Read the photos as in the training of the model, at their full size."""
+        """Read the scene as the training of the model did, at full image size."""
         masked = self.settings.masked(read_scene(self.folder, self.settings.split))
         return masked.with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:
-    """Raise DataError for a folder without Gaussians, and for the file of a field."""
+    """Raise DataError for a folder without Gaussians, and for a field."""
     refuse_field(path)
     if path.is_dir() and not (file := model_path(path)).is_file():
-        raise _no_model(path, file.name)
+        raise _missing_model_error(path, file.name)
 
 
-def _no_model(folder: Path, name: str = MODEL) -> DataError:
+def _missing_model_error(folder: Path, name: str = MODEL) -> DataError:
     """Return the error for a folder without a model, with a remedy for its kind."""
     if _has_field(folder):
-        return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
+        return DataError(f"{folder}: its field file is missing; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
         return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {shell_quote(folder)}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(
-            f"{fault}; for a model of its photographs, run `clsplat run photos --scene {shell_quote(folder)}` first"
+            f"{fault}; to train a model of its photos, run `clsplat run photos --scene {shell_quote(folder)}` first"
         )
     return DataError(fault)
 
 
 def refuse_field(path: Path) -> None:
-    """Raise DataError for the file of a field, and for a run that trained one."""
+    """Raise DataError for a field file, and for a run that trained a field."""
     if is_field(path) or (has_pipeline(path) and _has_field(path) and not run_model(path).is_file()):
-        raise of_a_field(path)
+        raise field_error(path)
 
 
-def of_a_field(path: Path) -> DataError:
+def field_error(path: Path) -> DataError:
     """Return the error for a field where Gaussians are expected."""
-    remedy = "use `clsplat render`, after a stage export_field has written the field"
-    return DataError(f"{path}: is a field, a network instead of Gaussians; expected Gaussians; {remedy}")
+    remedy = "use `clsplat render`, after the stage export_field"
+    return DataError(f"{path}: is a field, which has a network instead of Gaussians; {remedy}")
 
 
-def shown_of_run(run: Path) -> Path:
+def trained_file(run: Path) -> Path:
     """Return the file that a run trained: Gaussians, or a field."""
     file = run_model(run)
     return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
 
 def _has_field(run: Path) -> bool:
-    """Whether a finished run trained a field instead of Gaussians."""
+    """Return whether a finished run trained a field instead of Gaussians."""
     try:
         return read_metrics(run / METRICS).gaussians is None
     except DataError:
         return False
 
 
-def run_of(model: Path) -> Path | None:
-    """Return the run folder of a model: itself, or that of the run that exported the file; None without one."""
+def find_run(model: Path) -> Path | None:
+    """Return the run folder of a model: the path itself, or the run that exported the file; None if there is none."""
     if model.is_dir():
         return model if has_pipeline(model) else None
     file = model.resolve()
@@ -191,17 +191,17 @@ def run_of(model: Path) -> Path | None:
     return None
 
 
-def photographs_of(scene: Path) -> Path:
-    """Return the dataset folder: for a run folder that of its photos, else the folder itself.
+def photo_folder(scene: Path) -> Path:
+    """Return the dataset folder of a scene: the folder itself, or for a run folder that of its photos.
 
-    Raises ConfigError if the pipeline of a run names none or cannot be read, DataError if the folder is missing.
+    Raises ConfigError if the pipeline of a run names no folder or cannot be read, DataError if the folder is missing.
     """
     if not has_pipeline(scene):
         return scene
     prepared = read_note(scene)
     folder = Path(prepared["folder"]) if prepared else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
-        raise DataError(f"{scene}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
+        raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; give the folder of the scene")
     return folder
 
 
@@ -210,18 +210,18 @@ def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
     return [stage for stage in stages if isinstance(stage, Export | ExportField)]
 
 
-def overrides_of(overrides: Sequence[str], scene: Path | None) -> list[str]:
-    """Return `overrides` with the folder of the photos, if given.  Raises ConfigError, DataError."""
-    return [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
+def with_scene_path(overrides: Sequence[str], scene: Path | None) -> list[str]:
+    """Return `overrides` with `scene.path` added, if a scene is given.  Raises ConfigError, DataError."""
+    return [*overrides, *([f"scene.path={path_setting(photo_folder(scene))}"] if scene is not None else [])]
 
 
-def as_setting(folder: Path) -> str:
-    """Return a folder as a value for `--set`, with its full path.  Raises ConfigError if YAML cannot hold its name."""
+def path_setting(folder: Path) -> str:
+    """Format the absolute path of a folder as a value for `--set`.  Raises ConfigError if YAML cannot represent it."""
     path = str(folder.resolve())
     try:
         path.encode()
     except UnicodeEncodeError:
-        raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
+        raise ConfigError(f"--scene {path!r}: expected a path in UTF-8; rename the folder") from None
     return json.dumps(path)
 
 
@@ -229,7 +229,7 @@ def as_setting(folder: Path) -> str:
 
 FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # of a video; frames of the path `views` have the names of views
 LOG = logging.getLogger("clsplat")
-KINDS = ("png", "npy")  # of files
+KINDS = ("png", "npy")  # file formats
 RECORD = ".renders.json"  # next to renders: their names, and whether each is a frame of a video
 
 
@@ -240,46 +240,48 @@ def write_pictures(
     kind: str,
     layers: Sequence[str],
     photographs: Sequence[Path],
-    film: bool = False,
+    is_video: bool = False,
 ) -> list[Path]:
     """Write images (`kind` png) or float32 arrays (npy) of the layers of each view; return their files.
 
-    The name of a layer, except color, is in the file name.  photographs: their folders must not be written to; film:
-    the views are frames of a video, and leftover frames of an earlier one are removed at the end.
+    File names end in the name of the layer, except for color.  photographs: files whose folders must not be written to;
+    is_video: the views are frames of a video, and leftover frames of an earlier one are removed at the end.
     """
-    own = image_paths(out, [view.name for view in views], f".{kind}")
-    files = [{layer: _of_layer(path, layer) for layer in layers} for path in own]
-    paths = [path for of_view in files for path in of_view.values()]
+    color_paths = image_paths(out, [view.name for view in views], f".{kind}")
+    files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
+    paths = [path for layer_files in files for path in layer_files.values()]
     if len(set(paths)) < len(paths):
-        raise ConfigError(f"{out}: two pictures would have one name, as a view is called _depth or _alpha; rename it")
+        raise ConfigError(f"{out}: two images would have one name; rename the view that ends in _depth or _alpha")
     _check_folder(out, paths, photographs)
     names = [path.relative_to(out).as_posix() for path in paths]
-    rendered = {**_rendered(out), **dict.fromkeys(names, film)}
-    _note(out, rendered)
+    rendered = {**_read_record(out), **dict.fromkeys(names, is_video)}
+    _write_record(out, rendered)
     depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
-    for view, of_view in counted(zip(views, files, strict=True), "views rendered", len(views)):
-        found = canvas.layers(view, "depth" in layers)
-        for layer, path in of_view.items():
+    for view, layer_files in counted(zip(views, files, strict=True), "views rendered", len(views)):
+        buffers = canvas.layers(view, "depth" in layers)
+        for layer, path in layer_files.items():
             if kind == "png":
-                write_image(path, layer_image(found, layer, depths))
+                write_image(path, layer_image(buffers, layer, depths))
             else:
-                _write_array(path, layer_values(found, layer))
-    if film:
-        _remove(out, {name for name, framed in rendered.items() if framed and name.endswith(f".{kind}")} - {*names})
+                _write_array(path, layer_values(buffers, layer))
+    if is_video:
+        _remove_frames(
+            out, {name for name, is_frame in rendered.items() if is_frame and name.endswith(f".{kind}")} - {*names}
+        )
     return paths
 
 
-def _remove(out: Path, frames: set[str]) -> None:
+def _remove_frames(out: Path, frames: set[str]) -> None:
     """Remove frames of an earlier video from a folder and its record."""
     with raising_output_error(out):
         for name in frames:
             (out / name).unlink(missing_ok=True)
-    _note(out, {name: framed for name, framed in _rendered(out).items() if name not in frames})
+    _write_record(out, {name: is_frame for name, is_frame in _read_record(out).items() if name not in frames})
     if frames:
-        LOG.info("%s: removed %d pictures of an earlier film", out, len(frames))
+        LOG.info("%s: removed %d frames of an earlier video", out, len(frames))
 
 
-def _of_layer(path: Path, layer: str) -> Path:
+def _layer_path(path: Path, layer: str) -> Path:
     return path if layer == LAYERS[0] else path.with_name(f"{path.stem}_{layer}{path.suffix}")
 
 
@@ -296,25 +298,25 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
     for images in {path.resolve().parent for path in photographs}:
         if folder == images or folder in images.parents or images in folder.parents:
             raise ConfigError(
-                f"{out}: is, contains or is inside the folder of the photographs, {images}; give another --out"
+                f"{out}: is, contains, or is inside the folder of the photos, {images}; give another --out"
             )
-    own = _rendered(out)
+    renders = _read_record(out)
     for path in paths:
-        if path_exists(path) and path.relative_to(out).as_posix() not in own:
+        if path_exists(path) and path.relative_to(out).as_posix() not in renders:
             raise ConfigError(f"{path}: exists, and is not from an earlier render; give another --out")
 
 
-def _rendered(out: Path) -> dict[str, bool]:
+def _read_record(out: Path) -> dict[str, bool]:
     """Return the renders of earlier calls in a folder, and whether each is a frame of a video."""
     try:
-        found = read_json(out / RECORD)
+        record = read_json(out / RECORD)
     except DataError:
         return {}
-    table = found if isinstance(found, dict) else {}
-    return {name: film is True and FRAME.fullmatch(name) is not None for name, film in table.items()}
+    table = record if isinstance(record, dict) else {}
+    return {name: is_frame is True and FRAME.fullmatch(name) is not None for name, is_frame in table.items()}
 
 
-def _note(out: Path, rendered: Mapping[str, bool]) -> None:
+def _write_record(out: Path, rendered: Mapping[str, bool]) -> None:
     write_text(out / RECORD, json.dumps(rendered, indent=1, sort_keys=True) + "\n")
 
 
@@ -324,8 +326,8 @@ SPLITS = ("train", "test", "all")
 class ModelFile:
     """A model on a device, with its scene.
 
-    Settings of rendering come from the comment of the file; files of other programs get those of 3DGS, or of
-    Mip-Splatting if the file says so.  Photos of a run folder are read as the run read them.
+    Rendering settings come from the header of the file; files of other programs get those of 3DGS, or of Mip-Splatting
+    if the header says so.  Photos of a run folder are read as the run read them.
     """
 
     def __init__(
@@ -335,9 +337,9 @@ class ModelFile:
         self.source = ModelSource.of(model, scene)
         loaded = read(self.source.file)
         self.device = open_verified(device)
-        found = self.source.scene(loaded)
-        self.loaded = loaded.with_origin(found.origin)
-        self.photographs = apply_side_files(self.source.file, found) if scene is None else found
+        original = self.source.scene(loaded)
+        self.loaded = loaded.with_origin(original.origin)
+        self.photographs = apply_side_files(self.source.file, original) if scene is None else original
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
@@ -347,24 +349,24 @@ class ModelFile:
     def gaussians(self) -> Model:
         """The model.  Raises DataError for a field."""
         if isinstance(self.loaded, FieldModel):
-            raise of_a_field(self.source.file)
+            raise field_error(self.source.file)
         return self.loaded
 
     @cached_property
     def painter(self) -> Painter:
-        """Renders the model on the device."""
-        return painter_of(self.loaded, self.device, self.background)
+        """The painter of the model on the device."""
+        return make_painter(self.loaded, self.device, self.background)
 
     def render(
         self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
     ) -> int:
-        """Write images (`kind` png) or float32 arrays (npy) of layers of the views of a split; return their number.
+        """Write layers of the views of a split as images (`kind` png) or float32 arrays (npy); return the file count.
 
-        time: of all views, in [0, 1], instead of each view's time.
+        time: in [0, 1], for all views; None: each view's time.
         """
         views: Sequence[View] = self.scene.split(split)
         if times := parse_times(time):
-            require_motion(moves(self.loaded))
+            require_motion(is_moving(self.loaded))
             views = [replace(view, time=times[0]) for view in views]
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
@@ -405,9 +407,9 @@ def render(
     device: str | Device | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
-    for what, value, known in (("split", split, SPLITS), ("kind", kind, KINDS)):
-        if value not in known:
-            raise ConfigError(f"no {what} '{value}'; there are {', '.join(known)}")
+    for option, value, choices in (("split", split, SPLITS), ("format", kind, KINDS)):
+        if value not in choices:
+            raise ConfigError(f"--{option}: expected {' or '.join(choices)}, got '{value}'")
     return ModelFile(model, scene, device, downscale).render(split, out, kind, layers, time)
 
 
@@ -422,22 +424,22 @@ def evaluate(
     device: str | Device | None = None,
 ) -> dict[str, Any]:
     """Measure a model file or run folder on a scene's views, with the keys of metrics.json.  Raises ClsplatError."""
-    if wrong := [value for value in downscales or () if not 1 <= value < math.inf]:
-        raise ConfigError(f"expected downscale factors from 1 on, got {wrong[0]:g}")
+    if invalid := [value for value in downscales or () if not 1 <= value < math.inf]:
+        raise ConfigError(f"--downscales: expected downscale factors of at least 1, got {invalid[0]:g}")
     perceptual = Perceptual.open(metric_names(list(metrics)), lpips, lpips_input)
     return ModelFile(model, scene, device).evaluate(downscales, perceptual)
 
 
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
-    """Write cameras as files of other programs; return the files.
+    """Write cameras in the format of another program; return the files.
 
-    scene: a dataset, as a folder or a scene, or a run folder, with its optimized cameras.  Raises ClsplatError.
+    scene: a dataset folder, a `Scene`, or a run folder, whose cameras are the optimized ones.  Raises ClsplatError.
     """
     if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: expected a folder to write into")
+        raise ConfigError(f"{out}: is a file; expected a folder to write into")
     if isinstance(scene, Path) and has_pipeline(scene):
         source = ModelSource.of(scene, None)
-        found = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
+        resolved = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
     else:
-        found = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
-    return camera_files.write_cameras(found, out, format_, images)
+        resolved = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
+    return camera_files.write_cameras(resolved, out, format_, images)

@@ -1,4 +1,4 @@
-"""Open a run: check its device, prepare its photos, read its scene."""
+"""Open a run: check the device, prepare the photos, read the scene, and resolve settings that the photos decide."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from clsplat.training.status import StatusFile
 # The scene of a run, with all photos decoded.
 
 LOG = logging.getLogger("clsplat")
-MIN_VIEWS = 3  # training photos; fewer get a warning
+MIN_VIEWS = 3  # training photos; with fewer, a warning is logged
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +51,10 @@ class RunScene:
     identity: Identity
 
     @classmethod
-    def of(cls, settings: SceneSettings, scene: Scene) -> "RunScene":
+    def from_scene(cls, settings: SceneSettings, scene: Scene) -> "RunScene":
         """Apply the settings to a scene, and decode its photos.
 
-        Raises DataError with the files if some photos or masks cannot be used.
+        Raises DataError, with their names, if photos or masks cannot be used.
         """
         original, background = settings.applied(scene)
         downscaled = original.downscaled(*settings.downscales)
@@ -72,10 +72,12 @@ class RunScene:
         )
         if len(original.train) < MIN_VIEWS:
             LOG.warning(
-                "%s: only %s for training: the model will fit these and little else; add photos",
+                "%s: only %s for training, so new views will look wrong; add photos",
                 *(scene.path, pluralize(len(original.train), "photo")),
             )
-        files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
+        files = decode_all(
+            view for version in (original, downscaled) for split in SPLITS for view in version.split(split)
+        )
         require_decodable(scene.path, files)
         return cls(original, downscaled, background, Identity.from_scene(original, files))
 
@@ -84,8 +86,8 @@ ReadScene = Callable[[SceneSettings, Path], RunScene]
 
 
 def read_run_scene(settings: SceneSettings, folder: Path) -> RunScene:
-    """Read the scene in a folder with these settings.  Raises DataError."""
-    return RunScene.of(settings, read_scene(folder, settings.split))
+    """Read the scene in a folder with the settings of a run.  Raises DataError."""
+    return RunScene.from_scene(settings, read_scene(folder, settings.split))
 
 
 READ_SCENE = "read_scene"  # the last stage of the preparation
@@ -99,17 +101,16 @@ def open_run(
     status: StatusFile | None = None,
     read: ReadScene = read_run_scene,
 ) -> Run:
-    """Open the device, prepare and read the scene, and decode its photos, with the progress in `status`.
+    """Open the device, prepare and read the scene, and decode its photos; `status` shows the progress.
 
-    start: "restart" allows other photos than those that the run in `out` was started with.
-    Raises the errors of these steps.
+    start: "restart" allows photos that differ from those of the run in `out`.  Raises the errors of these steps.
     """
     opened, planned = check_start(pipeline, out, device, start)
     if status:
         status.enter("preparing", device=opened.text)
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
-    with listening(counts_of(status)):
+    with listening(count_listener(status)):
         folder = prepare(planned, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
@@ -117,14 +118,14 @@ def open_run(
     return run
 
 
-def counts_of(status: StatusFile) -> Listener:
-    """Return a listener that writes counts of the preparation to `status`, with the time left in its last stage only.
+def count_listener(status: StatusFile) -> Listener:
+    """Return a listener that writes progress of the preparation to `status`; the time left, only in the last stage.
 
-    Earlier, the time of the following steps is unknown, such as that of mapping while pairs are matched.
+    Earlier, the time of the next steps is unknown: for example, that of mapping while pairs are being matched.
     """
 
-    def note_count(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        status.count(what, done, total, seconds_left=seconds_left if status.now.stage == READ_SCENE else None)
+    def note_count(unit: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        status.count(unit, done, total, seconds_left=seconds_left if status.now.stage == READ_SCENE else None)
 
     return note_count
 
@@ -132,7 +133,7 @@ def counts_of(status: StatusFile) -> Listener:
 def check_start(
     pipeline: Pipeline, out: Path, device: str | Device | None, start: Start
 ) -> tuple[Device, list[PlannedStep]]:
-    """Check everything that can be checked before photos are prepared; return the device and the steps of `prepare`.
+    """Check all that is possible before photos are prepared; return the device and the steps of `prepare`.
 
     Nothing is written.  Raises the errors of a run.
     """
@@ -146,10 +147,10 @@ def check_start(
     return opened, planned
 
 
-def listed(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> list[str]:
-    """Return the names of the photos to prepare; empty if `prepare` has no photos to find.
+def photo_names(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> list[str]:
+    """Return the names of the photos to prepare; empty without `prepare`, or if there are none.
 
-    The log names the files that are skipped.
+    Skipped files are logged.
     """
     try:
         return (
@@ -162,7 +163,7 @@ def listed(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> lis
 def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
     """Return the steps that prepare the photos of a run in `out`; nothing is written.
 
-    Raises ConfigError or DataError for faults that are known before the first step.
+    Raises ConfigError or DataError for errors that are known before the first step.
     """
     planned = pipeline.preparation(out)
     if planned and planned[0].why:
@@ -173,26 +174,26 @@ def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
 
 
 def _check_split(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> None:
-    """Raise DataError if the photos to prepare cannot have the split, even if all get a camera."""
+    """Raise DataError if the photos to prepare do not fit the split, even if all get a camera."""
     with log_level(logging.ERROR):
-        names = listed(pipeline, planned, out)
+        names = photo_names(pipeline, planned, out)
     if not names:
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
     with suppress(MissingViewError):  # a dry run reports it
-        _applied(pipeline, names)
+        _scene_of_names(pipeline, names)
 
 
-def known(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
-    """Return the measures of named photos, if all get a camera: the number for training and validation.
+def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
+    """Return the measures known before preparation: the number of training and validation photos, if all get a camera.
 
-    None without names.  Raises DataError if the split does not fit them.
+    Returns None without names.  Raises DataError if the photos do not fit the split.
     """
-    return Measures(len(_applied(pipeline, names).merge_validation().train)) if names else None
+    return Measures(len(_scene_of_names(pipeline, names).merge_validation().train)) if names else None
 
 
-def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
-    """Return a scene of named photos, all with a camera, with the split.  Raises DataError."""
+def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
+    """Return a scene of named photos with placeholder cameras and the split of the pipeline.  Raises DataError."""
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
@@ -201,19 +202,19 @@ def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
 
 
 def undistorted_folder(out: Path) -> Path:
-    """Return the folder of undistorted photos: in the run folder, or behind a link next to it.
+    """Return the folder of undistorted photos: in the run folder, or the target of a link next to it.
 
-    A store creates the link so that its cells share the photos.  Each host has its own folder, as the names of
+    A store creates the link so that its cells share the photos.  Each host has a separate folder, because the names of
     temporary files are unique only within a host.
     """
     shared = out.absolute().parent / UNDISTORTED
-    store = Path(*shared.parts[:-4]) / UNDISTORTED  # links to other places may come from somebody else
-    is_of_store = shared.is_symlink() and shared.is_dir() and shared.resolve().parent == store.resolve()
-    return shared / Owner.current().host_slug if is_of_store else out / UNDISTORTED
+    store = Path(*shared.parts[:-4]) / UNDISTORTED  # a link to another folder is not from the store
+    is_store_link = shared.is_symlink() and shared.is_dir() and shared.resolve().parent == store.resolve()
+    return shared / Owner.current().host_slug if is_store_link else out / UNDISTORTED
 
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
-    """Return a run of the pipeline on a scene, before its first stage."""
+    """Return the run of a pipeline on a scene, in the state before its first stage."""
     settings = pipeline.settings
     budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
     return Run(
@@ -235,13 +236,13 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
     )
 
 
-# Choices that follow from the photos, made before the first step and written to the run's pipeline.yaml.
+# Settings that the photos decide, resolved before the first step and written to the run's pipeline.yaml.
 
 
-def settle(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> Pipeline:
-    """Return the pipeline with what its `adapt` and its `auto` keys choose by the photos, and give it to the run.
+def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> Pipeline:
+    """Resolve `adapt` and `auto` keys from the photos; return the pipeline, and set it in the run.
 
-    Choices that an earlier run made stay.  log_reasons: whether to log why `adapt` decides as it does.
+    Choices of an earlier run are kept.  log_reasons: whether to log the reasons of `adapt`.
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
@@ -267,7 +268,7 @@ def _warn_of_near(near: float, nearest: float | None) -> None:
 
 
 def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline with what its training modules choose."""
+    """Return the pipeline with the `auto` settings of its training modules resolved."""
 
     def with_choices(training: Optimize) -> Optimize:
         modules = [module.resolve_auto(run) for module in training.modules]

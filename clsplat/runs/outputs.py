@@ -21,18 +21,18 @@ from clsplat.core.files import (
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, sha256
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.state import Phase, RunState, is_below, not_whole, read_sums
+from clsplat.runs.state import Phase, RunState, damaged_files, is_below, read_sums
 from clsplat.stages.report import is_overfit
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write the results of a run and the paths of its files, for the last stage of each name."""
-    trained = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
-    spent = {
+    """Write metrics.json: the results of a run, and the output path of the last stage of each name."""
+    training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
+    seconds = {
         **run.status.seconds,
-        trained: run.train_seconds,
+        training: run.train_seconds,
     }  # of this process; training time includes earlier processes
     files = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
@@ -50,7 +50,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "seed": run.seed,
         "device": run.device.text,
         "pipeline": run.name,
-        "seconds": {name: round(seconds, 3) for name, seconds in spent.items()},
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "scene": str(run.scene.path.resolve()),
         **({"origin": run.scene.origin.tolist()} if run.scene.origin.any() else {}),
         "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
@@ -60,37 +60,37 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 
-def sums_before(pipeline: Pipeline, run: Run) -> dict[str, str]:
-    """Return the SHA-256, by path in the folder, of files that the finished run had and that no later stage rewrites.
+def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
+    """Return the SHA-256, by path in the folder, of files of the finished run that no later stage rewrites.
 
-    Until the run ends again, other bytes in these files count as damage.  Records, and files of a training that
-    continues, are included only if they are lost.
+    Until the run ends again, a change of these files counts as damage.  Records, and files of a training that
+    continues, are included only if they are damaged.
     """
     sums = read_sums(run.out)  # read again: with --minutes this process may have changed them
     if sums is None:
         sums = run.model_hashes if run.status.was_done else {}
     stages = pipeline.stages[run.stage_index :]
-    trained = [path for stage in stages if isinstance(stage, Training) for path in stage.outputs(run.out)]
-    written = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
-    written += [run.out / name for name in (PIPELINE, METRICS)]
-    before = {name: value for name, value in sums.items() if not is_below(run.out / name, written)}
-    lost, grown = not_whole(run.out, before), [run.out / RECORDS, *trained]
-    return {n: value for n, value in before.items() if n in lost or not is_below(run.out / n, grown)}
+    training_files = [path for stage in stages if isinstance(stage, Training) for path in stage.outputs(run.out)]
+    rewritten = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
+    rewritten += [run.out / name for name in (PIPELINE, METRICS)]
+    previous = {name: value for name, value in sums.items() if not is_below(run.out / name, rewritten)}
+    damaged, growing = damaged_files(run.out, previous), [run.out / RECORDS, *training_files]
+    return {n: value for n, value in previous.items() if n in damaged or not is_below(run.out / n, growing)}
 
 
-def write_checksums(pipeline: Pipeline, run: Run, before: Mapping[str, str]) -> None:
+def write_checksums(pipeline: Pipeline, run: Run, previous: Mapping[str, str]) -> None:
     """Write the SHA-256 of each file of the finished run, by path in the run folder.
 
-    Files that were written `before` keep theirs.
+    previous: checksums of files that this run did not write.
     """
     files = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
     for output in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         files += sorted(output.rglob("*")) if output.is_dir() else [output]
-    new = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in before]
-    keep_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new}, **before})
+    new = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in previous]
+    save_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new}, **previous})
 
 
-def keep_checksums(run: Run, sums: Mapping[str, str]) -> None:
+def save_checksums(run: Run, sums: Mapping[str, str]) -> None:
     """Write the list of checksums, or remove it if there are none."""
     if sums:
         write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
@@ -103,9 +103,9 @@ def _name(path: Path, run: Run) -> str:
 
 
 def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
-    """Raise ConfigError if a run would write outside of its folder, or over files that are not from a run.
+    """Raise ConfigError if a run would write outside of its folder, or replace files that are not from a run.
 
-    Raises OutputError if the folder cannot exist.
+    Raises OutputError if the path of the folder is impossible.
     """
     out = state.out
     path_exists(out)
@@ -116,48 +116,48 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
         [folder, folder.parent] if pipeline.settings.prepare else [folder]
     )  # `prepare` hashes the photos' folder
     if scene.path is not None and scene.folder.resolve() in forbidden:
-        raise ConfigError(f"{out}: is the folder of the photos, or in it; use another folder for the run")
+        raise ConfigError(f"{out}: is, or is inside, the folder of the photos; use another folder for the run")
     check_names(state, RUN_FILES, [path for stage in pipeline.stages for path in stage.outputs(out)])
 
 
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
-    """Raise ConfigError if a file that a run or a matrix writes is outside of its folder, or is not from a run."""
+    """Raise ConfigError if a file that a run or a matrix would write is outside of its folder, or not from a run."""
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
     require_inside(out, files)
-    own = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
-    leftovers = {out / name for name in own}  # of a run that has not started
+    written = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
+    leftovers = {out / name for name in written}  # of a run that has not started
     for path in files if state.phase < Phase.BEGUN else ():
         if path not in leftovers and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
             raise ConfigError(f"{path}: exists, and is not from a run; use another folder for the run")
 
 
 def require_inside(out: Path, files: Sequence[Path]) -> None:
-    """Raise ConfigError if one of the files is a link to outside of a folder."""
+    """Raise ConfigError if a file is a link to a target outside of a folder."""
     folder = out.resolve()
     if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
-        raise ConfigError(f"{outside[0]}: is a link to outside of the run folder; remove it, or choose another name")
+        raise ConfigError(f"{outside[0]}: links to a target outside of the run folder; remove it, or use another name")
 
 
 def _is_lock(file: Path) -> bool:
-    """Whether a file is a run.lock, even if its process was killed before it had written all of it."""
-    begin = b'{"process": '
-    return file.is_file() and begin.startswith(read_file(file)[: len(begin)])
+    """Return whether a file is a run.lock, even one that its process did not finish writing."""
+    start = b'{"process": '
+    return file.is_file() and start.startswith(read_file(file)[: len(start)])
 
 
-def check_outputs(pipeline: Pipeline, run: Run, lost: Collection[str] = ()) -> None:
-    """Check that the files of a run exist, except those that were `lost` before.
+def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -> None:
+    """Check that the files of a run exist, except those that were `damaged` before it.
 
-    Raises OutputError if one is missing, or a model has changed since it was written.
+    Raises OutputError if a file is missing, or a model has changed since it was written.
     """
     outputs = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
     models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, outputs)}
-    faults = {name for name in (METRICS, PIPELINE, *declared(pipeline)) if not (run.out / name).is_file()}
-    if faults := (faults | {*not_whole(run.out, models)}) - {*lost}:
+    faults = {name for name in (METRICS, PIPELINE, *declared_outputs(pipeline)) if not (run.out / name).is_file()}
+    if faults := (faults | {*damaged_files(run.out, models)}) - {*damaged}:
         fault = "is missing, or changed after the run wrote it"
         raise OutputError(f"{run.out / min(faults)}: {fault}; see {run.out / LOG_FILE}")
 
 
-def declared(pipeline: Pipeline) -> list[str]:
-    """Return the files that the stages of a pipeline name, as paths in the run folder."""
+def declared_outputs(pipeline: Pipeline) -> list[str]:
+    """Return the output files that the stages of a pipeline name, as paths in the run folder."""
     fields = [(stage, *named) for stage in pipeline.stages for named in stage.named_outputs().items()]
     return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

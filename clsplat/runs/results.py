@@ -23,7 +23,7 @@ Points = list[tuple[float, float]]
 
 
 class Averages(BaseModel):
-    """Metrics of a split at one image size; perceptual metrics and remarks on them are extra fields."""
+    """Metrics of a split at one image size; perceptual metrics are extra fields."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
@@ -31,7 +31,7 @@ class Averages(BaseModel):
     ssim: float
     lpips: float | None = None
     views: int
-    psnr_color_views: int | None = None  # None: all of them
+    psnr_color_views: int | None = None  # None: all views
 
     @property
     def color_views(self) -> int:
@@ -54,21 +54,21 @@ class RunMetrics(BaseModel):
 
     test: AveragesByDownscale
     train: AveragesByDownscale
-    gaussians: int | None  # None: a field was trained
+    gaussians: int | None  # None for a field
     parameters: int | None = None  # of a field
     steps: int
     train_seconds: float
-    cpu_seconds: float | None = None  # of all threads, in the training
-    device_memory: int | None = None  # bytes, the peak
+    cpu_seconds: float | None = None  # of the training, summed over threads
+    device_memory: int | None = None  # peak, bytes
     seed: int
     device: str
     pipeline: str
-    files: dict[str, str] = {}  # of the last stage of each name, in the run folder
+    files: dict[str, str] = {}  # by stage name: the output of its last stage, in the run folder
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One finished run."""
+    """The folder of a finished run: settings, metrics, and records."""
 
     path: Path
     settings: dict[str, Any]  # the resolved pipeline, in the shape of a file
@@ -79,19 +79,19 @@ class RunFolder:
     def read(cls, path: Path) -> "RunFolder":
         """Read a run folder.
 
-        Raises DataError when it is missing, unfinished or damaged, ConfigError when its pipeline.yaml cannot be read.
+        Raises DataError if it is missing, unfinished, or damaged, and ConfigError if its pipeline.yaml cannot be read.
         """
         state = RunState.read(path)
         if PIPELINE not in state.names:
             raise DataError(f"{path}: has no {PIPELINE}; expected the folder of a finished run")
         if METRICS not in state.names:
-            raise DataError(f"{path}: has no {METRICS}, as the run is {state.state_name}; finish it with --resume")
+            raise DataError(f"{path}: has no {METRICS} because the run is {state.state_name}; finish it with --resume")
         settings = read_settings(path)
         return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
 
     @property
     def missing_plugins(self) -> list[str]:
-        """A sentence for each plug-in of the run that is not loaded, or has other content now."""
+        """A message for each plug-in of the run that is not loaded, or has changed since."""
         recorded = self.settings.get("plugins")
         faults = plugins.differences(recorded) if isinstance(recorded, dict) else []
         return [f"{self.path}: {fault}" for fault in faults]
@@ -107,14 +107,14 @@ class RunFolder:
         """The lines of metrics.jsonl; empty if it is missing.  Raises DataError if it is damaged."""
         return Records(self.path).read()
 
-    def points(self, kind: str, figure: str, **where: Any) -> Points:
-        """Return (step, figure) of all records of a kind, such as `train`, that have the values `where`."""
+    def points(self, kind: str, figure: str, **conditions: Any) -> Points:
+        """Return (step, figure) of all records of a kind, such as `train`, that match the conditions."""
         lines = (line for line in self.records if line["kind"] == kind)
-        chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
+        chosen = (line for line in lines if all(line.get(key) == value for key, value in conditions.items()))
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
 
     def by_cpu_seconds(self, points: Points) -> Points:
-        """Return points (CPU seconds of training, figure) for points (step, figure); empty without CPU times."""
+        """Convert points (step, figure) to points (CPU seconds of training, figure); empty without CPU times."""
         times = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
         if len(times) == 1:
             return []
@@ -129,7 +129,7 @@ class RunFolder:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError if it is not a pipeline."""
+    """Return the pipeline.yaml of a run folder as plain data.  Raises ConfigError if it is not a pipeline."""
     data = read_yaml(path / PIPELINE).data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
         raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")
@@ -145,13 +145,13 @@ def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
 
 
 def read_metrics(path: Path) -> RunMetrics:
-    """Return the contents of a metrics.json.  Raises DataError with the file and the place when it is damaged."""
+    """Read a metrics.json.  Raises DataError, with the file and the key, if it is damaged."""
     try:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:
         first = error.errors()[0]
-        place = shorten(".".join(str(part) for part in first["loc"]))
+        key = shorten(".".join(str(part) for part in first["loc"]))
         message = shorten(first["msg"].removeprefix("Invalid JSON: "), 200)
         raise DataError(
-            f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
+            f"{path}: {key + ': ' if key else ''}{message}; the file is damaged: run the pipeline again"
         ) from error

@@ -1,4 +1,4 @@
-"""Create, lock and clear run folders, and leave them unchanged if a run does not get to start."""
+"""Create, lock, and clear run folders; restore them if a run ends before its first step."""
 
 import shutil
 from collections.abc import Collection, Iterator
@@ -38,12 +38,12 @@ Start = Literal["new", "resume", "restart"]
 
 
 @contextmanager
-def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]:
+def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]:
     """Create and lock the run folder, remove leftovers of killed runs, and yield its status with `values`.
 
     A run that ends before its first step, without a checkpoint, leaves no files behind, and a finished run that is
-    refused before it continues stays finished.
-    Raises ConfigError if the folder has another run, OutputError if it is in use or cannot be written.
+    rejected before it continues stays finished.
+    Raises ConfigError if the folder has another run, and OutputError if it is in use or not writable.
     """
     check_run_folder(state, start)
     out = state.out
@@ -52,7 +52,7 @@ def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]
         make_folder(out)
     try:
         with lock.lock_folder(out) as require_held:
-            state = RunState.read(out)  # again, now that it is held: another process may have run there since
+            state = RunState.read(out)  # again: another process may have run there before the lock was taken
             check_run_folder(state, start)
             remove_partial_files(out, border=PIPELINE)
             old_status = read_text(out / STATUS) if state.phase is Phase.DONE else None
@@ -66,12 +66,12 @@ def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]
                     with suppress(OutputError):
                         status.require_held()
                         write_text(out / STATUS, old_status)
-                is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
+                is_defect = isinstance(as_clsplat_error(error), InternalError)  # keep the log, which has the traceback
                 if PIPELINE not in state.names and not status.now.step and not is_defect:
                     written = EARLY_RUN_FILES if status.now.cells else RUN_FILES - {CHECKPOINTS}
                     with suppress(OutputError):
                         status.require_held()
-                        _remove_unused(out, written, kept={LOCK} if new_folders else EARLY_RUN_FILES)
+                        _remove_unused(out, written, keep={LOCK} if new_folders else EARLY_RUN_FILES)
                 raise
     except BaseException:
         with suppress(OSError):  # a folder that is not empty stays
@@ -80,21 +80,21 @@ def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]
         raise
 
 
-def _remove_unused(out: Path, written: Collection[str], kept: Collection[str]) -> None:
-    """Remove what a run wrote that ended before its first step, except for the names to keep.
+def _remove_unused(out: Path, written: Collection[str], keep: Collection[str]) -> None:
+    """Remove the files of a run that ended before its first step, except for the names to keep.
 
-    If there is anything else, such as a checkpoint or a file of the user, nothing is removed.
+    Nothing is removed if the folder has other files, such as a checkpoint or a file of the user.
     """
     with suppress(OSError):
         files = list(out.iterdir())
         if all(file.name in written for file in files):
             for file in files:
-                if file.name not in kept:
+                if file.name not in keep:
                     shutil.rmtree(file) if file.is_dir() else file.unlink()
 
 
 def clear(status: StatusFile) -> None:
-    """Remove everything that a run could continue from.  Raises OutputError."""
+    """Remove the checkpoints and results of earlier runs.  Raises OutputError."""
     status.note(checkpoint=None)
     status.write()
     out = status.out
@@ -104,8 +104,8 @@ def clear(status: StatusFile) -> None:
             file.unlink(missing_ok=True)
 
 
-def _is_of_a_run(state: RunState) -> bool:
-    """Whether the pipeline.yaml of a folder, if any, was written by a run or a matrix."""
+def _has_own_pipeline(state: RunState) -> bool:
+    """Return whether the pipeline.yaml of a folder, if any, was written by a run or a matrix."""
     out = state.out
     if PIPELINE not in state.names or STATUS in state.names or state.checkpoints:
         return True
@@ -119,17 +119,17 @@ def _is_of_a_run(state: RunState) -> bool:
 
 
 def check_run_folder(state: RunState, start: Start) -> None:
-    """Raise ConfigError if a new run finds another run in its folder, or any run a pipeline.yaml of the user.
+    """Raise ConfigError if the folder has another run, for a new run, or a pipeline.yaml that no run wrote.
 
-    Raises OutputError if a run that is to continue has lost its state.
+    Raises OutputError if a run to resume has lost its state.
     """
     out = state.out
     if start not in get_args(Start):
         raise ConfigError(f"start: expected one of {', '.join(get_args(Start))}, got '{start}'")
-    if not _is_of_a_run(state):
+    if not _has_own_pipeline(state):
         raise ConfigError(f"{out / PIPELINE}: was not written by a run, which would replace it; use another folder")
     if start == "new" and state.phase >= Phase.BEGUN:
-        raise ConfigError(f"{out}: already has a run; use another folder, --resume or --restart")
+        raise ConfigError(f"{out}: already has a run; use another folder, --resume, or --restart")
     if start != "resume":
         return
     if state.phase is Phase.DONE and "cells" not in state.status and not state.checkpoints:
@@ -138,7 +138,7 @@ def check_run_folder(state: RunState, start: Start) -> None:
         )
     if state.phase is Phase.STATELESS:
         raise OutputError(
-            f"{out}: both {STATUS} and the checkpoints of its run are lost; put them back, or start the run over with "
+            f"{out}: both {STATUS} and the checkpoints of its run are missing; restore them, or start over with "
             f"{state.restart}"
         )
 
@@ -147,7 +147,7 @@ def check_run_folder(state: RunState, start: Start) -> None:
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunState:
-    """Return the default run folder, with the next free number if another run is there."""
+    """Return the default run folder, or the next numbered one that has no other run."""
     number, state = 1, RunState.read(folder)
 
     def is_taken() -> bool:
@@ -157,7 +157,7 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunSta
                     return True
             except OutputError:  # locked by a run that may not have started yet
                 return True
-        return PIPELINE in state.names and not (pipeline and is_same(pipeline, state))
+        return PIPELINE in state.names and not (pipeline and is_up_to_date(pipeline, state))
 
     while start == "new" and is_taken():
         number += 1
@@ -165,15 +165,15 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunSta
     return state
 
 
-def start_of(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:
-    """Return how a run starts in a folder; None if it is finished.  A finished run that lost files resumes."""
-    if start == "new" and is_same(pipeline, state):
+def choose_start(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:
+    """Return how a run starts in a folder; None if it is finished.  A finished run with missing files resumes."""
+    if start == "new" and is_up_to_date(pipeline, state):
         start = "resume"
-    return None if start == "resume" and state.is_whole(pipeline) else start
+    return None if start == "resume" and state.is_complete(pipeline) else start
 
 
-def is_same(pipeline: Pipeline, state: RunState) -> bool:
-    """Whether a run with this pipeline and the same photos is finished; always false without `prepare`."""
+def is_up_to_date(pipeline: Pipeline, state: RunState) -> bool:
+    """Return whether a run of this pipeline on the same photos is finished; always False without `prepare`."""
     if not pipeline.settings.prepare or state.phase is not Phase.DONE or state.difference(pipeline):
         return False
     return read_note(state.out) == make_note(pipeline.preparation(state.out))

@@ -15,9 +15,9 @@ from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.inspect.findings import few_views
-from clsplat.runs.outputs import check_outputs, keep_checksums, sums_before, write_checksums, write_metrics
+from clsplat.runs.outputs import check_outputs, previous_sums, save_checksums, write_checksums, write_metrics
 from clsplat.runs.run_folder import RESOLVED, Start, clear
-from clsplat.runs.state import not_whole
+from clsplat.runs.state import damaged_files
 from clsplat.scene.identity import Identity
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
@@ -31,15 +31,15 @@ from clsplat.training.stage import Training
 # The refit: training again on all photos, for the number of steps that validation found best.
 
 LOG = logging.getLogger("clsplat")
-WITHOUT = {"keep": "last", "patience": None, "refit": False}
+WITHOUT_VALIDATION = {"keep": "last", "patience": None, "refit": False}
 
 
-def is_due(run: Run) -> bool:
-    """Whether validation has found the number of steps, and the refit has not started."""
+def is_refit_due(run: Run) -> bool:
+    """Return whether validation has chosen the number of steps, and the refit has not started."""
     return run.best is not None and run.best.refit == "due"
 
 
-def begin_if_due(run: Run) -> None:
+def start_refit_if_due(run: Run) -> None:
     """Restart the pipeline if a refit is due."""
     if run.best is None or run.best.refit != "due":
         return
@@ -52,8 +52,8 @@ def begin_if_due(run: Run) -> None:
     run.restart_for_refit(run.best.model_copy(update={"refit": "begun"}))
 
 
-def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline; in a refit with the number of steps that validation found best, keeping the last model.
+def with_refit_steps(pipeline: Pipeline, run: Run) -> Pipeline:
+    """Return the pipeline as it is trained: in a refit, for the number of steps that validation chose.
 
     A refit gives the same bits as a run of this pipeline without validation views.
     """
@@ -61,19 +61,19 @@ def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
         return pipeline
     best = run.best
 
-    def refitted(stage: Optimize) -> Optimize:
+    def with_steps(stage: Optimize) -> Optimize:
         if stage.keep != "best":
             return stage
-        during = [_as_grown(inner, best) if isinstance(inner, Densify) else inner for inner in stage.during]
-        return stage.model_copy(update={"steps": best.measured.step, "during": during, **WITHOUT})
+        during = [_with_growth_end(inner, best) if isinstance(inner, Densify) else inner for inner in stage.during]
+        return stage.model_copy(update={"steps": best.measured.step, "during": during, **WITHOUT_VALIDATION})
 
-    return replace(pipeline, settings=map_trainings(pipeline.settings, Optimize, refitted))
+    return replace(pipeline, settings=map_trainings(pipeline.settings, Optimize, with_steps))
 
 
-def _as_grown(stage: Densify, best: Best) -> Densify:
-    """Return a stage that stops growth at the step where patience stopped it before."""
-    ended = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
-    return stage.model_copy(update={"patience": None, "grow_until": min(ended, default=None)})
+def _with_growth_end(stage: Densify, best: Best) -> Densify:
+    """Return a stage that ends growth at the step where patience ended it in the first training."""
+    ends = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
+    return stage.model_copy(update={"patience": None, "grow_until": min(ends, default=None)})
 
 
 # inputs.json: the inputs of a run, and their comparison when the run resumes.
@@ -86,31 +86,31 @@ def write_inputs(run: Run) -> None:
 
 
 def require_same_inputs(scene: Path, identity: Identity | None, out: Path, digest: str = "") -> None:
-    """Raise ConfigError, with the changes, if a run was started with other photos, cameras or points.
+    """Raise ConfigError, with the changes, if a run was started with other photos, cameras, or points.
 
-    digest: of those, if a checkpoint has it.
+    digest: of the earlier inputs, if a checkpoint has it.
     """
-    before = _read(out / INPUTS)
-    digest = digest or (before.digest if before else "")
+    previous = _read_identity(out / INPUTS)
+    digest = digest or (previous.digest if previous else "")
     if not digest:
         LOG.warning("%s: missing or damaged; cannot check that the photos are the same", out / INPUTS)
     elif identity and identity.digest != digest:
-        changes = ", ".join(identity.changes(before)) if before else ""
+        changes = ", ".join(identity.changes(previous)) if previous else ""
         changes = changes or f"{INPUTS} is missing or damaged, so the changes are unknown"
         raise ConfigError(
-            f"{scene}: not what the run was started with: {shorten(changes, 500)}; put that back, or start over: "
+            f"{scene}: differs from the inputs of the run: {shorten(changes, 500)}; restore them, or start over: "
             "`clsplat run` with --restart or another --out"
         )
 
 
-def _read(path: Path) -> Identity | None:
+def _read_identity(path: Path) -> Identity | None:
     try:
         return Identity.from_data(read_json(path))
     except (DataError, ValueError):
         return None
 
 
-# Ctrl-C, SIGTERM and SIGHUP.
+# Ctrl-C, SIGTERM, and SIGHUP.
 
 
 @contextmanager
@@ -137,7 +137,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     The caller records failures.
     """
     run.on_progress = show
-    before = begin(pipeline, run, start)
+    previous = begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
         run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
@@ -146,45 +146,45 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         LOG.info("%s", text)
     run.status.require_held()
     write_metrics(pipeline, run)
-    lost = not_whole(run.out, before)
-    check_outputs(pipeline, run, lost)
-    write_checksums(pipeline, run, before)
-    for name in lost:
+    damaged = damaged_files(run.out, previous)
+    check_outputs(pipeline, run, damaged)
+    write_checksums(pipeline, run, previous)
+    for name in damaged:
         LOG.warning("%s: is missing or has changed; only --restart writes it again", run.out / name)
     run.status.end("done", exit_code=0)
 
 
 def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
-    """Restore the newest checkpoint, or clear the folder, and write the first files of a run folder.
+    """Restore the newest checkpoint, or clear the folder, and write the first files of the run.
 
-    Return the checksums of files that the finished run had, and that no later stage rewrites.
+    Return the checksums of files of the finished run that no later stage rewrites.
     """
-    taken = restore(pipeline, run) if start == "resume" else None
+    restored = restore(pipeline, run) if start == "resume" else None
     check_run(pipeline, run)
     if start == "restart":
         clear(run.status)
     if start == "resume":
-        LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
-    before = sums_before(pipeline, run) if taken else {}
-    run.status.enter("running", step=run.step)  # until here, a refusal changes nothing
-    keep_checksums(run, before)
-    checkpoint.drop_later(run.out, taken)
+        LOG.info("resumed at step %d" if restored else "nothing to resume; starting from the beginning%.0s", run.step)
+    previous = previous_sums(pipeline, run) if restored else {}
+    run.status.enter("running", step=run.step)  # before this line, an error leaves the folder unchanged
+    save_checksums(run, previous)
+    checkpoint.drop_later(run.out, restored)
     write_pipeline(pipeline, run)
     write_inputs(run)
     if run.prepared:
         write_text(run.out / PREPARE_SUMMARY, json.dumps(run.prepared) + "\n")
     run.records.start(run.is_refit)
-    return before
+    return previous
 
 
 def check_run(pipeline: Pipeline, run: Run) -> None:
-    """Raise what stages that are still to run can know of the run before any of them; nothing is written."""
+    """Check the run for all remaining stages, and raise their errors; nothing is written."""
     for stage in pipeline.stages[run.stage_index :]:
         stage.check_run(run)
 
 
 def write_pipeline(pipeline: Pipeline, run: Run) -> None:
-    """Write all settings of the run, with the reason if some differ from the file."""
+    """Write pipeline.yaml, with all settings, and the reason if some differ from the pipeline file."""
     reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
     write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
 
@@ -192,45 +192,45 @@ def write_pipeline(pipeline: Pipeline, run: Run) -> None:
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
     """Restore the newest intact checkpoint; return it, or None if none was saved.  Nothing is written.
 
-    Raises ConfigError if it has other settings, photos, cameras or points, or has trained longer already, and
+    Raises ConfigError if it has other settings, photos, cameras, or points, or has trained longer already, and
     OutputError if all checkpoints are damaged.
     """
-    taken, remarks = checkpoint.restore(run)
-    if taken:
+    restored, remarks = checkpoint.restore(run)
+    if restored:
         require_same_inputs(run.scene.path, run.identity, run.out, run.inputs_before)
         stage = pipeline.stages[run.stage_index] if run.stage_index < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
-                f"{taken}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it: use "
+                f"{restored}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it; use "
                 f"{run.stage_step} or more, or start over: `clsplat run` with --restart or another --out"
             )
     for remark in remarks:
         LOG.warning("%s", remark)
-    return taken
+    return restored
 
 
 def run_stages(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages from the run's current one, and all of them again for a refit.
+    """Run the stages from the current one, and all of them again for a refit.
 
-    After a training or an edit, the current stage stays until the next training or edit starts: the stages between see
-    the same model, and a resumed run runs all of them again.
+    The current stage advances only after a training or an edit, and before the next one: the stages between use the
+    same model, and a resumed run repeats all of them.
     """
-    begin_if_due(run)
-    for cursor, stage in enumerate(as_trained(pipeline, run).stages):
+    start_refit_if_due(run)
+    for cursor, stage in enumerate(with_refit_steps(pipeline, run).stages):
         if cursor < run.stage_index:
             continue
-        changes = stage.edits or isinstance(stage, Training)
-        if changes and cursor > run.stage_index:
+        changes_model = stage.edits or isinstance(stage, Training)
+        if changes_model and cursor > run.stage_index:
             run.next_stage(cursor)
         with suppress(Stopped):
             stage.act(run)
-            if changes:
+            if changes_model:
                 run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(
                 f"stopped in {stage.stage}, saved in {path}; `clsplat resume {shell_quote(run.out)}` continues from it"
             )
-        if is_due(run):
+        if is_refit_due(run):
             run_stages(pipeline, run)
             return

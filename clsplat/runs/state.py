@@ -1,4 +1,4 @@
-"""Read a run folder once: the phase of the run, and which of its files are lost."""
+"""Read a run folder once: the phase of the run, and which of its files are missing or changed."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -24,28 +24,28 @@ class Phase(IntEnum):
     EMPTY = 0
     """There is no run."""
     PREPARING = 1
-    """There is only a status.json: no stage has started."""
+    """There is only a status.json; no stage has started."""
     BEGUN = 2
-    """It is running, or stopped before its end."""
+    """It is running, or has stopped before its end."""
     STATELESS = 3
-    """It has started, but both its status and its checkpoints are lost."""
+    """It has started, but both its status and its checkpoints are missing."""
     DONE = 4
-    """It has finished; `RunState.lost` lists files that were lost since."""
+    """It has finished; `RunState.damaged` lists files that are missing or changed."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """The content of the folder of a run or a matrix, when it was read."""
+    """The content of the folder of a run or a matrix at the time of reading."""
 
     out: Path
     names: frozenset[str]  # of the files and folders in it
     status: Mapping[str, Any]  # content of status.json; empty if missing or damaged
-    checkpoints: tuple[Path, ...]  # from old to new
+    checkpoints: tuple[Path, ...]  # oldest first
     sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None if the list is missing or damaged
 
     @classmethod
     def read(cls, out: Path) -> "RunState":
-        """Read a folder, which need not exist.  Its pipeline and its outputs are read on first use."""
+        """Read a folder, which need not exist.  The pipeline and the outputs are read on first use."""
         names = frozenset[str]()
         with suppress(OSError):
             names = frozenset(path.name for path in out.iterdir())
@@ -64,7 +64,7 @@ class RunState:
 
     @property
     def state_name(self) -> str:
-        """The state in status.json, or `killed` if the process is gone."""
+        """The state in status.json, or "killed" if the process is gone."""
         owner = Owner.from_record(self.status) if self.status.get("state") not in END_STATES else None
         return "killed" if owner and owner.has_ended else str(self.status.get("state", "unknown"))
 
@@ -74,14 +74,14 @@ class RunState:
         return load(str(self.out / PIPELINE))
 
     @cached_property
-    def lost(self) -> list[str]:
-        """The files that were lost or changed since they were written, and of a finished run a lost list of them."""
+    def damaged(self) -> list[str]:
+        """The files that are missing or changed; for a finished run also a missing list of checksums."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
-        return not_whole(self.out, self.sums)
+        return damaged_files(self.out, self.sums)
 
     def difference(self, pipeline: Pipeline) -> str:
-        """Return how another pipeline differs, or why that of the run cannot be read; "" if they are the same."""
+        """Describe how another pipeline differs, or why that of the run cannot be read; "" if they are the same."""
         try:
             return str(_difference(self.pipeline, pipeline) or "")
         except ConfigError as error:
@@ -90,18 +90,18 @@ class RunState:
     def require_same(self, pipeline: Pipeline) -> None:
         """Raise ConfigError if a finished run had other settings."""
         is_known = self.phase is Phase.DONE and PIPELINE in self.names
-        if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.lost:
+        if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.damaged:
             raise ConfigError(
-                f"{self.out}: was run with other settings: {difference}; use another folder, or the same settings"
+                f"{self.out}: has a run with other settings: {difference}; use another folder, or the same settings"
             )
 
-    def is_whole(self, pipeline: Pipeline) -> bool:
-        """Whether a run of this pipeline is finished, with all its files as they were written."""
-        return self.phase is Phase.DONE and not self.difference(pipeline) and not self.lost
+    def is_complete(self, pipeline: Pipeline) -> bool:
+        """Return whether a run of this pipeline is finished, with all files intact."""
+        return self.phase is Phase.DONE and not self.difference(pipeline) and not self.damaged
 
     @property
     def steps_key(self) -> str:
-        """The key of the training's steps: optimize.steps, also where the pipeline cannot be read, or another."""
+        """The key of the number of training steps; optimize.steps if the pipeline cannot be read."""
         with suppress(ConfigError):  # which the resumed run raises again
             return f"{self.pipeline.settings.training.stage}.steps"
         return "optimize.steps"
@@ -110,24 +110,25 @@ class RunState:
     def restart(self) -> str:
         """The command that starts the run over."""
         pipeline = "…"
-        with suppress(ConfigError):  # the pipeline is lost
+        with suppress(ConfigError):  # the pipeline is missing or damaged
             pipeline = shell_quote(self.pipeline.path)
         return f"`clsplat run {pipeline} --out {shell_quote(self.out)} --restart`"
 
 
 def has_pipeline(folder: Path) -> bool:
-    """Whether a folder has the pipeline of a run or a matrix."""
+    """Return whether a folder has the pipeline of a run or a matrix."""
     return (folder / PIPELINE).is_file()
 
 
-def _difference(before: Pipeline, now: Pipeline) -> Difference | None:
-    """Return the first setting that differs, apart from what the run decided itself.  Raises ConfigError."""
-    old, new = (without_auto(pipeline.resolved()) for pipeline in (before, with_decisions(now, before.decisions)))
+def _difference(old_pipeline: Pipeline, new_pipeline: Pipeline) -> Difference | None:
+    """Return the first setting that differs, except for automatic choices of the run.  Raises ConfigError."""
+    decided = with_decisions(new_pipeline, old_pipeline.decisions)
+    old, new = (without_auto(pipeline.resolved()) for pipeline in (old_pipeline, decided))
     return first_difference({**old, "adapt": None}, {**new, "adapt": None})
 
 
 def is_below(file: Path, paths: Iterable[Path]) -> bool:
-    """Whether a file is one of the paths, or in a folder among them."""
+    """Return whether a file is one of the paths, or in a folder among them."""
     return any(map(file.is_relative_to, paths))
 
 
@@ -140,12 +141,12 @@ def read_sums(out: Path) -> dict[str, str] | None:
     return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else None
 
 
-def not_whole(out: Path, sums: Mapping[str, str]) -> list[str]:
-    """Return the files of a list of checksums that are missing or changed."""
-    return [name for name, value in sums.items() if sum_of(out / name) != value]
+def damaged_files(out: Path, sums: Mapping[str, str]) -> list[str]:
+    """Return the files in a list of checksums that are missing or changed."""
+    return [name for name, value in sums.items() if try_sha256(out / name) != value]
 
 
-def sum_of(file: Path) -> str | None:
+def try_sha256(file: Path) -> str | None:
     """Return the SHA-256 of a file; None if it cannot be read."""
     with suppress(DataError):
         return sha256(file)

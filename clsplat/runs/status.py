@@ -22,9 +22,9 @@ LOG = logging.getLogger("clsplat")
 
 
 def run_status(state: RunState) -> dict[str, Any]:
-    """Return the content of status.json, the last report and the metrics of a run; a matrix has no step.
+    """Return the content of status.json, the last report, and the metrics of a run or a matrix.
 
-    state: as in the file, or killed if its process, on this machine, is gone
+    state: as in the file, or "killed" if the process, on this machine, is gone
     silent: seconds since the last heartbeat of a run that has not ended, on any machine
     ahead: seconds by which that heartbeat is in the future, if at least a minute
     advice: how to continue a run that stopped early, or ""
@@ -40,7 +40,7 @@ def run_status(state: RunState) -> dict[str, Any]:
             f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` checks the other files"
         ) from error
     if known is None:
-        raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
+        raise DataError(f"{out / STATUS}: was written by a newer version; update clsplat to read it")
     status["state"] = state.state_name
     for key in ("silent", "ahead"):
         status.pop(key, None)
@@ -54,11 +54,11 @@ def run_status(state: RunState) -> dict[str, Any]:
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
     has_stopped = status["state"] in ("killed", "failed", "interrupted")
     advice = _advice(state) if has_stopped else ""
-    return {"run": str(out), **status, "last": _last(out), "metrics": metrics, "advice": advice}
+    return {"run": str(out), **status, "last": _last_report(out), "metrics": metrics, "advice": advice}
 
 
-def _last(out: Path) -> dict[str, Any] | None:
-    """Return the last report; None if there is none, or, with a warning, if the records are damaged."""
+def _last_report(out: Path) -> dict[str, Any] | None:
+    """Return the last report; None if there is none, or, after a warning, if the records are damaged."""
     try:
         lines = Records(out).read("train")
     except DataError as error:
@@ -68,7 +68,7 @@ def _last(out: Path) -> dict[str, Any] | None:
 
 
 def status_text(status: dict[str, Any]) -> str:
-    """Return the result of `run_status` as text."""
+    """Format the result of `run_status` as text."""
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
     if status.get("silent", 0) >= HEARTBEAT_TIMEOUT:
         lines.append(f"no heartbeat for {status['silent']} s{_process(status)}")
@@ -89,7 +89,7 @@ def status_text(status: dict[str, Any]) -> str:
 
 
 def _advice(state: RunState) -> str:
-    """How to continue a run that has stopped before its end."""
+    """Return a sentence on how to continue a run that has stopped before its end; "" if its message has it."""
     out, status = state.out, state.status
     message, resume = str(status.get("message")), f"clsplat resume {shell_quote(out)}"
     if PIPELINE not in state.names or resume in message or "--restart" in message:
@@ -97,13 +97,13 @@ def _advice(state: RunState) -> str:
     if "cells" in status or state.checkpoints:
         return f"`{resume}` continues it"
     if status.get("checkpoint"):  # it cannot continue without one
-        again = f"`clsplat run {shell_quote(out / PIPELINE)} --out {shell_quote(out)} --restart`"
-        return f"its checkpoints are gone; {again} starts it over"
+        restart = f"`clsplat run {shell_quote(out / PIPELINE)} --out {shell_quote(out)} --restart`"
+        return f"its checkpoints are missing; {restart} starts it over"
     return f"no checkpoint was saved; `{resume}` starts it over"
 
 
 def _progress(status: dict[str, Any]) -> str:
-    """Return the progress of the run and of its stage."""
+    """Format the progress of the run and of its stage."""
     if "cells" in status:
         failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
         return f", {status.get('done')} of {status['cells']} cells, {len(failed)} of them failed"
@@ -134,21 +134,21 @@ def _process(status: dict[str, Any]) -> str:
     return f"; it runs on {status.get('host')}" if elsewhere else f"; process {status.get('process')}"
 
 
-# The summary of a finished run: its quality, files, photos and time, and what to do next.
+# The summary of a finished run: quality, files, photos, time, and the next command.
 
 TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "previews"}  # of stages' files
-MIN_SECONDS = 0.5  # shorter stages are not listed
+MIN_SECONDS = 0.5  # shorter stages are left out
 
 
 def summary(folder: Path) -> list[str]:
-    """Return the lines; none for an unfinished run or a matrix.  Raises DataError if a file is damaged."""
+    """Return the lines of the summary; none for an unfinished run or a matrix.  Raises DataError for damaged files."""
     if not (folder / METRICS).exists():
         return []
     metrics = read_json(folder / METRICS)
     try:
         return list(_lines(folder, metrics))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder / METRICS}: the file is damaged; run the pipeline again, --restart") from error
+        raise DataError(f"{folder / METRICS}: the file is damaged; run the pipeline again with --restart") from error
 
 
 def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
@@ -157,9 +157,9 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     size = size_text(metrics["gaussians"], metrics.get("parameters"))
     yield f"{quality}{size}; {metrics['train_seconds']:.0f} s of training"
     placed = summarize_placement(metrics.get("preparation", {}))
-    if kept := metrics.get("kept"):
-        model = "best     model of step {:,}" if not kept["refit"] else "refit    {:,} steps on all photos"
-        yield f"  {model.format(kept['step'])}, by a validation PSNR of {kept['validation']:.2f} dB"
+    if best := metrics.get("kept"):
+        model = "best     model of step {:,}" if not best["refit"] else "refit    {:,} steps on all photos"
+        yield f"  {model.format(best['step'])}, by a validation PSNR of {best['validation']:.2f} dB"
     yield f"  scene    {metrics['scene']}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics["files"].items()}
     titles = {file: title for kind in variants(TrainingModule).values() for file, title in kind.side_files.items()}
@@ -173,9 +173,9 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(times)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        more = f"; `clsplat resume {shell_quote(folder)} --steps {2 * metrics['steps']}` trains longer"
+        advice = f"; `clsplat resume {shell_quote(folder)} --steps {2 * metrics['steps']}` trains longer"
         if metrics.get("overfit"):
-            more = "; the model overfits: more photos help most"
-        elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation found the best step already
-            more = ""
-        yield f"next: open {page} in a browser{more}"
+            advice = "; the model overfits: add photos"
+        elif best and (best["refit"] or best["step"] < best["last"]["step"]):  # validation found the best step already
+            advice = ""
+        yield f"next: open {page} in a browser{advice}"

@@ -5,7 +5,7 @@ from itertools import takewhile
 
 from clsplat.losses.base import ViewLosses
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.runner import as_trained, begin_if_due, is_due
+from clsplat.runs.runner import is_refit_due, start_refit_if_due, with_refit_steps
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
 
@@ -21,14 +21,14 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
-    """Run all stages from the first training to the last, and the edits that follow it; yield after each step.
+    """Run all stages from the first training to the last, and the edits that follow it; yield the losses of each step.
 
     A refit runs the stages from the start.
     """
-    whole, begins = pipeline, is_due(run)
-    begin_if_due(run)
-    pipeline = as_trained(whole, run)
-    if begins:
+    original, starts_refit = pipeline, is_refit_due(run)
+    start_refit_if_due(run)
+    pipeline = with_refit_steps(original, run)
+    if starts_refit:
         run_until_training(pipeline, run)
     first, last = _training_stages(pipeline)
     for cursor in range(max(first, run.stage_index), last + 1):
@@ -38,19 +38,19 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
         if isinstance(stage, Optimize):
             run.status.note(stage=stage.stage, progress=None)
             for view in stage.iterate(run):
-                if cursor == last and stage.has_ended(run) and not is_due(run):
-                    _edit_behind(pipeline, run)
+                if cursor == last and stage.has_ended(run) and not is_refit_due(run):
+                    _run_final_edits(pipeline, run)
                     yield view
                     return
                 yield view
-            if is_due(run):
-                yield from train(whole, run)
+            if is_refit_due(run):
+                yield from train(original, run)
                 return
         else:
             stage.act(run)
 
 
-def _edit_behind(pipeline: Pipeline, run: Run) -> None:
+def _run_final_edits(pipeline: Pipeline, run: Run) -> None:
     """Run the stages that edit the model after the training, as part of its last step."""
     for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.stage_index + 1 :]):
         run.next_stage(run.stage_index + 1)
@@ -60,9 +60,9 @@ def _edit_behind(pipeline: Pipeline, run: Run) -> None:
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
     """Return whether the training has no steps left."""
     _, last = _training_stages(pipeline)
-    stage = as_trained(pipeline, run).stages[last]
-    in_its_end = isinstance(stage, Optimize) and run.stage_index == last and stage.has_ended(run)
-    return (run.stage_index > last or in_its_end) and not is_due(run)
+    stage = with_refit_steps(pipeline, run).stages[last]
+    is_at_end = isinstance(stage, Optimize) and run.stage_index == last and stage.has_ended(run)
+    return (run.stage_index > last or is_at_end) and not is_refit_due(run)
 
 
 def _training_stages(pipeline: Pipeline) -> tuple[int, int]:

@@ -1,8 +1,8 @@
-"""Choose the number of steps that fit into a time (`--minutes`).
+"""Choose the number of steps that fit into a time budget (`--minutes`).
 
-A short rehearsal measures the time of a step, and of everything else.  If it took little of the time, a longer one
-follows, as steps become slower while Gaussians grow.  At fixed fractions of the training, the number of steps is
-corrected by the measured steps.  It is written to the run's pipeline, so that the run can be repeated bit by bit.
+A short rehearsal measures the time of a step, and of everything else.  If it was very short, a longer one follows,
+because steps become slower while Gaussians grow.  At fixed fractions of the training, the number of steps is corrected
+from measured times.  It is written to the run's pipeline, so that the run can be repeated bit by bit.
 """
 
 import logging
@@ -32,9 +32,9 @@ LOG = logging.getLogger("clsplat")
 CORRECTIONS = 0.3, 0.6, 0.85  # fractions of the training
 STEPS = 200  # of the first rehearsal; a training may declare that fewer are enough
 LONGER = 3  # factor of the number of steps of the next rehearsal
-MIN_SHARE = 0.03  # of the time: a shorter rehearsal is followed by a longer one
-REPORTS = 20  # of a training, at least; each gives the median time of its steps
-MAX_SHARE = 0.2  # of the time, after which a rehearsal ends its steps
+MIN_FRACTION = 0.03  # of the budget; a shorter rehearsal is followed by a longer one
+REPORTS = 20  # minimum per training; each gives the median time of its steps
+MAX_FRACTION = 0.2  # of the budget, after which a rehearsal stops training
 MAX_TREND = 0.5  # largest exponent of the growth of a step's time with the number of steps
 
 Show = Callable[[Progress], None]
@@ -43,7 +43,7 @@ Execute = Callable[[Pipeline, Run, Start, Show], None]
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The times of a pipeline with few steps, in seconds."""
+    """The measured times of a pipeline run with few steps, in seconds."""
 
     steps: int
     step_times: Sequence[float]  # of one step, in equal parts of the training
@@ -52,25 +52,25 @@ class Rehearsal:
     trend: float = 0.0  # exponent of the growth of a step's time with the number of steps
 
     def steps_in(self, seconds: float) -> int:
-        """Return the number of steps that fit."""
+        """Return the number of steps that fit into a time, s."""
         times = max(0.0, seconds - self.during - self.after) / (self.steps * fmean(self.step_times))
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
-    def later(self, share: float) -> tuple[float, float]:
-        """Return the mean and the last time of later steps, relative to a step at a fraction of the training."""
-        index = min(int(share * len(self.step_times)), len(self.step_times) - 1)
+    def later(self, fraction: float) -> tuple[float, float]:
+        """Return the mean and the last step time after a fraction of the training, relative to the time at it."""
+        index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
         now = self.step_times[index]
         return fmean(self.step_times[index:]) / now, self.step_times[-1] / now
 
 
-class _Enough(Exception):
-    """Raised to end the steps of a rehearsal."""
+class _RehearsalOver(Exception):
+    """Raised to end the training of a rehearsal."""
 
 
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
-    """Execute the pipeline in as many steps as fit into `minutes`, including the rehearsal.
+    """Execute the pipeline with the number of steps that fits into `minutes`, including the rehearsal.
 
-    Raises ConfigError unless exactly one stage trains and its smallest number of steps fits, and what `execute` raises.
+    Raises ConfigError unless exactly one stage trains and its minimum of steps fits, and the errors of `execute`.
     """
     until = time.perf_counter() + 60 * minutes
     _require_one_training(pipeline)
@@ -78,24 +78,24 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     rehearsal = rehearse_enough(pipeline, run, minutes, until)
     steps, planned = pipeline.settings.training.steps, rehearsal.steps_in(until - time.perf_counter())
     if planned < min_steps_of(pipeline):
-        raise _too_few(minutes, pipeline)
+        raise _too_short(minutes, pipeline)
     reason = f"--minutes {minutes:g}: {planned:,} steps instead of {steps:,}, by a rehearsal"
     LOG.info("%s", reason)
     plan = replace(pipeline, settings=_reporting(stretched(pipeline.settings, Fraction(planned, steps))), reason=reason)
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
-        planned, share, each = report.steps, report.step / report.steps, report.milliseconds / 1e3
-        mean, end = (ratio * each for ratio in rehearsal.later(share))
-        rest = rehearsal.after + (1 - share) * rehearsal.during + mean * (planned - report.step)
-        more = math.floor((until - time.perf_counter() - rest) / end)
-        least = min(planned, last_edit(plan.settings.training) + 2)  # and what begins behind it, once
-        steps = max(report.step + 2, least, planned + more)
+        planned, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
+        mean, last = (ratio * step_time for ratio in rehearsal.later(fraction))
+        remaining = rehearsal.after + (1 - fraction) * rehearsal.during + mean * (planned - report.step)
+        change = math.floor((until - time.perf_counter() - remaining) / last)
+        minimum = min(planned, last_edit(plan.settings.training) + 2)  # stages that start after the last edit run once
+        steps = max(report.step + 2, minimum, planned + change)
         reason = f"--minutes {minutes:g}: {steps:,} steps, corrected at step {report.step:,}"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
 
-    for share in CORRECTIONS:
-        corrected = _execute_until(share, plan, new_run(run, plan), start, show, execute, correct)
+    for fraction in CORRECTIONS:
+        corrected = _execute_until(fraction, plan, new_run(run, plan), start, show, execute, correct)
         if corrected is None:
             return
         plan, start = corrected, "resume"
@@ -103,7 +103,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
 
 
 def _execute_until(
-    share: float,
+    fraction: float,
     plan: Pipeline,
     run: Run,
     start: Start,
@@ -113,20 +113,20 @@ def _execute_until(
 ) -> Pipeline | None:
     """Execute a pipeline up to a fraction of its training, save a checkpoint, and return the corrected pipeline.
 
-    Returns None if it ended earlier.
+    Returns None if the training ended earlier.
     """
     corrected: list[Pipeline] = []
 
-    def shown(report: Progress) -> None:
+    def show_and_correct(report: Progress) -> None:
         show(report)
-        if share * report.steps <= report.step < report.steps and not run.interrupted:
+        if fraction * report.steps <= report.step < report.steps and not run.interrupted:
             corrected.append(correct(plan, report))
             write_pipeline(corrected[0], run)  # before the checkpoint, so that a resumed run uses it
             run.settings, run.pipeline = corrected[0].settings, corrected[0].resolved()
             run.interrupted = True
 
     try:
-        execute(plan, run, start, shown)
+        execute(plan, run, start, show_and_correct)
     except Interrupted:
         if not corrected:
             raise
@@ -135,65 +135,66 @@ def _execute_until(
 
 
 def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, until: float) -> Rehearsal:
-    """Return a rehearsal that takes at least a small part of the time, with the trend since the previous one.
+    """Rehearse until the rehearsal takes a minimum fraction of the time; return the last one, with its trend.
 
-    until: s, on the clock.  Raises ConfigError as `rehearse` does.
+    until: deadline, s, on the clock.  Raises ConfigError as `rehearse` does.
     """
-    steps, began, trend = min(STEPS, pipeline.settings.training.rehearsed), time.perf_counter(), 0.0
+    steps, started, trend = min(STEPS, pipeline.settings.training.rehearsed), time.perf_counter(), 0.0
     rehearsal = rehearse(pipeline, run, steps, minutes, until)
-    while time.perf_counter() - began < MIN_SHARE * 60 * minutes:
-        before, steps, began = rehearsal, LONGER * steps, time.perf_counter()
+    while time.perf_counter() - started < MIN_FRACTION * 60 * minutes:
+        previous, steps, started = rehearsal, LONGER * steps, time.perf_counter()
         rehearsal = rehearse(pipeline, run, steps, minutes, until)
-        trend = math.log(fmean(rehearsal.step_times) / fmean(before.step_times)) / math.log(LONGER)
+        trend = math.log(fmean(rehearsal.step_times) / fmean(previous.step_times)) / math.log(LONGER)
     return replace(rehearsal, trend=min(max(trend, -MAX_TREND), MAX_TREND))
 
 
 def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: float) -> Rehearsal:
     """Run all stages of the pipeline with few steps, without changing the run.
 
-    until: s, on the clock.  Raises ConfigError as soon as the smallest number of steps turns out not to fit.
+    until: deadline, s, on the clock.  Raises ConfigError as soon as it is clear that the minimum steps do not fit.
     """
     LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
     short = stretched(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
-    short_pipeline, began = replace(pipeline, settings=_reporting(short)), time.perf_counter()
-    reports: list[tuple[float, int, float]] = []  # s on the clock, step, s of one
+    short_pipeline, started = replace(pipeline, settings=_reporting(short)), time.perf_counter()
+    reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
 
-    def look() -> None:
-        each = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0  # one may build kernels
-        if time.perf_counter() + min_steps_of(pipeline) * each > until:
-            raise _too_few(minutes, pipeline)
+    def check_time() -> None:
+        # the first report may include the building of kernels
+        step_time = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0
+        if time.perf_counter() + min_steps_of(pipeline) * step_time > until:
+            raise _too_short(minutes, pipeline)
 
     def show(report: Progress) -> None:
         run.status.count("steps", report.step, report.steps)
         reports.append((time.perf_counter(), report.step, report.milliseconds / 1e3))
-        look()
-        if report.step < report.steps and reports[-1][0] - reports[0][0] > MAX_SHARE * 60 * minutes:
-            raise _Enough
+        check_time()
+        if report.step < report.steps and reports[-1][0] - reports[0][0] > MAX_FRACTION * 60 * minutes:
+            raise _RehearsalOver
 
     run.status.note(seconds_left=None)
     with scratch_folder(run.out / "rehearsal") as out, log_level(logging.WARNING), run.status.stage("rehearse"):
-        one = new_run(run, short_pipeline, out=out, status=StatusFile(out), on_progress=show, on_step=look)
-        one.records.start()
+        trial = new_run(run, short_pipeline, out=out, status=StatusFile(out), on_progress=show, on_step=check_time)
+        trial.records.start()
         try:
-            run_stages(short_pipeline, one)
-        except _Enough:
-            one.next_stage(one.stage_index + 1)
-            run_stages(short_pipeline, one)
-    trained, done, _ = reports[-1]
+            run_stages(short_pipeline, trial)
+        except _RehearsalOver:
+            trial.next_stage(trial.stage_index + 1)
+            run_stages(short_pipeline, trial)
+    training_end, done_steps, _ = reports[-1]
     step_times = [seconds for _, _, seconds in reports]
-    during = (trained - began - done * fmean(step_times)) * steps / done
-    step_times += [step_times[-1]] * (round(len(step_times) * steps / done) - len(step_times))
-    return Rehearsal(steps, step_times, max(0.0, during), time.perf_counter() - trained)
+    during = (training_end - started - done_steps * fmean(step_times)) * steps / done_steps
+    step_times += [step_times[-1]] * (round(len(step_times) * steps / done_steps) - len(step_times))
+    return Rehearsal(steps, step_times, max(0.0, during), time.perf_counter() - training_end)
 
 
 def min_steps_of(pipeline: Pipeline) -> int:
-    """Return the smallest number of steps of a training: its edits stay apart, and a rehearsal is not longer."""
+    """Return the minimum number of training steps: no fewer than a rehearsal, and edits stay at different steps."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsed), min_steps(training))
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
-    """Return a run of the pipeline in the state before its first step, with the same device, scene and photos."""
+    """Return a run of the pipeline in the state before its first step, with the same device, scene, and photos."""
     reset: dict[str, Any] = {
         "best": None,
         "best_tables": {},
@@ -206,16 +207,16 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
 
 
 def _reporting(settings: PipelineFile) -> PipelineFile:
-    """Return settings with at least REPORTS reports of the training."""
+    """Return settings with a minimum of REPORTS reports per training."""
 
-    def often(training: Training) -> Training:
+    def with_reports(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
 
-    return map_trainings(settings, Training, often)
+    return map_trainings(settings, Training, with_reports)
 
 
 def _require_one_training(pipeline: Pipeline) -> None:
-    """Raise ConfigError if the time of the training does not depend on a single number of steps."""
+    """Raise ConfigError unless a single number of steps determines the time of the training."""
     trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
     if len(trainings) != 1:
         raise ConfigError(
@@ -227,7 +228,7 @@ def _require_one_training(pipeline: Pipeline) -> None:
         )
 
 
-def _too_few(minutes: float, pipeline: Pipeline) -> ConfigError:
+def _too_short(minutes: float, pipeline: Pipeline) -> ConfigError:
     return ConfigError(
         f"--minutes {minutes:g}: too short: this scene needs at least {min_steps_of(pipeline)} steps on this device; "
         "use more minutes, or smaller images (--set scene.downscale=2)"

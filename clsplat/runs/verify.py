@@ -1,4 +1,4 @@
-"""Verify the files of a run folder: which must exist, and whether each is intact."""
+"""Verify the files of a run folder: required files exist, and every file is intact."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -31,7 +31,7 @@ from clsplat.pipeline.files import origin, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import read_note
-from clsplat.runs.outputs import declared
+from clsplat.runs.outputs import declared_outputs
 from clsplat.runs.results import read_metrics, read_settings
 from clsplat.runs.state import Phase, RunState
 from clsplat.scene.identity import Identity
@@ -64,7 +64,7 @@ def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
 def status_file(path: Path) -> str:
     content = read_json(path)
     status = status_of(content)
-    return status.state if status else f"not checked further: format {content['format']}, of a newer clsplat"
+    return status.state if status else f"not checked further: format {content['format']} of a newer version"
 
 
 def checkpoint_file(path: Path) -> str:
@@ -93,7 +93,7 @@ def sums_file(expected: list[str], path: Path) -> str:
 
 
 def output(expected: str | None, path: Path) -> str:
-    """Check one output; return a description.  Raises errors of its reader, or DataError if its bytes changed."""
+    """Check one output; return a description.  Raises errors of its reader, and DataError if its checksum differs."""
     require_sum(expected, path)
     if path.name == METRICS:
         metrics = read_metrics(path)
@@ -108,21 +108,22 @@ def output(expected: str | None, path: Path) -> str:
     return ""
 
 
-NO_SUMS = "is missing, as in runs of a Trainer; without it, outputs cannot be verified"
+NO_SUMS = "is missing, as always with a Trainer; without it, outputs cannot be verified"
 
 
 def verify(state: RunState) -> dict[str, Any]:
-    """Return `whole`, the `state` of the run, and in `objects` for each file whether it is whole, and a detail.
+    """Verify all files of a run or a matrix.
 
-    If a file is damaged, `remedy` says how to get it back.  Files of later stages may be missing while a run is
-    unfinished.  Raises DataError if the folder has no run.
+    Returns the `state` of the run, `whole`: whether all files are intact, and `objects`: for each `file`, whether it is
+    `whole`, and a `detail`; for damaged files also a `remedy`.  Files of later stages may be missing in an unfinished
+    run.  Raises DataError if the folder has no run.
     """
     out = state.out
     if state.phase is Phase.EMPTY:
         raise DataError(f"{out}: has neither pipeline.yaml nor status.json; expected the folder of a run")
     cells: dict[str, RunState] = {}
-    objects = list(_objects(state, cells))
-    damaged = [one["file"] for one in objects if not one["whole"]]
+    objects = list(_check_files(state, cells))
+    damaged = [entry["file"] for entry in objects if not entry["whole"]]
     verified = {"run": str(out), "state": state.state_name, "whole": not damaged, "objects": objects}
     if damaged:
         cell = cells.get(damaged[0].partition("/")[0])
@@ -130,64 +131,64 @@ def verify(state: RunState) -> dict[str, Any]:
     return verified
 
 
-def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -> Iterator[dict[str, Any]]:
+def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool = False) -> Iterator[dict[str, Any]]:
     """Yield the result for each file of a run, or of the cells of a matrix.
 
-    cells: receives the folders of the cells, by name; whole: expect the files of a finished run.
+    cells: receives the folders of the cells, by name; expect_all: whether to expect the files of a finished run.
     """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
-    ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run continues, it lists other files
-    done = whole or state.phase is Phase.DONE or (not status and ended)
-    one = partial(check_file, out)
-    yield one(PIPELINE, partial(settings_file, state, settings))
-    yield one(STATUS, status_file)
+    has_ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run continues, it lists other files
+    is_done = expect_all or state.phase is Phase.DONE or (not status and has_ended)
+    check_one = partial(check_file, out)
+    yield check_one(PIPELINE, partial(settings_file, state, settings))
+    yield check_one(STATUS, status_file)
     if "matrix" in settings or "cells" in status:
-        cells |= _cells(out, done)
+        cells |= _find_cells(out, is_done)
         for name, cell in sorted(cells.items()):
-            yield from ({**found, "file": f"{name}/{found['file']}"} for found in _objects(cell, {}, done))
-        if done or COMPARISON in names:
-            yield one(COMPARISON, require_complete)
+            yield from ({**entry, "file": f"{name}/{entry['file']}"} for entry in _check_files(cell, {}, is_done))
+        if is_done or COMPARISON in names:
+            yield check_one(COMPARISON, require_complete)
         return
-    saved = [*(path.name for path in state.checkpoints), str(status.get("checkpoint") or "")]
-    saved += sorted(path.name for path in (out / CHECKPOINTS).glob("failed_*.npz"))
-    for name in filter(is_inside, dict.fromkeys(saved)):
-        yield one(f"{CHECKPOINTS}/{name}", checkpoint_file)
-    files = [RECORDS, METRICS] if done else []
+    checkpoints = [*(path.name for path in state.checkpoints), str(status.get("checkpoint") or "")]
+    checkpoints += sorted(path.name for path in (out / CHECKPOINTS).glob("failed_*.npz"))
+    for name in filter(is_inside, dict.fromkeys(checkpoints)):
+        yield check_one(f"{CHECKPOINTS}/{name}", checkpoint_file)
+    files = [RECORDS, METRICS] if is_done else []
     with suppress(ConfigError):  # reported for its own file
-        files += declared(state.pipeline) if done else []
+        files += declared_outputs(state.pipeline) if is_done else []
     if CHECKSUMS in names:
-        yield one(CHECKSUMS, partial(sums_file, [PIPELINE, *files] if done else []))
-    elif done:
+        yield check_one(CHECKSUMS, partial(sums_file, [PIPELINE, *files] if is_done else []))
+    elif is_done:
         yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
-    if done or INPUTS in names:
-        yield one(INPUTS, lambda path: Identity.from_data(read_json(path)))
-    if (done and settings.get("prepare")) or PREPARE_SUMMARY in names:
-        yield one(PREPARE_SUMMARY, note_file)
+    if is_done or INPUTS in names:
+        yield check_one(INPUTS, lambda path: Identity.from_data(read_json(path)))
+    if (is_done and settings.get("prepare")) or PREPARE_SUMMARY in names:
+        yield check_one(PREPARE_SUMMARY, note_file)
     for name in dict.fromkeys([*sums, *files, *sorted({METRICS, RECORDS} & names)]):
         if name != PIPELINE:
-            yield one(name, partial(output, sums.get(name)))
+            yield check_one(name, partial(output, sums.get(name)))
 
 
 def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, Any]:
-    """Return the result of a check of one file."""
+    """Check one file; return its entry of the result of `verify`."""
     path = out / name
     try:
         if not path.exists():
             raise DataError("is a broken link" if path.is_symlink() else "is missing")
         detail = check(path)
         return {"file": name, "whole": True, "detail": detail if isinstance(detail, str) else ""}
-    except Exception as error:  # whatever the fault of one file is, check the others too
+    except Exception as error:  # whatever is wrong with one file, check the others too
         reason = one_line(error).removeprefix(f"{path}: ") or type(error).__name__
         return {"file": name, "whole": False, "detail": reason}
 
 
-def _cells(out: Path, done: bool) -> dict[str, RunState]:
-    """The folders of a matrix's cells, by name: those that are there, and of a finished matrix all of them."""
+def _find_cells(out: Path, is_done: bool) -> dict[str, RunState]:
+    """Return the folders of a matrix's cells, by name: the existing ones, or all of a finished matrix."""
     folders = [path for path in out.iterdir() if path.is_dir() and not path.is_symlink()]
     cells = {path.name: state for path in folders if (state := RunState.read(path)).phase}
-    with suppress(ConfigError):  # which the pipeline's own line says
-        experiment = load_experiment(str(out / PIPELINE)) if done else None
+    with suppress(ConfigError):  # reported for the file of the pipeline
+        experiment = load_experiment(str(out / PIPELINE)) if is_done else None
         for cell in experiment.cells if experiment else ():
             cells.setdefault(cell.name, RunState.read(out / cell.name))
     return cells
@@ -196,38 +197,41 @@ def _cells(out: Path, done: bool) -> dict[str, RunState]:
 # The verdict of `clsplat check RUN`.
 
 
-def verdict(found: dict[str, Any]) -> str:
-    """Return the result of `verify` in one sentence."""
-    damaged = [one["file"] for one in found["objects"] if not one["whole"]]
+def verdict(result: dict[str, Any]) -> str:
+    """Format the result of `verify` as one sentence."""
+    damaged = [entry["file"] for entry in result["objects"] if not entry["whole"]]
     if not damaged:
-        return f"{found['run']}: {found['state']}; all {len(found['objects'])} files are whole"
-    if all(one["whole"] or one["detail"] == NO_SUMS for one in found["objects"]):
-        return f"{found['run']}: {found['state']}; {damaged[0]} {NO_SUMS}"
+        return f"{result['run']}: {result['state']}; all {len(result['objects'])} files are intact"
+    if all(entry["whole"] or entry["detail"] == NO_SUMS for entry in result["objects"]):
+        return f"{result['run']}: {result['state']}; {damaged[0]} {NO_SUMS}"
     names = ", ".join(damaged[:3]) + (", …" if len(damaged) > 3 else "")
     return (
-        f"{found['run']}: {found['state']}; {len(damaged)} of {len(found['objects'])} files are damaged or missing: "
-        f"{names}; copy them again, or {found['remedy']}"
+        f"{result['run']}: {result['state']}; {len(damaged)} of {len(result['objects'])} files are damaged or missing: "
+        f"{names}; copy them again, or {result['remedy']}"
     )
 
 
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
-    """How to get the files of a run back: from a checkpoint that is whole, or from the beginning."""
-    if state.phase is Phase.DONE and "cells" not in state.status and not state.lost and PIPELINE in state.names:
-        return "ignore them: all outputs are whole, and only longer training needs these files"
-    whole = {Path(verified["run"], one["file"]) for one in verified["objects"] if one["whole"]}
-    can_continue = "cells" in state.status or any(path in whole for path in state.checkpoints)
+    """Return how to restore the files of a run: from an intact checkpoint, or from the start."""
+    if state.phase is Phase.DONE and "cells" not in state.status and not state.damaged and PIPELINE in state.names:
+        return "ignore them: all outputs are intact, and only longer training needs these files"
+    intact = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
+    can_continue = "cells" in state.status or any(path in intact for path in state.checkpoints)
     can_continue |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
-    if state.out / PIPELINE not in whole:
-        how = "--resume" if can_continue else "--restart"
-        return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {how}"
+    if state.out / PIPELINE not in intact:
+        option = "--resume" if can_continue else "--restart"
+        return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {option}"
     if can_continue:
-        return f"`clsplat resume {shell_quote(state.out)}` runs the stages after its newest checkpoint again"
+        return f"`clsplat resume {shell_quote(state.out)}` repeats the stages after its newest checkpoint"
     return f"start over: {state.restart}"
 
 
-def lines(found: dict[str, Any]) -> str:
-    """Return the result of `verify`, a line for each file."""
-    rows = ((f"{'whole  ' if one['whole'] else 'DAMAGED'}  {one['file']}", one["detail"]) for one in found["objects"])
+def lines(result: dict[str, Any]) -> str:
+    """Format the result of `verify`, a line for each file."""
+    rows = (
+        (f"{'ok     ' if entry['whole'] else 'DAMAGED'}  {entry['file']}", entry["detail"])
+        for entry in result["objects"]
+    )
     return "\n".join(", ".join(filter(None, row)) for row in rows)
 
 
@@ -237,8 +241,8 @@ def lines(found: dict[str, Any]) -> str:
 def check(pipeline: str) -> dict[str, Any]:
     """Check a pipeline, by file or name; return its path, name, stages or cells, and the keys that the photos decide.
 
-    For a run folder return the result of `verify`, for a model file that of `examine`, for a field its parameters.
-    Raises ConfigError; DataError for a folder without a run.
+    For a run folder, return the result of `verify`; for a model file, that of `examine`; for a field, its parameters.
+    Raises ConfigError, and DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):
         return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.learned}
@@ -249,8 +253,12 @@ def check(pipeline: str) -> dict[str, Any]:
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped()):
         return verify(state)
-    if found := load_experiment(pipeline):
-        return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}
-    checked = load(pipeline)
-    stages = {"stages": checked.names, "adapts": checked.undecided}
-    return {"path": str(origin(checked.path)), "name": checked.settings.name, **stages}
+    if experiment := load_experiment(pipeline):
+        return {
+            "path": str(experiment.path),
+            "name": experiment.name,
+            "cells": [cell.name for cell in experiment.cells],
+        }
+    loaded = load(pipeline)
+    stages = {"stages": loaded.names, "adapts": loaded.undecided}
+    return {"path": str(origin(loaded.path)), "name": loaded.settings.name, **stages}

@@ -23,7 +23,7 @@ from clsplat.prepare.cache import prepare
 from clsplat.runs.failures import Failures
 from clsplat.runs.opening import check_preparation
 from clsplat.runs.run_folder import Start
-from clsplat.runs.state import Phase, RunState, read_sums, sum_of
+from clsplat.runs.state import Phase, RunState, read_sums, try_sha256
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import find_slots
@@ -56,13 +56,13 @@ def has_result(source: Path, target: Path) -> bool:
     copied = None
     with suppress(DataError, KeyError, TypeError):
         copied = read_json(target / MANIFEST)["files"][PIPELINE]
-    if copied and sum_of(target / PIPELINE) not in (None, copied):
+    if copied and try_sha256(target / PIPELINE) not in (None, copied):
         raise ConfigError(
             f"{target}: the run was continued with other settings after the sweep; move that folder away, "
             "and run the sweep again with --resume"
         )
     here = RunState.read(target)
-    return here.phase is Phase.DONE and here.sums == read_sums(source) and not here.lost
+    return here.phase is Phase.DONE and here.sums == read_sums(source) and not here.damaged
 
 
 PROGRESS_INTERVAL_S = 2.0  # between two reads of the cells' status files
@@ -144,7 +144,7 @@ class Batch:
         for cell in self.cells:
             if cell.name in self.outcomes:
                 continue
-            with self.failures.kept(cell.name):
+            with self.failures.recording(cell.name):
                 pending.append(pending_cell(cell, scenes, self.store))
         return pending
 
@@ -188,7 +188,7 @@ class Batch:
     def _copy(self, cell: CellRun) -> None:
         """Copy a result to the folder with its name, unless it is there."""
         result, target = self.store.folder(cell.key).result, self.out / cell.name
-        with self.failures.kept(cell.name):
+        with self.failures.recording(cell.name):
             if self.overwrites or not has_result(result, target):
                 self.require_held()
                 copy_result(result, target)
@@ -300,7 +300,7 @@ def run_sweep(
         )
         sweep.status = status
         for cell in experiment.cells if start == "resume" else ():
-            if RunState.read(state.out / cell.name).is_whole(cell.pipeline):  # wherever it ran
+            if RunState.read(state.out / cell.name).is_complete(cell.pipeline):  # wherever it ran
                 sweep.outcomes[cell.name] = Outcome("published")
         sweep.run(execution, device)
 

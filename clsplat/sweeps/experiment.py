@@ -29,11 +29,11 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import describe, opening, outputs, run_folder, runner
-from clsplat.runs.failures import Failures, failures_recorded
+from clsplat.runs.failures import Failures, recording_failures
 from clsplat.runs.live.live import Live
-from clsplat.runs.model_file import overrides_of
-from clsplat.runs.opening import read_run_scene, settle
-from clsplat.runs.run_folder import Start, free_folder, start_of
+from clsplat.runs.model_file import with_scene_path
+from clsplat.runs.opening import read_run_scene, resolve_choices
+from clsplat.runs.run_folder import Start, choose_start, free_folder
 from clsplat.runs.runner import require_same_inputs
 from clsplat.runs.state import Phase, RunState
 from clsplat.runs.status import summary
@@ -61,16 +61,16 @@ def run_pipeline(
     outputs.check_output_paths(pipeline, state)
     out = state.out
     with (
-        run_folder.opened(state, start, step=0) as status,
+        run_folder.open_run_folder(state, start, step=0) as status,
         stopping_on_signals(stop_at_once),
-        failures_recorded(status),
+        recording_failures(status),
         terminal.logging_to(out / LOG_FILE),
     ):
         if live:
             live.follow(status)
         with terminal.counts_on_terminal():
             run = opening.open_run(pipeline, out, device, start, status)
-            pipeline = settle(pipeline, run)
+            pipeline = resolve_choices(pipeline, run)
             stop_if_signaled()
 
         def execute(pipeline: Pipeline, run: Run, start: Start, show: Show) -> None:
@@ -134,7 +134,7 @@ class Job:
         start: Start,
         execution: dict[str, Any] | None,
     ) -> "Job":
-        edits = overrides_of(overrides, scene)
+        edits = with_scene_path(overrides, scene)
         experiment = load_experiment(pipeline, edits, execution)
         if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
@@ -200,7 +200,7 @@ class Job:
         with live_preview(live) as preview:
             if isinstance(self.work, Experiment):
                 run_matrix(self.work, self.state, device, self.start, preview)
-            elif start := start_of(self.work, self.state, self.start):
+            elif start := choose_start(self.work, self.state, self.start):
                 folder = self.work.settings.scene.folder
                 if start == "resume" and not folder.exists():
                     remedy = f"if you moved it, run `clsplat resume {shell_quote(self.out)} --scene DIR`"
@@ -250,7 +250,7 @@ def run_matrix(
             status.note(stage=cell.name)
             LOG.info("%s is done" if cell.name in done else "%s", title)
             try:
-                with failures.kept(cell.name):
+                with failures.recording(cell.name):
                     if cell.name not in done:
                         run_pipeline(cell.pipeline, states[cell.name], device, start, live)
             except Interrupted as error:
@@ -267,13 +267,13 @@ def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterat
     """
     check_matrix_folder(state)
     count, failures, out = len(experiment.cells), Failures("cells"), state.out
-    with run_folder.opened(state, start, cells=count, done=0, failed={}) as status, failures_recorded(status):
+    with run_folder.open_run_folder(state, start, cells=count, done=0, failed={}) as status, recording_failures(status):
         write_text(out / PIPELINE, experiment.text)
         yield status, failures
         status.require_held()
         compare(experiment, out, failures)
         if failures:
-            raise failures.whole(count)
+            raise failures.summary(count)
         status.end("done", exit_code=0)
 
 
@@ -286,7 +286,7 @@ def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[st
     resumed = experiment.cells if start == "resume" else []
     for cell in resumed:
         states[cell.name].require_same(cell.pipeline)
-    return states, {cell.name for cell in resumed if states[cell.name].is_whole(cell.pipeline)}
+    return states, {cell.name for cell in resumed if states[cell.name].is_complete(cell.pipeline)}
 
 
 def check_matrix_folder(state: RunState) -> None:
@@ -318,7 +318,7 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {progress}".rstrip())
     if refusals:
-        raise refusals.whole(len(lines), "would fail")
+        raise refusals.summary(len(lines), "would fail")
     return f"would run {len(lines)} cells in {state.out}:\n" + "\n".join(lines)
 
 

@@ -52,7 +52,7 @@ from clsplat.core.files import (
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.formats.table import CODECS
-from clsplat.runs.state import sum_of
+from clsplat.runs.state import try_sha256
 from clsplat.sweeps.cell import CellRun, is_key
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
@@ -317,7 +317,7 @@ class CellFolder:
         if not self.result.is_dir():
             return None
         manifest = self.manifest()
-        if manifest and all(sum_of(self.result / name) == digest for name, digest in manifest["files"].items()):
+        if manifest and all(try_sha256(self.result / name) == digest for name, digest in manifest["files"].items()):
             return manifest
         with suppress(OSError):  # another process may have done so
             make_folder(self.path / ATTEMPTS)

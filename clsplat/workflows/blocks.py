@@ -41,7 +41,7 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.runs.estimate import MAX_PER_PIXEL, max_gaussians, minutes_text, step_seconds
 from clsplat.runs.failures import Failures
-from clsplat.runs.model_file import as_setting, photographs_of, require_model
+from clsplat.runs.model_file import path_setting, photo_folder, require_model
 from clsplat.runs.opening import read_run_scene
 from clsplat.runs.status import status_text
 from clsplat.stages.init import Init
@@ -129,7 +129,7 @@ class Blocks:
             )
         self.out, self.plan, self.execution = out, plan, execution
         self._device_name = device if isinstance(device, str) else None
-        overrides = [f"scene.path={as_setting(photographs_of(scene))}"]
+        overrides = [f"scene.path={path_setting(photo_folder(scene))}"]
         self.pipeline = load(plan.pipeline, [*overrides, "init.file=coarse", *plan.overrides])
         require_divisible(self.pipeline)
         self.coarse_file = _coarse_file(plan.coarse)
@@ -198,7 +198,7 @@ class Blocks:
             if block.name in failures:
                 continue
             LOG.info("%s of %d: %s", block.name, len(pipelines), pluralize(len(block.views), "view"))
-            with failures.kept(block.name):
+            with failures.recording(block.name):
                 try:
                     model = train_in_folder(pipelines[block.name], self.out / block.name, self.device)
                     files.append((block, raw_model(model)))
@@ -208,7 +208,7 @@ class Blocks:
             remedy = "fix that and run the same command again; finished blocks are kept"
             coarse = shell_quote(self.out / COARSE)
             other = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
-            summary = failures.whole(len(pipelines))
+            summary = failures.summary(len(pipelines))
             error = ClsplatError(f"{summary};  {remedy if self.coarse_file else f'{remedy}; {other}'}")
             error.exit_code = summary.exit_code
             raise error
@@ -338,7 +338,7 @@ def plan_blocks(
 
     Raises ConfigError for an invalid number of blocks, and DataError if the scene has no or too few points.
     """
-    settings = load(pipeline, [f"scene.path={as_setting(photographs_of(scene))}", "init.file=points"]).settings
+    settings = load(pipeline, [f"scene.path={path_setting(photo_folder(scene))}", "init.file=points"]).settings
     with log_level(logging.ERROR):  # `Blocks` reads the scene again and logs its warnings
         original = read_run_scene(settings.scene, settings.scene.folder).original
         points = original.points

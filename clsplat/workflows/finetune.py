@@ -101,7 +101,7 @@ def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str 
     the run starts over.
     """
     state = RunState.read(folder)
-    if not state.is_whole(pipeline):
+    if not state.is_complete(pipeline):
         is_resumable = any(readable_checkpoints([CellAttempt(folder)]))
         if state.checkpoints and not is_resumable:
             LOG.warning("%s: no checkpoint is intact; training starts over", folder)
@@ -115,7 +115,7 @@ def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str 
 
 def is_trained(pipeline: Pipeline, folder: Path) -> bool:
     """Return whether a folder has a finished run of a pipeline with all files intact."""
-    return RunState.read(folder).is_whole(pipeline)
+    return RunState.read(folder).is_complete(pipeline)
 
 
 def require_steps(steps: int) -> None:

@@ -20,7 +20,7 @@ from clsplat.formats.streamed_sog import LOD_META, write_lod
 from clsplat.formats.table import model_bytes, model_file
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import sky_path, write_sky_file
-from clsplat.runs.model_file import ModelFile, photographs_of, run_of
+from clsplat.runs.model_file import ModelFile, find_run, photo_folder
 from clsplat.scene.detect import read_scene
 from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
@@ -241,7 +241,7 @@ def levels_of_detail(
 
 def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
     """Return the model with its photos, or None if it has none, and its Gaussians with the world filter baked in."""
-    run = run_of(model) if scene is None else None
+    run = find_run(model) if scene is None else None
     if scene is None and run is None:
         gaussians = _without_photos(model, plan, device, "has no known photos")
         LOG.info("%s: no photos: levels are merged without training", model)
@@ -271,7 +271,7 @@ def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Mod
 def _photo_error(run: Path) -> DataError | None:
     """Return the error that reading the photos of a run raises, or None."""
     try:
-        read_scene(photographs_of(run))
+        read_scene(photo_folder(run))
     except DataError as error:
         return error
     return None

@@ -54,7 +54,7 @@ def test_trainer_overwrites_no_foreign_file(tiny_scene, tmp_path):
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(ConfigError, match=r"report.html: exists, and is not from a run"):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path)
-    with pytest.raises(ConfigError, match="is the folder of the photos"):
+    with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
         clsplat.Trainer(tiny_scene, "smoke", out=tiny_scene)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 

@@ -104,7 +104,7 @@ NEAR = {
     "status nowhere": "nowhere: has no readable status.json; expected a run folder",
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
-    "evaluate x.ply --scene y --downscales nan": "expected downscale factors from 1 on, got nan",
+    "evaluate x.ply --scene y --downscales nan": "expected downscale factors of at least 1, got nan",
 }
 
 
@@ -199,13 +199,13 @@ def test_run_folder_without_model_is_explained(finished, tmp_path):
     (tmp_path / "a.JPG").touch()
     for command in ("evaluate", "view"):
         said = clsplat(command, tmp_path, expect=3).stderr
-        assert f"for a model of its photographs, run `clsplat run photos --scene {tmp_path}` first" in said
+        assert f"to train a model of its photos, run `clsplat run photos --scene {tmp_path}` first" in said
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     text = (run / "pipeline.yaml").read_text()
     (run / "pipeline.yaml").write_text(text.replace(str(load(str(run / "pipeline.yaml")).settings.scene.path), "gone"))
     missing = clsplat("render", run, expect=3).stderr
-    assert "the folder of its photographs, gone, is missing; give the folder of a scene" in missing
+    assert "the folder of its photos, gone, is missing; give the folder of the scene" in missing
     (run / "point_cloud.ply").unlink()
     assert (
         f"has no point_cloud.ply; finish the run with `clsplat resume {run}`" in clsplat("render", run, expect=3).stderr

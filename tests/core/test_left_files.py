@@ -55,7 +55,7 @@ def test_files_of_a_live_process_are_not_swept(tmp_path):
         path.write_text("x")
     with open_atomic(tmp_path / "c") as file:
         file.write(b"x")
-        with run_folder.opened(RunState.read(tmp_path), "new", step=0):
+        with run_folder.open_run_folder(RunState.read(tmp_path), "new", step=0):
             pass
     assert (tmp_path / "c").read_bytes() == b"x"
     assert other.exists()
@@ -131,7 +131,7 @@ def test_checkpoint_is_synced_before_old_ones_are_removed(tiny_scene, tmp_path, 
 
 @has_proc
 def test_run_folder_is_synced_with_its_parents(tmp_path, calls):
-    with run_folder.opened(RunState.read(tmp_path / "a" / "run"), "new"):
+    with run_folder.open_run_folder(RunState.read(tmp_path / "a" / "run"), "new"):
         synced = [name for kind, name in calls if kind == "sync"]
     assert {tmp_path.name, "a"} <= {*synced}
 

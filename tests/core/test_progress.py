@@ -11,7 +11,7 @@ from clsplat.core.progress import Count, Progress, clock, listening, polled
 from clsplat.prepare.cache import PlannedStep, prepare
 from clsplat.prepare.gather import summarize_placement
 from clsplat.prepare.steps import FindFeatures, MapCameras
-from clsplat.runs.opening import READ_SCENE, counts_of
+from clsplat.runs.opening import READ_SCENE, count_listener
 from clsplat.training.status import StatusFile
 
 
@@ -91,7 +91,7 @@ def test_uncounted_work_is_polled(monkeypatch):
 
 def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
     status = StatusFile(tmp_path)
-    listen = counts_of(status)
+    listen = count_listener(status)
     for stage, left in (("match_features", None), (READ_SCENE, 4), ("undistort", None)):
         with status.stage(stage):
             listen("pairs", 3, 9, seconds_left=4.0)

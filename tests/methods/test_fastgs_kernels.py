@@ -36,7 +36,7 @@ def surveyed(device: Device, case: Case, photographs: list[np.ndarray], masks: l
     return Survey(Rasterizer(device, "radix"), case.model(device), source, range(len(held)), seed=1, step=600)
 
 
-def photographs_of(rng, case: Case, number: int) -> list[np.ndarray]:
+def photo_folder(rng, case: Case, number: int) -> list[np.ndarray]:
     """The image of the reference, with errors in about half of the pixels."""
     image = ref.render(case.gaussians(), case.camera(), BACKGROUND.astype(np.float64), case.degree).image
     found = []
@@ -73,7 +73,7 @@ def expected_wrong(
 )
 def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, masked):
     case = safe_case(rng, count, width, height, MARGIN)
-    photographs = photographs_of(rng, case, 4)
+    photographs = photo_folder(rng, case, 4)
     masks = [rng.random((height, width)) < 0.7 if masked else None for _ in photographs]
     found = wrong_pixels(surveyed(device, case, photographs, masks), 10, 0.1)
     pixels, score = expected_wrong(case, photographs, masks, 0.1)

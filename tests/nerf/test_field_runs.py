@@ -126,7 +126,7 @@ def test_files_of_a_field_run_are_verified(finished):
 
 def test_model_commands_refuse_field_runs(finished):
     for path in (finished, finished / "field.npz"):
-        with pytest.raises(DataError, match=r"is a field, a network instead of Gaussians; expected Gaussians; .*ren"):
+        with pytest.raises(DataError, match=r"is a field, which has a network instead of Gaussians; .*ren"):
             require_model(path)
     with pytest.raises(DataError, match="is a field"):
         clsplat.convert(finished, finished / "a.ply")

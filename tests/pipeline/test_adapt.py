@@ -126,10 +126,10 @@ def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
     assert digest(again) == digest(out)
     state = RunState.read(out)
-    assert state.is_whole(load("smoke", asked)), "the same command finds it up to date"
+    assert state.is_complete(load("smoke", asked)), "the same command finds it up to date"
     with pytest.raises(ConfigError, match=r"model\.sh_degree was 1, is 2"):
         state.require_same(load("smoke", [*asked, "model.sh_degree=2"]))
-    assert state.is_whole(load("smoke", [*asked, "model.sh_degree=1"]))
+    assert state.is_complete(load("smoke", [*asked, "model.sh_degree=1"]))
 
 
 def test_undecided_keys_are_listed_before_preparation():

@@ -13,7 +13,7 @@ from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
 from clsplat.runs import estimate as module
 from clsplat.runs.describe import describe
-from clsplat.runs.opening import check_preparation, known, listed
+from clsplat.runs.opening import check_preparation, expected_measures, photo_names
 from clsplat.runs.state import RunState
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import pending_cell
@@ -37,9 +37,9 @@ def expected(pipeline: str, photos: Path, *sets: str) -> list[str]:
     asked = load(pipeline, [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
     planned = asked.preparation(out)
-    names = listed(asked, planned, out)
+    names = photo_names(asked, planned, out)
     device = SimpleNamespace(info=SimpleNamespace(units=2))
-    return module.estimate_time(asked, planned, names, known(asked, names), device, None)  # type: ignore[arg-type]
+    return module.estimate_time(asked, planned, names, expected_measures(asked, names), device, None)  # type: ignore[arg-type]
 
 
 def test_time_estimates_scale_with_the_work(photos):
@@ -84,10 +84,10 @@ def test_estimated_growth_follows_the_number_of_images(photos):
 def test_unprepared_photographs_give_the_training_count(photos, sets, training):
     asked = load("photos", [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
-    names = listed(asked, asked.preparation(out), out)
+    names = photo_names(asked, asked.preparation(out), out)
     assert len(names) == COUNT
-    assert known(asked, names).photographs == training
-    assert known(asked, []) is None
+    assert expected_measures(asked, names).photographs == training
+    assert expected_measures(asked, []) is None
 
 
 def as_cell(asked, state, device, start):

@@ -323,8 +323,8 @@ def test_run_does_not_resume_with_other_inputs(scene, tmp_path, what):
     word = {"photograph": "the photograph of 1 view", "pose": "the camera of 1 view", "points": "the points"}[what]
     for more in (["--dry-run"], []):
         done = command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume", *more, expect=2)
-        assert f"{scene}: not what the run was started with: {word}" in done.stderr
-        assert "put that back, or start over: `clsplat run` with --restart or another --out" in done.stderr
+        assert f"{scene}: differs from the inputs of the run: {word}" in done.stderr
+        assert "restore them, or start over: `clsplat run` with --restart or another --out" in done.stderr
         if more:
             assert sorted((path.name, path.read_bytes()) for path in out.iterdir() if path.is_file()) == before
     for path, content in kept.items():
@@ -341,7 +341,7 @@ def test_checkpoint_identifies_inputs_without_the_record(scene, tmp_path, caplog
     assert record.read_text() != "{}"
     record.write_text("{}")
     cv2.imwrite(str(views(scene)[0].image_path), np.zeros((40, 40, 3), np.uint8))
-    with pytest.raises(ConfigError, match=r"not what the run was started with: inputs.json is missing or damaged"):
+    with pytest.raises(ConfigError, match=r"differs from the inputs of the run: inputs.json is missing or damaged"):
         train(scene, tmp_path / "run", *FEW, resume=True)
     assert record.read_text() == "{}", "the new inputs do not become those of the start"
 

@@ -18,7 +18,7 @@ from clsplat.metrics.views import render_view
 from clsplat.render.painter import SplatPainter
 from clsplat.runs.live import live as module
 from clsplat.runs.live.live import Live
-from clsplat.runs.live.preview import AIMS, MAX_POINTS, QUALITY, SIDES, Credit, Curves, PageCamera, Preview
+from clsplat.runs.live.preview import MAX_POINTS, QUALITY, SIDES, TARGET_TIMES, Credit, Curves, Preview, PreviewRequest
 from clsplat.scene.detect import read_scene
 from clsplat.sweeps.experiment import Job
 from tests.support.live import in_background, trained
@@ -57,7 +57,7 @@ class Client:
 @pytest.fixture
 def live():
     with Live() as opened:
-        opened.desk.budget = Credit(1e9, 1e9)  # pictures at every step
+        opened.state.budget = Credit(1e9, 1e9)  # pictures at every step
         yield opened
 
 
@@ -92,7 +92,7 @@ def test_live_page_does_not_change_the_bits(live, few_steps, tiny_scene, tmp_pat
                 time.sleep(0.05)
         seen["end"] = state
 
-    live.desk.pause(True)
+    live.state.pause(True)
     with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
         live.close()
@@ -108,7 +108,7 @@ def test_title_names_the_given_folder(live, tiny_scene, tmp_path, monkeypatch):
     shutil.copytree(tiny_scene, prepared)
     monkeypatch.setattr("clsplat.runs.opening.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
     trained(live, tiny_scene, tmp_path / "run")
-    assert live.desk.shown.title == f"smoke · {tiny_scene.name}"
+    assert live.state.shown.title == f"smoke · {tiny_scene.name}"
 
 
 def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatch):
@@ -117,10 +117,10 @@ def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatc
 
 
 def test_a_pause_ends_by_itself_when_no_page_is_open(live, tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "ABSENT", 0.3)
-    live.desk.pause(True)
+    monkeypatch.setattr(module, "PAUSE_TIMEOUT", 0.3)
+    live.state.pause(True)
     trained(live, tiny_scene, tmp_path / "run")
-    assert not live.desk.paused
+    assert not live.state.paused
 
 
 def test_a_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
@@ -130,7 +130,7 @@ def test_a_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
         client.until(lambda state: state.get("drawn") and state.get("stage") == "paused")
         os.kill(os.getpid(), signal.SIGTERM)
 
-    live.desk.pause(True)
+    live.state.pause(True)
     with in_background(stop), pytest.raises(Interrupted, match="stopped at step 1, saved in "):
         trained(live, tiny_scene, tmp_path / "run")
 
@@ -148,14 +148,14 @@ def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, t
         assert client.json("state.json?after=0")["fault"] == "no room"
         client.get("resume")
 
-    live.desk.pause(True)
+    live.state.pause(True)
     with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
 
 
 def test_live_renders_wait_for_their_time_budget(live, tiny_scene, tmp_path):
     """Without credit no picture is drawn, however often it is asked for."""
-    live.desk.budget = Credit(0.0, 1.0)
+    live.state.budget = Credit(0.0, 1.0)
     client, answers = Client(live), []
 
     def look():
@@ -166,7 +166,7 @@ def test_live_renders_wait_for_their_time_budget(live, tiny_scene, tmp_path):
         trained(live, tiny_scene, tmp_path / "run")
         live.close()
     assert answers == [204]
-    assert live.desk.budget.spent == 0
+    assert live.state.budget.spent == 0
 
 
 def test_the_server_ends_with_the_run(tiny_scene, tmp_path, capsys):
@@ -192,7 +192,7 @@ def test_used_port_is_refused_before_the_run(live, tiny_scene, tmp_path):
 def test_live_image_of_a_view_is_its_render(live, tiny_scene, tmp_path):
     run = trained(live, tiny_scene, tmp_path / "run")
     for view in run.scene.views[:3]:
-        jpeg = Preview(run).draw(PageCamera(1, view, "still")).jpeg
+        jpeg = Preview(run).draw(PreviewRequest(1, view, "still")).jpeg
         photograph = run.photographs.get(view)
         render = render_view(SplatPainter(run.rasterizer, run.model, run.photographs.background), photograph.camera)
         assert np.ptp(render) > 60
@@ -204,7 +204,7 @@ def test_image_size_adapts_to_the_render_time():
     preview = Preview.__new__(Preview)
     preview._costs = {}
     assert preview._side("moving") == SIDES[0]
-    preview._costs[SIDES[0]] = 2 * AIMS["moving"]
+    preview._costs[SIDES[0]] = 2 * TARGET_TIMES["moving"]
     assert preview._side("moving") < SIDES[0]
     assert preview._side("still") == SIDES[0]
     preview._costs = dict.fromkeys(SIDES, 9.0)

@@ -4,7 +4,7 @@ import pytest
 
 from clsplat.runs.live.live import Live
 from clsplat.runs.live.server import FOLDER as LIVE
-from clsplat.runs.live.server import OWN, page
+from clsplat.runs.live.server import SCRIPTS, page
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import Page
 from tests.support.live import in_background, trained
@@ -17,7 +17,7 @@ def test_page_is_self_contained_and_its_scripts_are_short():
     text = page().decode()
     assert Page(text).elements["script"] == 1
     assert "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'sha256-" in text
-    for name in OWN:
+    for name in SCRIPTS:
         lines = (LIVE / f"{name}.js").read_text().splitlines()
         assert len(lines) <= 250
         assert max(map(len, lines)) <= 120
@@ -49,7 +49,7 @@ def test_late_image_does_not_replace_a_newer_one(tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
 def test_a_visit_from_the_first_step_to_the_end(tiny_scene, tmp_path):
     with Live() as live, Browser(tmp_path / "browser", 700, 620) as browser:
-        live.desk.pause(True)
+        live.state.pause(True)
 
         def visit():
             browser.visit(live.address)  # at rest: it shows a picture of step 1

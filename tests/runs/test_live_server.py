@@ -9,14 +9,14 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.runs.live import server as module
-from clsplat.runs.live.preview import MAX_WAITING, Credit, EncodedPicture, Orders, PageCamera
-from clsplat.runs.live.server import Answer, Server
+from clsplat.runs.live.preview import MAX_WAITING, Credit, EncodedPicture, PreviewRequest, RequestQueue
+from clsplat.runs.live.server import Response, Server
 
 
 @pytest.fixture
 def server(monkeypatch):
     monkeypatch.setattr(module._Connection, "timeout", 0.5)
-    made = Server(0, "token", lambda request: Answer(200, request.path.encode()))
+    made = Server(0, "token", lambda request: Response(200, request.path.encode()))
     yield made
     made.stop()
 
@@ -90,7 +90,7 @@ def test_final_answer_is_complete_and_the_last():
     def answer(request):
         given.set()
         going.wait(10)
-        return Answer(200, b"farewell")
+        return Response(200, b"farewell")
 
     server = Server(0, "token", answer)
     request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -109,8 +109,8 @@ def test_final_answer_is_complete_and_the_last():
 
 def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
     with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
-        Server(server.port, "token", server.answer)
-    other = Server(0, "token", server.answer)
+        Server(server.port, "token", server.handle)
+    other = Server(0, "token", server.handle)
     assert server.port < other.port < module.PORT + module.PORTS
     other.stop()
 
@@ -141,41 +141,41 @@ def test_budget_is_capped_and_carries_debt():
     assert budget.credit == 0
 
 
-def asked(orders: Orders, *wanted: PageCamera) -> list[threading.Thread]:
-    threads = [threading.Thread(target=orders.ask, args=(order, 10)) for order in wanted]
+def asked(queue: RequestQueue, *wanted: PreviewRequest) -> list[threading.Thread]:
+    threads = [threading.Thread(target=queue.wait_for, args=(request, 10)) for request in wanted]
     for number, thread in enumerate(threads, 1):
         thread.start()
-        while sum(order in orders._waiting for order in wanted) < number:
+        while sum(request in queue._waiting for request in wanted) < number:
             time.sleep(0.001)
     return threads
 
 
 def test_moving_requests_take_precedence_and_the_queue_is_short():
-    orders, picture = Orders(), EncodedPicture(b"", 1)
-    wanted = [PageCamera(page, None, "again" if page < 2 else "moving") for page in range(MAX_WAITING)]
-    threads = asked(orders, *wanted)
-    assert not orders.ask(PageCamera(99, None, "moving"), 0)
-    for order in (wanted[2], wanted[3], wanted[0], wanted[1]):
-        assert orders.first() is order
-        orders.deliver(order, picture)
+    queue, picture = RequestQueue(), EncodedPicture(b"", 1)
+    wanted = [PreviewRequest(page, None, "again" if page < 2 else "moving") for page in range(MAX_WAITING)]
+    threads = asked(queue, *wanted)
+    assert not queue.wait_for(PreviewRequest(99, None, "moving"), 0)
+    for request in (wanted[2], wanted[3], wanted[0], wanted[1]):
+        assert queue.first() is request
+        queue.deliver(request, picture)
     for thread in threads:
         thread.join(5)
-    assert not orders
+    assert not queue
 
 
 def test_new_request_replaces_the_pages_previous_one():
-    orders, first, second = Orders(), PageCamera(1, None, "moving"), PageCamera(1, None, "still")
-    (thread,) = asked(orders, first)
-    others = asked(orders, second)
+    queue, first, second = RequestQueue(), PreviewRequest(1, None, "moving"), PreviewRequest(1, None, "still")
+    (thread,) = asked(queue, first)
+    others = asked(queue, second)
     thread.join(5)
     assert first.picture is None
-    assert orders.first() is second
-    orders.deliver(second, EncodedPicture(b"x", 2))
+    assert queue.first() is second
+    queue.deliver(second, EncodedPicture(b"x", 2))
     others[0].join(5)
 
 
 def test_request_times_out():
-    orders, order = Orders(), PageCamera(1, None, "moving")
-    assert orders.ask(order, 0)
-    assert order.picture is None
-    assert not orders
+    queue, request = RequestQueue(), PreviewRequest(1, None, "moving")
+    assert queue.wait_for(request, 0)
+    assert request.picture is None
+    assert not queue

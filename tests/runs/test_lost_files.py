@@ -86,7 +86,7 @@ def test_last_stages_run_again_if_files_are_lost(saved_late, copy):
     for name in names:
         change(copy / name)
     (copy / "metrics.json").unlink()
-    assert sorted(state.RunState.read(copy).lost) == sorted([*names, "metrics.json"])
+    assert sorted(state.RunState.read(copy).damaged) == sorted([*names, "metrics.json"])
     command("resume", copy)
     assert damaged(copy) == []
     assert (copy / "point_cloud.ply").read_bytes() == (saved_late / "point_cloud.ply").read_bytes()
@@ -137,7 +137,7 @@ def test_lost_model_of_an_earlier_stage_leaves_the_run_done(tiny_scene, tmp_path
     (out / "b.ply").unlink()
     change(out / "a.ply")
     assert command("check", out, expect=7).stderr.endswith(
-        f"`clsplat resume {out}` runs the stages after its newest checkpoint again\n"
+        f"`clsplat resume {out}` repeats the stages after its newest checkpoint\n"
     )
     for lost in ("b.ply", "checksums.json"):
         (out / lost).unlink(missing_ok=True)

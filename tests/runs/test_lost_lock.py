@@ -104,7 +104,7 @@ def test_emergency_save_skips_a_lost_folder(tiny_scene, tmp_path, monkeypatch):
 
 def test_heartbeat_stops_and_reports_a_lost_folder(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
+    with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "new") as status:
         before = take_folder(tmp_path / "run")
         while status.lost is None:
             time.sleep(0.001)
@@ -118,7 +118,7 @@ def test_run_ending_before_its_first_step_keeps_the_new_status(tmp_path):
     before: dict[str, bytes] = {}
 
     def ends() -> None:
-        with run_folder.opened(RunState.read(tmp_path / "run"), "new"):
+        with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "new"):
             before.update(take_folder(tmp_path / "run"))
             raise ValueError("ends")
 

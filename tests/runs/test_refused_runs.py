@@ -61,7 +61,7 @@ def test_restart_keeps_foreign_files(tiny_scene, tmp_path):
     command(*arguments)
     (out / "notes.txt").write_text("mine")
     (out / "checkpoints" / "failed_000003.npz").write_text("x")
-    assert "already has a run; use another folder, --resume or --restart" in command(*arguments, expect=2).stderr
+    assert "already has a run; use another folder, --resume, or --restart" in command(*arguments, expect=2).stderr
     assert "use only one of them" in command(*arguments, "--resume", "--restart", expect=2).stderr
     model = (out / "point_cloud.ply").read_bytes()
     records = (out / "metrics.jsonl").read_text()

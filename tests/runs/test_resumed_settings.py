@@ -41,7 +41,7 @@ def test_settings_that_shape_tables_may_not_change(change, killed_run, tiny_scen
 
 def test_fewer_steps_than_trained_are_refused(killed_run, tiny_scene, caplog):
     before = (killed_run / "pipeline.yaml").read_text()
-    words = r"already at step 8; optimize.steps=6 would end before it: use 8 or more, or start over: `clsplat run`"
+    words = r"already at step 8; optimize.steps=6 would end before it; use 8 or more, or start over: `clsplat run`"
     with pytest.raises(ConfigError, match=words):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=6", resume=True)
     assert "bits" not in caplog.text, "nothing goes on"

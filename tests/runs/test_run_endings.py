@@ -138,7 +138,7 @@ def test_unwritable_output_is_one_line(arguments):
 
 
 def test_scene_with_a_non_unicode_name_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="expected a path of UTF-8 text"):
+    with pytest.raises(ConfigError, match="expected a path in UTF-8"):
         Job.open("smoke", tmp_path / "\udcff")
 
 

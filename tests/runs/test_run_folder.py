@@ -24,16 +24,16 @@ def opened(scene: Path, out: Path, *changes: str) -> None:
 
 def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
     for out in (tiny_scene, tiny_scene / "train" / ".."):
-        with pytest.raises(ConfigError, match="is the folder of the photos"):
+        with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
             opened(tiny_scene, out)
     monkeypatch.chdir(tiny_scene)
-    with pytest.raises(ConfigError, match="is the folder of the photos"):
+    with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
         opened(tiny_scene, Path())
     with pytest.raises(ConfigError, match="is the root of a file system"):
         opened(tiny_scene, Path(Path.cwd().anchor))
     opened(tiny_scene, tiny_scene / "runs" / "a")
     photographs = tiny_scene / "train"
-    with pytest.raises(ConfigError, match="is the folder of the photos, or in it"):
+    with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
         outputs.check_output_paths(
             load("photos", [f"scene.path={str(photographs)!r}"]), RunState.read(photographs / "run")
         )
@@ -45,7 +45,7 @@ def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
         out.mkdir()
         (out / name).symlink_to(tmp_path / "elsewhere")
         for _ in ("new", "with a run"):
-            with pytest.raises(ConfigError, match=f"{name}: is a link to outside of the run folder"):
+            with pytest.raises(ConfigError, match=f"{name}: links to a target outside of the run folder"):
                 opened(tiny_scene, out)
             (out / "pipeline.yaml").touch()
         (out / name).unlink()
@@ -103,7 +103,7 @@ UNWRITABLE = {  # --out -> the exit code, and what the sentence says
     "FILE/run": (7, "cannot be written (Not a directory)"),
     "FILE": (7, "cannot be written (File exists)"),
     "x" * 300: (7, "File name too long"),
-    "SCENE": (2, "is the folder of the photos"),
+    "SCENE": (2, "is, or is inside, the folder of the photos"),
     "ROOT": (2, "is the root of a file system"),
     "not \udcff text": (0, ""),
 }
@@ -170,4 +170,4 @@ def test_run_state_follows_from_its_folder(name, tmp_path):
         (tmp_path / file).write_text(text)
     state = RunState.read(tmp_path)
     assert state.phase is phase
-    assert state.lost == (["checksums.json"] if phase is Phase.DONE else [])
+    assert state.damaged == (["checksums.json"] if phase is Phase.DONE else [])

@@ -10,7 +10,7 @@ import clsplat
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
 from clsplat.prepare.gather import summarize_placement
-from clsplat.runs.model_file import ModelSource, photographs_of, run_of
+from clsplat.runs.model_file import ModelSource, find_run, photo_folder
 from clsplat.runs.status import summary
 from clsplat.sweeps.experiment import Job
 from tests.support.html_page import Page
@@ -31,11 +31,11 @@ def done(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_run_folder_is_a_model(done):
     model = done / "models/last.ply"
-    assert run_of(done) == done
-    assert run_of(model) == done.resolve()
+    assert find_run(done) == done
+    assert find_run(model) == done.resolve()
     assert len(load(done)) == len(load(model))
     shutil.copy(model, done.parent / "copy.ply")
-    assert run_of(done.parent / "copy.ply") is None
+    assert find_run(done.parent / "copy.ply") is None
 
 
 def test_model_of_a_run_has_its_scene(done, tiny_scene):
@@ -51,14 +51,14 @@ def test_model_of_a_run_has_its_scene(done, tiny_scene):
 
 
 def test_run_folder_is_a_scene(done, tiny_scene, tmp_path):
-    assert photographs_of(done) == tiny_scene
-    assert photographs_of(tiny_scene) == tiny_scene
+    assert photo_folder(done) == tiny_scene
+    assert photo_folder(tiny_scene) == tiny_scene
     assert clsplat.inspect_scene(done).trainable
     assert Job.open("smoke", done, tmp_path / "run").work.settings.scene.folder == tiny_scene
     moved = shutil.copytree(done, tmp_path / "moved")
     (moved / "prepared.json").write_text('{"inputs": "x", "folder": "/nowhere"}')
-    with pytest.raises(DataError, match="the folder of its photographs, /nowhere, is missing"):
-        photographs_of(moved)
+    with pytest.raises(DataError, match="the folder of its photos, /nowhere, is missing"):
+        photo_folder(moved)
 
 
 def test_finished_run_trains_longer(done, tiny_scene, tmp_path):
@@ -101,7 +101,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     (folder / "metrics.json").write_text(json.dumps({**metrics, "overfit": True}))
-    assert summary(folder)[-1].endswith("in a browser; the model overfits: more photos help most")
+    assert summary(folder)[-1].endswith("in a browser; the model overfits: add photos")
 
 
 def test_summary_names_missing_photographs(done, tmp_path):

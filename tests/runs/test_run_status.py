@@ -83,7 +83,7 @@ def test_suggested_command_works(state, tmp_path):
     text = reading.status_text(write_and_read_status(tmp_path, **more))
     assert f"no checkpoint was saved; `clsplat resume {tmp_path}` starts it over" in text
     gone = reading.status_text(write_and_read_status(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
-    assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` starts" in gone
+    assert f"are missing; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` starts" in gone
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step_000007.npz").touch()
     text = reading.status_text(write_and_read_status(tmp_path, **more))
@@ -122,7 +122,7 @@ def test_a_status_of_a_newer_version_is_refused(tmp_path):
     write_and_read_status(tmp_path)
     path = tmp_path / "status.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))
-    assert "of a newer clsplat" in refusal(reading.run_status, RunState.read(tmp_path))
+    assert "by a newer version" in refusal(reading.run_status, RunState.read(tmp_path))
 
 
 def test_status_has_no_terminal_escapes(tmp_path):

@@ -60,7 +60,7 @@ def test_status_of_a_newer_version_is_not_damage(copy):
     path.write_text(json.dumps({**status, "format": 2, "step": "of words"}))
     assert damaged(copy) == {}
     details = {one["file"]: one["detail"] for one in clsplat.check(copy)["objects"]}
-    assert details["status.json"] == "not checked further: format 2, of a newer clsplat"
+    assert details["status.json"] == "not checked further: format 2 of a newer version"
     for fault in ({"step": "of words"}, {"format": 0}, {"format": "1"}):
         path.write_text(json.dumps({**status, **fault}))
         assert list(damaged(copy)) == ["status.json"]
@@ -74,7 +74,7 @@ def test_complete_run_has_a_line_per_file_and_needs_no_device(finished, monkeypa
     assert damaged(finished) == {}
     done = command("check", finished)
     lines = done.stdout.splitlines()
-    assert lines[-1] == f"{finished}: done; all {len(lines) - 1} files are whole"
+    assert lines[-1] == f"{finished}: done; all {len(lines) - 1} files are intact"
     text = "\n".join(lines)
     names = ["pipeline.yaml", "status.json, done", "checkpoints/step_000020.npz, step 20, ", "metrics.jsonl, "]
     names += ["metrics.json, ", "point_cloud.ply, ", "renders/test/", "report.html", "checksums.json, of 8 files"]
@@ -211,7 +211,7 @@ def test_every_missing_file_is_named(finished, copy):
 def test_run_without_checksums_is_not_reported_as_complete(copy):
     (copy / "checksums.json").unlink()
     done = command("check", copy, expect=7)
-    assert "checksums.json is missing, as in runs of a Trainer" in done.stderr
+    assert "checksums.json is missing, as always with a Trainer" in done.stderr
     assert "whole" not in done.stderr
 
 
@@ -252,7 +252,7 @@ def test_damaged_checkpoint_is_described_plainly(copy):
     path.write_bytes(data)
     assert damaged(copy)["checkpoints/step_000020.npz"].startswith("differs from its checksum (")
     said = command("check", copy, expect=7).stderr
-    assert "all outputs are whole" in said
+    assert "all outputs are intact" in said
     assert "resume" not in said, "it would leave the run as it is"
 
 

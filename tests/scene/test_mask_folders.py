@@ -149,7 +149,7 @@ def test_run_does_not_resume_with_other_masks(tiny_scene, tmp_path):
     store((masks / name).with_suffix(".png"), np.full((40, 40), 255, np.uint8))
     again = ["run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "optimize.steps=12", "--set"]
     told = command(*again, place, expect=2).stderr
-    assert f"{tiny_scene}: not what the run was started with: the mask of 1 view ({name}); put that back" in told
+    assert f"{tiny_scene}: differs from the inputs of the run: the mask of 1 view ({name}); restore them" in told
     command(*again, f"scene.masks='{moved}'")  # the same content elsewhere
 
 

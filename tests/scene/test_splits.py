@@ -253,7 +253,7 @@ def test_invalid_selection_is_explained(setting, fault):
 )
 def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, count, warned):
     scene = read_scene(tiny_scene, Split(0))
-    RunScene.of(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
+    RunScene.from_scene(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
     told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(told) == bool(warned)
     assert all(warned in text for text in told), told

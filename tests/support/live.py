@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, run_folder, runner
-from clsplat.runs.failures import failures_recorded
+from clsplat.runs.failures import recording_failures
 from clsplat.runs.live.live import Live
 from clsplat.runs.state import RunState
 from clsplat.training.run import Run
@@ -15,7 +15,7 @@ from tests.support.runs import FEW
 
 def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
     checked = load("smoke", [f"scene.path='{scene}'", *FEW, *overrides])
-    with run_folder.opened(RunState.read(out), "new", step=0) as status, failures_recorded(status):
+    with run_folder.open_run_folder(RunState.read(out), "new", step=0) as status, recording_failures(status):
         live.follow(status)
         run = opening.open_run(checked, out, None, "new", status)
         with live.showing(run):

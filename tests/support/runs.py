@@ -12,7 +12,7 @@ import numpy as np
 
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, run_folder, runner
-from clsplat.runs.failures import failures_recorded
+from clsplat.runs.failures import recording_failures
 from clsplat.runs.state import RunState
 from clsplat.training import archive
 from clsplat.training.run import Run
@@ -69,7 +69,7 @@ def records(out: Path) -> list[dict]:
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
     start: run_folder.Start = "resume" if resume else "new"
-    with run_folder.opened(RunState.read(out), start, step=0) as status, failures_recorded(status):
+    with run_folder.open_run_folder(RunState.read(out), start, step=0) as status, recording_failures(status):
         run = opening.open_run(checked, out, None, start, status)
         runner.execute(checked, run, start, lambda progress: None)
     return run

@@ -383,7 +383,7 @@ def broken(make_run, how: str) -> Path:
 @pytest.mark.parametrize(("how", "code", "words"), [
     ("missing", 3, "nowhere: has no pipeline.yaml"),
     ("no settings", 3, "has no pipeline.yaml"),
-    ("unfinished", 3, "has no metrics.json, as the run is interrupted; finish it with --resume"),
+    ("unfinished", 3, "has no metrics.json because the run is interrupted; finish it with --resume"),
     ("damaged metrics", 3, "metrics.json: .*the file is damaged"),
     ("metrics of something else", 3, r"metrics.json: test.1.psnr: "),
     ("damaged records", 3, "metrics.jsonl:1: damaged.*; remove this line"),

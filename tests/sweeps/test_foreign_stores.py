@@ -95,7 +95,7 @@ def test_a_matrix_folder_with_a_link_to_outside_is_refused(tmp_path, outside, na
     out = tmp_path / "out"
     out.mkdir()
     (out / name).symlink_to(outside, target_is_directory=True)
-    with pytest.raises(ConfigError, match=f"{name}: is a link to outside of the run folder"):
+    with pytest.raises(ConfigError, match=f"{name}: links to a target outside of the run folder"):
         check_matrix_folder(RunState.read(out))
 
 

@@ -108,7 +108,7 @@ def test_a_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
     assert json.loads((out / "status.json").read_text())["state"] == "done"
     assert json.loads((out / "seed=1" / "metrics.json").read_text())["steps"] == 3
     before = [(out / name).read_bytes() for name in ("pipeline.yaml", "status.json")]
-    with pytest.raises(ConfigError, match=r"was run with other settings: .*steps was 3, is 4"):
+    with pytest.raises(ConfigError, match=r"has a run with other settings: .*steps was 3, is 4"):
         experiment.Job.resume(out, ["optimize.steps=4"]).run()
     assert [(out / name).read_bytes() for name in ("pipeline.yaml", "status.json")] == before, (
         "plain resume still works"
@@ -185,7 +185,7 @@ def test_cells_with_other_settings_are_not_reused(finished, tmp_path):
     changed = tmp_path / "changed.yaml"
     changed.write_text(Path(finished[0]).read_text().replace("count: 300", "count: 301"))
     with pytest.raises(
-        ConfigError, match=r"seed=0: was run with other settings: stages\[0\].init.count was 300, is 301"
+        ConfigError, match=r"seed=0: has a run with other settings: stages\[0\].init.count was 300, is 301"
     ):
         experiment.run_matrix(load_experiment(str(changed)), RunState.read(tmp_path / "run"), None, "resume")
 

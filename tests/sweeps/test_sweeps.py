@@ -187,7 +187,7 @@ def test_sweep_resumes_only_in_its_first_store(file, execution_file, runs, tmp_p
 
 
 def test_existing_result_is_not_run_again(file, execution_file, runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(RunState, "is_whole", lambda state, pipeline: state.out.name == "tiny-seed=0")
+    monkeypatch.setattr(RunState, "is_complete", lambda state, pipeline: state.out.name == "tiny-seed=0")
     out = commands.run(file, out=tmp_path / "out", on=execution_file)
     shutil.rmtree(tmp_path / "store")
     shutil.rmtree(out / "tiny-seed=1")

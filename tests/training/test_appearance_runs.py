@@ -124,7 +124,7 @@ def test_decision_is_recorded_and_off_keeps_the_bits(tiny_scene, tmp_path, few_s
     assert found.reason == "exposures are unknown, from tracks as well as from EXIF"
     assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
-    assert RunState.read(tmp_path / "run").is_whole(asked), "the same command finds it up to date"
+    assert RunState.read(tmp_path / "run").is_complete(asked), "the same command finds it up to date"
 
 
 def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
@@ -138,7 +138,7 @@ def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
     photographs = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
-    with run_folder.opened(RunState.read(tmp_path / "run"), "resume", step=0) as status:
+    with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
     assert run.settings.training.modules == [found], "who goes on takes the choice"
 

@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
-from clsplat.runs.runner import as_trained
+from clsplat.runs.runner import with_refit_steps
 from clsplat.runs.status import summary
 from clsplat.stages.report import NAMES, is_overfit, overfitting_note
 from clsplat.sweeps.experiment import Job
@@ -189,7 +189,7 @@ def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
         growth_ended=20,
     )
     run = SimpleNamespace(best=best_run.model_copy(update={"refit": "begun"}), is_refit=True)
-    training = as_trained(pipeline, run).settings.training
+    training = with_refit_steps(pipeline, run).settings.training
     density = next(stage for stage in training.during if stage.stage == "densify")
     assert (training.steps, density.patience, density.grow_until) == (30, None, 20)
 

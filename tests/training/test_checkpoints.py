@@ -119,7 +119,7 @@ def test_run_without_its_status_does_not_restart(killed_run, tiny_scene, few_ste
     (killed_run / "status.json").unlink()
     if status is not None:
         (killed_run / "status.json").write_text(status)
-    with pytest.raises(OutputError, match=r"both status\.json and the checkpoints of its run are lost; .*--restart"):
+    with pytest.raises(OutputError, match=r"both status\.json and the checkpoints of its run are missing; .*--restart"):
         train(tiny_scene, killed_run, *FEW, resume=True)
     assert (killed_run / "metrics.jsonl").read_bytes() == before
 
@@ -135,7 +135,7 @@ def test_restoring_reads_no_other_run(few_steps, tmp_path):
     """A folder with checkpoints and no pipeline.yaml is a run too."""
     out = shutil.copytree(few_steps, tmp_path / "run")
     (out / "pipeline.yaml").unlink()
-    with pytest.raises(ConfigError, match="already has a run; use another folder, --resume or --restart"):
+    with pytest.raises(ConfigError, match="already has a run; use another folder, --resume, or --restart"):
         run_folder.check_run_folder(RunState.read(out), "new")
     assert CHECKSUMS in {path.name for path in out.iterdir()}
 

@@ -140,7 +140,7 @@ def test_run_with_few_visible_rows_resumes_from_any_checkpoint(few_steps, tiny_s
     device, out = small(2050), tmp_path / "run"
     run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
     expected = digest(out)
-    with run_folder.opened(RunState.read(out), "resume", step=0) as status:
+    with run_folder.open_run_folder(RunState.read(out), "resume", step=0) as status:
         run = opening.open_run(load("smoke", own), out, Device(device), "resume", status)
         checkpoint.restore(run)
     assert run.model.gaussians.on_host is not None
@@ -236,7 +236,7 @@ def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(few_steps, out)
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])
-    with run_folder.opened(RunState.read(out), "restart", step=0) as status:
+    with run_folder.open_run_folder(RunState.read(out), "restart", step=0) as status:
         run = opening.open_run(checked, out, None, "restart", status)
         run.losses.append(OnHarmonics(weight=1.0))
         with pytest.raises(ConfigError, match="a penalty on sh_rest"):

@@ -57,7 +57,7 @@ def sky_run(yard, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "yard"
     asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
     run_pipeline(asked, RunState.read(out), None, "new")
-    assert RunState.read(out).is_whole(asked), "the same command finds it up to date"
+    assert RunState.read(out).is_complete(asked), "the same command finds it up to date"
     return out
 
 

@@ -16,7 +16,7 @@ from clsplat.formats.table import read as read_ply
 from clsplat.photos.sampling import Sampler
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
-from clsplat.runs.failures import failures_recorded
+from clsplat.runs.failures import recording_failures
 from clsplat.training import checkpoint
 from tests.support.onnx_writer import distance_network
 from tests.support.runs import FEW, ONE_CORE, digest, train
@@ -105,7 +105,7 @@ def test_interrupt_saves_and_resume_continues(few_steps, tiny_scene, tmp_path):
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 5
 
-    with pytest.raises(Interrupted, match="stopped at step 5"), failures_recorded(run.status):
+    with pytest.raises(Interrupted, match="stopped at step 5"), recording_failures(run.status):
         runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, *FEW, resume=True)

@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.progress import listening
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.runs.film import names
+from clsplat.runs.video import names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.render import Viewer
 from clsplat.viewer import page as module
@@ -47,7 +47,7 @@ def test_run_writes_a_viewer_and_its_report_links_to_it(run):
 
 
 def test_too_many_splats_for_smooth_display_get_advice(run, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("clsplat.runs.film.MANY_SPLATS", 10)
+    monkeypatch.setattr("clsplat.runs.video.MANY_SPLATS", 10)
     heard = []
     with listening(lambda *what, seconds_left: heard.append(what)):
         clsplat.view(run, out=tmp_path / "a.html")
@@ -217,7 +217,7 @@ def test_errors_are_one_line(run, tmp_path):
 def test_errors_of_the_function(run, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="one model or two, got 0"):
         clsplat.view()
-    with pytest.raises(ConfigError, match="--photographs: expected none, test or all, got 'some'"):
+    with pytest.raises(ConfigError, match="--photographs: expected none, test, or all, got 'some'"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
     for budget in (float("inf"), float("nan"), -1.0):
         with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):

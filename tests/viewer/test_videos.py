@@ -66,7 +66,7 @@ def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_pa
     )
     assert told["frames"] == 2
     assert f"the folder of its photographs, {tmp_path / 'gone'}, is missing" in caplog.text
-    with pytest.raises(DataError, match="is missing; give the folder of a scene"):
+    with pytest.raises(DataError, match="is missing; give the folder of the scene"):
         clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
 
 
@@ -212,7 +212,7 @@ def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path)
         ({"fps": float("nan")}, "expected frames a second"),
         ({"video": None, "side": "photograph"}, "--side needs --video"),
         ({"kind": "gif", "video": None}, "no kind 'gif'"),
-        ({"kind": "npy"}, "--format npy is for pictures"),
+        ({"kind": "npy"}, "--format npy is for images"),
         ({"side": "no.ply"}, "no.ply"),
     ],
 )

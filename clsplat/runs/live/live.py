@@ -1,4 +1,4 @@
-"""Run the live preview: the part of it in the training thread."""
+"""Run the live preview in the training thread: render requested images between steps, and pause the training."""
 
 import logging
 import secrets
@@ -11,28 +11,28 @@ import numpy as np
 from clsplat.core.errors import ClsplatError
 from clsplat.core.progress import Progress
 from clsplat.photos.photographs import BACKGROUNDS
-from clsplat.runs.live.preview import RESERVE, Curves, Desk, PageCamera, Pictures, Preview, ShownRun
-from clsplat.runs.live.server import LOOPBACK, Answers, Server, scene_data
+from clsplat.runs.live.preview import RESERVE, Curves, LiveState, Pictures, Preview, PreviewRequest, ShownRun
+from clsplat.runs.live.server import LOOPBACK, Handlers, Server, scene_data
 from clsplat.scene.scene import position_text
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
-LOOKING = 5.0  # s after its last request that a page counts as open; then the memory of previews is freed
-ABSENT = 120.0  # s without a request that end a pause; background pages ask once a minute
-FAREWELL = 1.5  # s that a finished run waits for the page to learn of its end
+OPEN_TIMEOUT = 5.0  # s without a request until a page counts as closed, and the memory of previews is freed
+PAUSE_TIMEOUT = 120.0  # s without a request until a pause ends; background tabs send one per minute
+FAREWELL = 1.5  # s that a finished run waits until the page has received its end
 TOKEN = 16  # bytes
 
 
 class Live:
-    """Serves a page while runs train, one after another.  As a context manager, it stops the server at the end."""
+    """Serves a page while runs train, one after another; a context manager that stops the server at its end."""
 
     def __init__(self, port: int = 0) -> None:
-        """port: on the loopback address; 0: the default one, or the next free one.  Raises ConfigError."""
-        self.desk = Desk()
+        """port: on the loopback address; 0: the first free default port.  Raises ConfigError if it is in use."""
+        self.state = LiveState()
         self._preview: Preview | None = None
-        self._server = Server(port, secrets.token_urlsafe(TOKEN), Answers(self.desk))
+        self._server = Server(port, secrets.token_urlsafe(TOKEN), Handlers(self.state))
 
     def __enter__(self) -> "Live":
         return self
@@ -46,21 +46,21 @@ class Live:
 
     @property
     def text(self) -> str:
-        """The address of the page, and how to reach it from another machine."""
+        """The address of the page, and the command for access from another machine."""
         port = self._server.port
         return (
             f"live preview: {self.address}\n"
-            f"  from another machine: `ssh -L {port}:{LOOPBACK}:{port} HOST`, then that address"
+            f"  from another machine: `ssh -L {port}:{LOOPBACK}:{port} HOST`, then open that address"
         )
 
     def close(self) -> None:
-        """Stop the server, once an open page knows how the run ended."""
-        desk = self.desk
-        desk.pause(False)
-        desk.ended = True
+        """Stop the server, after an open page has received the end of the run."""
+        state = self.state
+        state.pause(False)
+        state.ended = True
         try:
             end = time.monotonic() + FAREWELL
-            while desk.silent() < LOOKING and not desk.is_end_sent and time.monotonic() < end:
+            while state.idle_seconds() < OPEN_TIMEOUT and not state.is_end_sent and time.monotonic() < end:
                 self._leave()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
         finally:
@@ -68,8 +68,8 @@ class Live:
             self._leave()
 
     def follow(self, status: StatusFile) -> None:
-        """Show the state of a run that starts."""
-        self.desk.status = status
+        """Show the status of a run that is starting."""
+        self.state.status = status
 
     @contextmanager
     def showing(self, run: Run) -> Iterator[None]:
@@ -82,91 +82,90 @@ class Live:
             self._leave()
 
     def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """Return a function that shows a report as `show` does, and on the page."""
+        """Return a function that calls `show`, and shows the report on the page."""
 
-        def both(progress: Progress) -> None:
+        def show_both(progress: Progress) -> None:
             show(progress)
-            if shown := self.desk.shown:
+            if shown := self.state.shown:
                 shown.curves.add(progress)
 
-        return both
+        return show_both
 
     def _enter(self, run: Run) -> None:
-        desk, scene = self.desk, run.scene.downscaled(run.downscale)
-        number = desk.shown.number + 1 if desk.shown else 1
+        state, scene = self.state, run.scene.downscaled(run.downscale)
+        number = state.shown.number + 1 if state.shown else 1
         title, test = f"{run.name} · {run.scene_name}", scene.split("test")
         if scene.origin.any():
             title += f" · origin {position_text(scene.origin)}"
         points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
-        stand = Viewpoint.from_points(points, scene.views, (test or scene.views)[0])
-        data = scene_data(number, title, scene.views, {view.name for view in test}, stand)
+        viewpoint = Viewpoint.from_points(points, scene.views, (test or scene.views)[0])
+        data = scene_data(number, title, scene.views, {view.name for view in test}, viewpoint)
         photographs = run.photographs
         background = BACKGROUNDS[photographs.background_name]
-        pictures = Pictures(scene.views, background, photographs.undistorted, desk.budget)
-        desk.step, desk.fault = 0, ""
-        desk.shown = ShownRun(number, title, scene.views, data, pictures, Curves([]))
+        pictures = Pictures(scene.views, background, photographs.undistorted, state.budget)
+        state.step, state.error = 0, ""
+        state.shown = ShownRun(number, title, scene.views, data, pictures, Curves([]))
         self._preview = Preview(run)
         run.on_step = lambda: self._on_step(run)
-        desk.budget.skip()
+        state.budget.skip()
 
     def _leave(self) -> None:
-        """Release the run, as its model may be large."""
-        self.desk.step, self._preview = 0, None
-        while order := self.desk.orders.first():
-            self.desk.orders.deliver(order, None)
+        """Release the run, because its model may be large, and answer waiting requests without an image."""
+        self.state.step, self._preview = 0, None
+        while request := self.state.requests.first():
+            self.state.requests.deliver(request, None)
 
     def _on_step(self, run: Run) -> None:
         """Render requested previews, if there is time; wait while the page pauses the training."""
-        desk, preview = self.desk, self._preview
+        state, preview = self.state, self._preview
         if preview is None or not (run.has_model and run.is_consistent):
             return
-        desk.step = max(run.step, 1)
-        if desk.orders:
+        state.step = max(run.step, 1)
+        if state.requests:
             self._draw(run, preview)
-        elif desk.silent() > LOOKING:
+        elif state.idle_seconds() > OPEN_TIMEOUT:
             preview.release()
-        if desk.paused and not run.interrupted:
+        if state.paused and not run.interrupted:
             self._pause(run, preview)
 
-    def _draw(self, run: Run, preview: Preview, free: bool = False) -> None:
-        """Render the first request, if there is time for it.  free: the training is paused anyway."""
-        order = self.desk.orders.first()
-        if order is None:
+    def _draw(self, run: Run, preview: Preview, is_paused: bool = False) -> None:
+        """Render the first request, if the time budget allows it, or in any case while the training is paused."""
+        request = self.state.requests.first()
+        if request is None:
             return
-        kept = RESERVE if order.pace == "again" else 0.0
-        if not free and self.desk.budget.credit < preview.cost(order.pace) + kept:
+        reserve = RESERVE if request.pace == "again" else 0.0
+        if not is_paused and self.state.budget.credit < preview.cost(request.pace) + reserve:
             return
         started = time.perf_counter()
         run.device.finish()
-        if (
-            run.device.info.kind == "CPU"
-        ):  # on a CPU only the time of rendering is lost; on a GPU also the queue of the host
+        # on a GPU, the wait for its queue counts as well, because training stands still
+        if run.device.info.kind == "CPU":
             started = time.perf_counter()
-        self._deliver(order, preview)
-        if not free:
-            self.desk.budget.spend(time.perf_counter() - started)
+        self._deliver(request, preview)
+        if not is_paused:
+            self.state.budget.spend(time.perf_counter() - started)
 
-    def _deliver(self, order: PageCamera, preview: Preview) -> None:
+    def _deliver(self, request: PreviewRequest, preview: Preview) -> None:
         """Render a request; failures are shown on the page, and the training continues."""
         try:
-            self.desk.orders.deliver(order, preview.draw(order))
-            self.desk.fault = ""
+            self.state.requests.deliver(request, preview.draw(request))
+            self.state.error = ""
         except ClsplatError as error:
-            self.desk.orders.deliver(order, None)
-            self.desk.fault = str(error)
+            self.state.requests.deliver(request, None)
+            self.state.error = str(error)
 
     def _pause(self, run: Run, preview: Preview) -> None:
-        """Wait until the page resumes the training, nobody looks for a while, or the run should stop."""
-        desk = self.desk
+        """Wait until the page resumes the training, no page has been open for a while, or the run should stop."""
+        state = self.state
         LOG.info("paused at step %d from the live page", run.step)
         with run.status.stage("paused"):
-            while desk.paused and not run.interrupted:
-                if desk.silent() > ABSENT:
-                    LOG.info("no live page for %.0f s", ABSENT)
-                    desk.pause(False)
-                elif desk.orders:
-                    self._draw(run, preview, free=True)
+            while state.paused and not run.interrupted:
+                if state.idle_seconds() > PAUSE_TIMEOUT:
+                    LOG.info("no live page for %.0f s; resuming", PAUSE_TIMEOUT)
+                    state.pause(False)
+                elif state.requests:
+                    self._draw(run, preview, is_paused=True)
                 else:
-                    desk.orders.wait(0.2)
-        desk.budget.skip()
+                    state.requests.wait(0.2)
+        state.budget.skip()
         LOG.info("resumed" if not run.interrupted else "stopping")

@@ -1,4 +1,4 @@
-"""Render previews of the model in training, in separate memory; the run's state is only read."""
+"""Render previews of the model in training, in separate memory; the run is not changed."""
 
 import logging
 import os
@@ -27,7 +27,7 @@ from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.viewer.page import LARGEST, THUMBNAIL
 
-# Pictures that pages wait for, from a few at a time.
+# The queue of preview requests.
 
 MAX_WAITING = 4  # requests
 Pace = Literal["moving", "still", "again"]  # the camera moves; it just stopped; it stands still
@@ -35,15 +35,15 @@ Pace = Literal["moving", "still", "again"]  # the camera moves; it just stopped;
 
 @dataclass(frozen=True)
 class EncodedPicture:
-    """An encoded image, and the step that it shows."""
+    """An encoded image, and the training step that it shows."""
 
     jpeg: bytes
     step: int
 
 
 @dataclass(eq=False)
-class PageCamera:
-    """The camera of a page."""
+class PreviewRequest:
+    """A request of a page for a preview from its camera."""
 
     page: int  # identifies the page
     view: View
@@ -52,49 +52,49 @@ class PageCamera:
     picture: EncodedPicture | None = None
 
 
-class Orders:
-    """A short queue between the threads of the server and the training thread."""
+class RequestQueue:
+    """A short queue from the threads of the server to the training thread."""
 
     def __init__(self) -> None:
-        self._waiting: deque[PageCamera] = deque()
+        self._waiting: deque[PreviewRequest] = deque()
         self._changed = threading.Condition()
 
-    def ask(self, order: PageCamera, seconds: float) -> bool:
-        """Wait for the preview of an order, which replaces one that its page still waits for.
+    def wait_for(self, request: PreviewRequest, seconds: float) -> bool:
+        """Wait for a preview; the request replaces an earlier one of the same page.
 
-        Returns False where too many wait; the order has no picture when the time was too short.
+        Returns False if the queue is full.  After a timeout, the request has no picture.
         """
         with self._changed:
-            before = next((other for other in self._waiting if other.page == order.page), None)
-            if before is None and len(self._waiting) >= MAX_WAITING:
+            replaced = next((other for other in self._waiting if other.page == request.page), None)
+            if replaced is None and len(self._waiting) >= MAX_WAITING:
                 return False
-            if before is not None:
-                self._waiting.remove(before)
-                before.done.set()
-            self._waiting.append(order)
+            if replaced is not None:
+                self._waiting.remove(replaced)
+                replaced.done.set()
+            self._waiting.append(request)
             self._changed.notify_all()
-        order.done.wait(seconds)
-        self._drop(order)
+        request.done.wait(seconds)
+        self._drop(request)
         return True
 
-    def _drop(self, order: PageCamera) -> None:
+    def _drop(self, request: PreviewRequest) -> None:
         with self._changed:
-            if order in self._waiting:
-                self._waiting.remove(order)
+            if request in self._waiting:
+                self._waiting.remove(request)
 
-    def first(self) -> PageCamera | None:
-        """Return the order that has waited longest, those of moving cameras first."""
+    def first(self) -> PreviewRequest | None:
+        """Return the request that has waited longest, with moving cameras first; None if there is none."""
         with self._changed:
-            return min(self._waiting, key=lambda order: order.pace == "again", default=None)
+            return min(self._waiting, key=lambda request: request.pace == "again", default=None)
 
-    def deliver(self, order: PageCamera, picture: EncodedPicture | None) -> None:
-        """End the wait."""
-        self._drop(order)
-        order.picture = picture
-        order.done.set()
+    def deliver(self, request: PreviewRequest, picture: EncodedPicture | None) -> None:
+        """Give a waiting thread its picture; None if there is none."""
+        self._drop(request)
+        request.picture = picture
+        request.done.set()
 
     def wait(self, seconds: float) -> None:
-        """Wait until there is a request, or the pause ends."""
+        """Wait for a request, at most this many seconds, or until `wake` is called."""
         with self._changed:
             if not self._waiting:
                 self._changed.wait(seconds)
@@ -109,11 +109,11 @@ class Orders:
 
 LOG = logging.getLogger("clsplat")
 SIDES = (400, 280, 200, 140)  # px, the longer side
-AIMS: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview, which determine its size
-GUESS = 0.03  # s, before the first measurement
-QUALITY = 85  # of JPEG
+TARGET_TIMES: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview; determine its size
+GUESS = 0.03  # s per preview, before the first measurement
+QUALITY = 85  # of the JPEG
 MAX_PAIRS = 1 << 23  # in memory at a time, about 100 MB; frames with more are rendered in bands
-ROOM = 0.95  # fraction of the device's memory that may be used
+MAX_MEMORY = 0.95  # fraction of the device's memory that may be used
 
 
 class Preview:
@@ -128,24 +128,24 @@ class Preview:
         """Return the estimated time of the next preview, s."""
         return self._estimate(self._side(pace))
 
-    def draw(self, order: PageCamera) -> EncodedPicture:
-        """Render an order.  Raises MemoryLimitError if the device has no memory left next to the training."""
-        side, rasterizer = self._side(order.pace), self._opened()
+    def draw(self, request: PreviewRequest) -> EncodedPicture:
+        """Render a preview.  Raises MemoryLimitError if the training leaves no device memory."""
+        side, rasterizer = self._side(request.pace), self._open_rasterizer()
         started = time.perf_counter()
-        view = fitted(order.view, side)
+        view = downscaled_view(request.view, side)
         camera = upload_camera(self.run.device, view)
         image = render_view(self.run.painter(rasterizer), camera)
-        jpeg = encoded(image, QUALITY)
+        jpeg = encode_jpeg(image, QUALITY)
         self._costs[side] = time.perf_counter() - started
         return EncodedPicture(jpeg, self.run.step)
 
     def release(self) -> None:
-        """Free the memory."""
+        """Free the device memory of previews."""
         self._rasterizer = None
 
-    def _opened(self) -> Rasterizer:
+    def _open_rasterizer(self) -> Rasterizer:
         device, training = self.run.device, self.run.rasterizer
-        if device.allocated + training.workspace.nbytes > ROOM * device.info.memory:
+        if device.allocated + training.workspace.nbytes > MAX_MEMORY * device.info.memory:
             self.release()
             raise MemoryLimitError("the training leaves no device memory for previews")
         if self._rasterizer is None:
@@ -156,69 +156,69 @@ class Preview:
         return self._rasterizer
 
     def _side(self, pace: Pace) -> int:
-        """Return the largest size whose preview is fast enough."""
-        return next((side for side in SIDES if self._estimate(side) <= AIMS[pace]), SIDES[-1])
+        """Return the largest image side, px, whose preview is fast enough."""
+        return next((side for side in SIDES if self._estimate(side) <= TARGET_TIMES[pace]), SIDES[-1])
 
     def _estimate(self, side: int) -> float:
-        """Return the time of the last preview of a size, or an estimate from others by area."""
+        """Return the time of the last preview of a size, s, or an estimate from other sizes by area."""
         if side in self._costs:
             return self._costs[side]
-        return max((cost * min(1.0, (side / known) ** 2) for known, cost in self._costs.items()), default=GUESS)
+        return max((cost * min(1.0, (side / measured) ** 2) for measured, cost in self._costs.items()), default=GUESS)
 
 
-def fitted(view: View, side: int) -> View:
-    """Return a view of at most `side` px."""
+def downscaled_view(view: View, side: int) -> View:
+    """Return the view, downscaled to a longer side of at most `side` px."""
     camera = view.camera
     factor = max(camera.width, camera.height) / side
     return view if factor <= 1 else replace(view, camera=camera.downscaled(factor))
 
 
-# A share of the time, saved up to a limit.
+# A fraction of the time, saved up to a limit.
 
 
 class Credit:
-    """A budget that grows with time, for callers that may use a fraction `share` of the time."""
+    """A time budget that grows by a fraction of the elapsed time, up to a limit."""
 
-    def __init__(self, share: float, most: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """share: credit per second; most: largest credit, which limits bursts after a rest."""
-        self.share, self.most, self.spent = share, most, 0.0
+    def __init__(self, rate: float, limit: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """rate: credit per second; limit: maximum credit, which limits bursts after a pause."""
+        self.rate, self.limit, self.spent = rate, limit, 0.0
         self._clock, self._credit, self._at = clock, 0.0, clock()
         self._lock = threading.Lock()
 
     @property
     def credit(self) -> float:
-        """The time that may be spent now; negative after an expense larger than its estimate."""
+        """The time that may be spent now, s; negative after an overrun."""
         with self._lock:
-            return self._grown()
+            return self._update()
 
     def spend(self, amount: float) -> None:
-        """Subtract an expense from the credit."""
+        """Subtract a spent time, s, from the credit."""
         with self._lock:
-            self._credit = self._grown() - amount
+            self._credit = self._update() - amount
             self.spent += amount
 
     def skip(self) -> None:
-        """Give no credit for the time since the last call."""
+        """Add no credit for the time since the last update."""
         with self._lock:
             self._at = self._clock()
 
-    def _grown(self) -> float:
+    def _update(self) -> float:
         now = self._clock()
-        self._credit = min(self.most, self._credit + self.share * (now - self._at))
+        self._credit = min(self.limit, self._credit + self.rate * (now - self._at))
         self._at = now
         return self._credit
 
 
-# The photographs of a run as small files, read when a page asks for them; its browser keeps them.
+# The photos of a run as JPEG, read when a page requests them; the browser caches them.
 
 Kind = Literal["thumbnail", "photograph"]
 JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
 JPEG_QUALITY = 88
-PATIENCE = 20.0  # s that a page waits for its turn
+PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
 
 class Pictures:
-    """Reads one photo at a time.  Its CPU time counts as rendering time."""
+    """Reads photos, one at a time; their CPU time is charged to the budget of previews."""
 
     def __init__(
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
@@ -227,16 +227,16 @@ class Pictures:
         self._lock = threading.Lock()
 
     def get(self, kind: Kind, index: int) -> bytes | None:
-        """Return a JPEG; None if there is no time for it now.  Raises DataError if the photo cannot be read."""
-        if not self._lock.acquire(timeout=PATIENCE):
+        """Return a photo as JPEG; None if the budget does not allow it in time.  Raises DataError."""
+        if not self._lock.acquire(timeout=PHOTO_TIMEOUT):
             return None
         try:
-            return self._read(kind, index) if self._in_time() else None
+            return self._read(kind, index) if self._wait_for_credit() else None
         finally:
             self._lock.release()
 
-    def _in_time(self) -> bool:
-        end = time.monotonic() + PATIENCE
+    def _wait_for_credit(self) -> bool:
+        end = time.monotonic() + PHOTO_TIMEOUT
         while self._budget.credit <= 0:
             if time.monotonic() > end:
                 return False
@@ -246,25 +246,25 @@ class Pictures:
     def _read(self, kind: Kind, index: int) -> bytes:
         started = time.thread_time()
         pixels = load_photograph(self.views[index], self._background, self._undistorted)[:, :, :3]
-        data = encoded(shrink(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
+        data = encode_jpeg(shrink(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
         self._budget.spend((time.thread_time() - started) / (os.cpu_count() or 1))
         return data
 
 
-def encoded(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return an RGB image, [height, width, 3], as a JPEG."""
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Encode an RGB image, [height, width, 3], as JPEG."""
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()
 
 
-# What the reports of a run say, as points of curves.
+# The reports of a run, as points of curves.
 
-MAX_POINTS = 600  # of more, every second point is dropped
+MAX_POINTS = 600  # beyond this, every second point is dropped
 Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussians
 
 
 class Curves:
-    """The points of one run, in order of steps."""
+    """The loss, PSNR, and number of Gaussians of one run, in order of steps."""
 
     def __init__(self, points: list[Point]) -> None:
         self._points = points
@@ -283,49 +283,49 @@ class Curves:
             self._points = [*self._points[:-1:2], self._points[-1]]
 
 
-# What the thread that trains and the threads that answer share.
+# The state shared by the training thread and the threads of the server.
 
-SHARE = 0.025  # of the time, for previews; waiting for the device and answering cost about as much again
-SAVED = 1.0  # s of it that are saved for moving cameras
-RESERVE = 0.3  # s of those that previews of still cameras do not use
+RATE = 0.025  # fraction of the time for previews; waiting for the device and responding cost about as much again
+MAX_CREDIT = 1.0  # s, saved for moving cameras
+RESERVE = 0.3  # s of credit that repeated previews of still cameras leave
 
 
 @dataclass(frozen=True)
 class ShownRun:
-    """What a page shows of one run; each run of a matrix has another number."""
+    """The run that pages show; each run of a matrix has a new number."""
 
     number: int
     title: str
     views: tuple[View, ...]
-    scene: dict[str, Any]  # what live.js reads
+    scene: dict[str, Any]  # data for live.js
     pictures: Pictures
     curves: Curves
 
 
 @dataclass
-class Desk:
-    """The state of a live preview; each field has one writer, which replaces it as a whole."""
+class LiveState:
+    """The state of a live preview; each field has a single writer, which replaces it atomically."""
 
-    orders: Orders = field(default_factory=Orders)
-    budget: Credit = field(default_factory=lambda: Credit(SHARE, SAVED))
+    requests: RequestQueue = field(default_factory=RequestQueue)
+    budget: Credit = field(default_factory=lambda: Credit(RATE, MAX_CREDIT))
     status: StatusFile | None = None
     shown: ShownRun | None = None
-    step: int = 0  # of the model that can be rendered; 0: there is none
+    step: int = 0  # of the model that can be rendered; 0 if there is none
     paused: bool = False
     ended: bool = False
-    is_end_sent: bool = False  # whether a page knows that it ended
-    fault: str = ""  # why there are no previews
-    heard: float = float("-inf")  # time of the last request of a page
+    is_end_sent: bool = False  # whether a page has received the end
+    error: str = ""  # why there are no previews
+    last_request: float = float("-inf")  # s, monotonic clock
 
-    def hear(self) -> None:
+    def note_request(self) -> None:
         """Record a request of a page."""
-        self.heard = time.monotonic()
+        self.last_request = time.monotonic()
 
-    def silent(self) -> float:
-        """Return the time since the last request of a page, s."""
-        return time.monotonic() - self.heard
+    def idle_seconds(self) -> float:
+        """Return the time since the last request, s."""
+        return time.monotonic() - self.last_request
 
     def pause(self, paused: bool) -> None:
         """Pause or resume the training."""
         self.paused = paused
-        self.orders.wake()
+        self.requests.wake()

@@ -1,4 +1,4 @@
-"""Films of models: along a path, beside photographs or another model."""
+"""Render videos of models along a path, and write viewer pages."""
 
 import logging
 import math
@@ -26,13 +26,13 @@ from clsplat.runs.model_file import (
     KINDS,
     Loaded,
     ModelSource,
-    moves,
-    painter_of,
+    find_run,
+    is_moving,
+    make_painter,
     points_of,
     read,
     require_model,
-    run_of,
-    shown_of_run,
+    trained_file,
     write_pictures,
 )
 from clsplat.runs.state import has_pipeline
@@ -47,81 +47,81 @@ from clsplat.viewer.video.paths import Floats, nearest_view
 from clsplat.viewer.video.plan import Side, VideoPlan, VideoRequest, layer_files, plan_video, render_video
 
 LOG = logging.getLogger("clsplat")
-PHOTOGRAPH = "photograph"  # what --side may show, besides a model
+PHOTOGRAPH = "photograph"  # value of --side; any other value is a model
 
 
 @dataclass(frozen=True)
-class FilmTarget:
+class VideoTarget:
     """The output of a video: a file, or images in a folder."""
 
     video: Path | None
     out: Path = Path("renders")
-    kind: str = "png"
+    kind: str = "png"  # of the images, one of KINDS
 
 
 @dataclass(frozen=True)
-class Extras:
-    """What a film has beside its pictures."""
+class VideoExtras:
+    """What a video shows in addition to the color image."""
 
     side: str | None = None  # PHOTOGRAPH, or a model file or run folder
     layers: tuple[str, ...] = ("color",)
 
 
-def film(
+def make_video(
     model: Path,
     scene: Path | None,
-    place: FilmTarget,
+    target: VideoTarget,
     request: VideoRequest,
-    extras: Extras,
+    extras: VideoExtras,
     *,
     downscale: float | None = None,
     device: str | Device | None = None,
 ) -> dict[str, Any]:
-    """Film a model file or run folder; return `files`, `frames`, `fps`, `seconds`, `size`, and the time it `took`.
+    """Render a video of a model file or run folder along a path.
 
-    Raises ClsplatError.
+    Returns `files`, `frames`, `fps`, `seconds` of video, `size` in px, and the time it `took`, s.  Raises ClsplatError.
     """
-    begun = time.perf_counter()
-    videos = layer_files(place.video, extras.layers) if place.video else {}
-    if place.kind not in KINDS:
-        raise ConfigError(f"no kind '{place.kind}'; there are {', '.join(KINDS)}")
-    if videos and place.kind != KINDS[0]:
-        raise ConfigError(f"--format {place.kind} is for pictures; a video has 8 bits: leave --video out")
+    started = time.perf_counter()
+    videos = layer_files(target.video, extras.layers) if target.video else {}
+    if target.kind not in KINDS:
+        raise ConfigError(f"--format: expected {' or '.join(KINDS)}, got '{target.kind}'")
+    if videos and target.kind != KINDS[0]:
+        raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; leave --video out")
     if extras.side and not videos:
-        raise ConfigError("--side needs --video: pictures of a folder stand alone")
+        raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     loaded = _read(model)
-    found = _scene(model, scene, loaded, downscale, needed=not request.is_file or extras.side == PHOTOGRAPH)
-    origin = found.origin if found else loaded.origin
+    used_scene = _scene(model, scene, loaded, downscale, needed=not request.is_file or extras.side == PHOTOGRAPH)
+    origin = used_scene.origin if used_scene else loaded.origin
     loaded = loaded.with_origin(origin)
-    made = plan_video(request, found, points_of(loaded, found), moves=moves(loaded), origin=origin)
-    background = loaded.rendering.background or (found.background if found else "black")
-    opened = open_verified(device)
-    canvas = Canvas(painter_of(loaded, opened, background))
+    plan = plan_video(request, used_scene, points_of(loaded, used_scene), moves=is_moving(loaded), origin=origin)
+    background = loaded.rendering.background or (used_scene.background if used_scene else "black")
+    opened_device = open_verified(device)
+    canvas = Canvas(make_painter(loaded, opened_device, background))
     if not videos:
-        taken = [view.image_path for view in found.views] if found else []
-        written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
+        photo_files = [view.image_path for view in used_scene.views] if used_scene else []
+        files = write_pictures(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
     else:
-        side = _side(extras.side, made, found, background, opened, origin)
-        render_video(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
-        written = list(videos.values())
+        side = _side(extras.side, plan, used_scene, background, opened_device, origin)
+        render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))
+        files = list(videos.values())
     return {
-        "files": [str(path) for path in written],
-        "frames": len(made.views),
-        "fps": made.fps,
-        "seconds": made.seconds,
-        "size": list(made.size),
-        "took": time.perf_counter() - begun,
+        "files": [str(path) for path in files],
+        "frames": len(plan.views),
+        "fps": plan.fps,
+        "seconds": plan.seconds,
+        "size": list(plan.size),
+        "took": time.perf_counter() - started,
     }
 
 
 def _read(model: Path) -> Loaded:
-    """Read the model of a file or a run folder, which does not need its photos."""
-    file = shown_of_run(model) if has_pipeline(model) else model
+    """Read the model of a file or a run folder, without its photos."""
+    file = trained_file(model) if has_pipeline(model) else model
     return read(file if is_field(file) else model)
 
 
 def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
-    """Return the scene of a model at the image size of its run; None if it is neither known nor needed."""
+    """Return the scene of a model at the image size of its run; None if it is unknown and not needed."""
     if not needed and scene is None and not has_pipeline(model):
         return None
     try:
@@ -129,36 +129,36 @@ def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | N
     except DataError as error:
         if needed or scene is not None:
             raise
-        LOG.warning("%s; without it: the background and the size are those of the model and the path", error)
+        LOG.warning("%s; continuing without a scene, with the background of the model and the size of the path", error)
         return None
     return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
 def _side(
-    name: str | None, made: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
+    name: str | None, plan: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
-    """Return what is shown next to a frame: the photo with the nearest camera, or another model."""
+    """Return a function that makes the image next to a frame: the nearest photo, or a render of another model."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
         other = _read(Path(name)).with_origin(origin)
-        return Canvas(painter_of(other, device, other.rendering.background or background)).picture
+        return Canvas(make_painter(other, device, other.rendering.background or background)).picture
     assert scene is not None
-    taken, reach = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
-    if not taken:
+    photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
+    if not photo_views:
         raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photographs; name a model instead")
 
     @lru_cache(maxsize=4)
-    def photograph(place: int) -> Image:
-        return letterbox(load_photograph(taken[place], BACKGROUNDS[background])[:, :, :3], made.size)
+    def photograph(index: int) -> Image:
+        return letterbox(load_photograph(photo_views[index], BACKGROUNDS[background])[:, :, :3], plan.size)
 
     def side(view: View) -> Image:
-        return photograph(taken.index(nearest_view(view, taken, reach)))
+        return photograph(photo_views.index(nearest_view(view, photo_views, extent)))
 
     return side
 
 
-# One or two models on a page to walk through.
+# A viewer page with one or two models.
 
 MAX_MODELS = 2  # side by side
 MANY_SPLATS = 2_000_000  # a page with more is slow
@@ -173,9 +173,9 @@ def view(
     photograph_budget: float = BUDGET,
     splats: int | None = None,
 ) -> Path:
-    """Write a page that shows one model, or two side by side; return the page.  Raises ClsplatError.
+    """Write a viewer page that shows one model, or two side by side; return its path.  Raises ClsplatError.
 
-    scene: its views and photos are in the page; default: the scene of the first run folder among the models.
+    scene: the page includes its views and photos; default: the scene of the first run folder among the models.
     """
     if not 1 <= len(models) <= MAX_MODELS:
         raise ConfigError(f"view: expected one model or two, got {len(models)}")
@@ -186,54 +186,53 @@ def view(
     if splats is not None and splats < 1:
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):
-        raise ConfigError(f"--photographs: expected none, test or all, got '{photographs}'")
+        raise ConfigError(f"--photographs: expected none, test, or all, got '{photographs}'")
     if not 0 <= photograph_budget < math.inf:
         raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
     for path in models:
         require_model(path)
-    source = next((ModelSource.of(path, scene) for path in models if scene is not None or run_of(path)), None)
+    source = next((ModelSource.of(path, scene) for path in models if scene is not None or find_run(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
-    _tell_of_scenes(models, source)
-    called = names(models)
-    loaded = dict(zip(called, map(load, counted(models, "models read", len(models))), strict=True))
-    _advise(loaded, splats)
+    _warn_of_different_scenes(models, source)
+    loaded = dict(zip(names(models), map(load, counted(models, "models read", len(models))), strict=True))
+    _warn_of_size(loaded, splats)
     first = next(iter(loaded.values()))
-    found = source.scene(first).downscaled(source.settings.downscale) if source else None
-    background = first.rendering.background or (found.background if found else "black")
-    origin = found.origin if found else first.origin
+    used_scene = source.scene(first).downscaled(source.settings.downscale) if source else None
+    background = first.rendering.background or (used_scene.background if used_scene else "black")
+    origin = used_scene.origin if used_scene else first.origin
     loaded = {name: model.with_origin(origin) for name, model in loaded.items()}
 
-    def read(one: View) -> NDArray[np.uint8]:
-        return load_photograph(one, BACKGROUNDS[background])[:, :, :3]
+    def read_photo(view: View) -> NDArray[np.uint8]:
+        return load_photograph(view, BACKGROUNDS[background])[:, :, :3]
 
-    views = described(found, read, photographs, photograph_budget) if found else []
-    start = (found.split("test") or found.views)[0] if found else None
-    stand = Viewpoint.from_points(next(iter(loaded.values())).means, found.views if found else (), start)
+    views = described(used_scene, read_photo, photographs, photograph_budget) if used_scene else []
+    start = (used_scene.split("test") or used_scene.views)[0] if used_scene else None
+    viewpoint = Viewpoint.from_points(next(iter(loaded.values())).means, used_scene.views if used_scene else (), start)
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
-    if found is None:
+    if used_scene is None:
         LOG.info("without a scene, up is -y; add --scene if the model is upside down")
     packed = counted(loaded.items(), "models packed", len(loaded))
-    shown = {name: pack(model, splats) for name, model in packed}
-    Page(title, shown, stand, background, views, origin).write(out)
+    contents = {name: pack(model, splats) for name, model in packed}
+    Page(title, contents, viewpoint, background, views, origin).write(out)
     return out
 
 
-def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
-    """Warn about models with too many splats for a page, before packing them, which takes minutes."""
+def _warn_of_size(loaded: Mapping[str, Model], splats: int | None) -> None:
+    """Warn about models with too many splats for a page, before packing, which takes minutes."""
     for name, model in loaded.items():
         if min(len(model), splats or len(model)) > MANY_SPLATS:
             LOG.warning(
                 "%s: %s splats take long to pack, and browsers show only %s smoothly; --splats %d keeps the most "
-                "important",
+                "important ones",
                 *(name, f"{len(model):,}", f"{MANY_SPLATS:,}", MANY_SPLATS),
             )
 
 
-def _tell_of_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
-    """Warn if models are of different scenes, as the page has the cameras of one."""
+def _warn_of_different_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
+    """Warn if models are of different scenes, because the page has the cameras of only one."""
     scenes = {}
-    for name, run in zip(names(models), map(run_of, models), strict=True):
+    for name, run in zip(names(models), map(find_run, models), strict=True):
         with suppress(ConfigError):  # of a missing plug-in; the model can be shown without it
             if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
                 scenes[name] = Path(path).resolve()
@@ -243,7 +242,7 @@ def _tell_of_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
 
 
 def names(models: Sequence[Path]) -> list[str]:
-    """Return a name for each model: that of its folder or file, with more of the path to tell two apart."""
+    """Return a unique name for each model: that of its folder or file, with the parent folder if two are equal."""
     short = [path.resolve().name if path.is_dir() else path.stem for path in models]
     parents = [path.resolve().parent.name for path in models]
     if len(set(short)) < len(short):
