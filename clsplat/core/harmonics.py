@@ -1,9 +1,14 @@
 """Evaluate and rotate real spherical harmonics, as defined in cl_kernels/harmonics.h."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 DIRECTIONS = 64  # samples; more than the 7 functions of a band need, and, with their opposites, all products
+BAND_0 = 0.28209479177387814
+ROWS = 4096  # Gaussians at once, to limit temporary memory
+Floats = NDArray[np.float64]
 DIGITS = 6  # of means; further ones differ between processors
 
 
@@ -60,6 +65,21 @@ def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> N
         result[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
         first += size
     return result.reshape(count, 3 * coefficients)
+
+
+def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Floats]) -> Floats:
+    """Return the coefficients, [N, K, 3], whose colors are closest to `curve` of the colors over all directions.
+
+    Without bands above 0, they are exact.
+    """
+    half = _directions()
+    values = basis(np.concatenate([half, -half]))[:, : coefficients.shape[1] - 1]
+    values = np.concatenate([np.full((len(values), 1), BAND_0), values], axis=1)
+    fit, result = np.linalg.pinv(values), np.empty(coefficients.shape)
+    for first in range(0, len(coefficients), ROWS):
+        rows = slice(first, first + ROWS)
+        result[rows] = fit @ (curve(values @ coefficients[rows].astype(np.float64) + 0.5) - 0.5)
+    return result
 
 
 def _directions() -> NDArray[np.float64]:

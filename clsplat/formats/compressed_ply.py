@@ -18,7 +18,16 @@ from clsplat.core.errors import DataError
 from clsplat.core.reading import open_file
 from clsplat.formats.packing import from_smallest_three
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, parse_ply_header, render_mode, rendering_of
-from clsplat.formats.splats import MAX_DEGREE, SH_C0, SplatFile, logits, reorder_columns, require_size, sh_coefficients
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    SH_C0,
+    SplatFile,
+    logits,
+    reorder_columns,
+    require_memory,
+    require_size,
+    sh_coefficients,
+)
 
 CHUNK = 256  # splats
 BITS = (11, 10, 11)  # of x, y, and z
@@ -47,6 +56,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
             file.seek(section.start)
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
     chunks, vertices = _checked(path, header, tables)
+    require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
     per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
     color, alpha = _colors(vertices, chunks, per_splat)
     rest = _harmonics(path, tables.get("sh"), len(vertices))

@@ -1,4 +1,4 @@
-"""Read and write glTF with KHR_gaussian_splatting in its binary container; write OpenUSD as text.
+"""Read and write glTF with KHR_gaussian_splatting, as .glb or, only read, as .gltf; write OpenUSD as text.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
@@ -7,21 +7,26 @@ Axes of glTF are x right, y up, z back.  The Gaussians are converted instead of 
 does not say whether viewers rotate SH with a node.
 """
 
+import base64
 import json
 import logging
 import struct
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, one_line, quote
+from clsplat.core.files import is_inside
+from clsplat.core.harmonics import map_colors
 from clsplat.core.quaternions import rotation_matrix
-from clsplat.core.reading import read_file
+from clsplat.core.reading import read_file, read_json
 from clsplat.formats.packing import Output, open_hashed
 from clsplat.formats.ply import check_rendering
 from clsplat.formats.splats import (
+    FLIP,
     MAX_DEGREE,
     MAX_FILE,
     SH_C0,
@@ -29,12 +34,17 @@ from clsplat.formats.splats import (
     SplatFile,
     Writing,
     flip_axes,
-    logits,
-    logs,
     opacities,
+    opacities_to_logits,
     require_gaussians,
+    require_memory,
+    scales_to_logs,
+    sh_degree_of,
+    transform,
     unit,
+    with_degree,
 )
+from clsplat.formats.spz import ALIKE, RATIO, decode_spz
 
 # The parts of glTF with Gaussians: primitives, the transforms of their nodes, and accessors.
 
@@ -44,75 +54,184 @@ PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SHARED = 8  # times that a byte may be read on average, because equal columns may share an accessor
-FLIP = np.diag([1.0, -1, -1, 1])  # converts between the axes of glTF and of a PLY
+SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
+FLIP_4 = np.diag([*FLIP, 1.0])  # converts between the axes of glTF and of a PLY
+LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
+MAX_TYPE = 200  # characters of a data URI before its data
+MAX_TEXT = 1 << 29  # bytes of a .gltf
 
 
 class Gltf:
-    """The Gaussian primitives of a file, which must share one transform.
+    """The Gaussian primitives of a file.
 
-    Raises DataError if there are none or their transforms differ; a damaged tree raises Python's own errors.
+    Raises DataError if there are none; a damaged tree raises Python's own errors.
     """
 
-    def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
+    def __init__(self, path: Path, tree: dict[str, Any], binary: bytes | None) -> None:
         self.path, self.tree, self.binary = path, tree, binary
-        self.left = SHARED * len(binary)  # bytes that may still be read
-        self.primitives: list[dict[str, Any]] = []
-        self.placement: NDArray[np.float64] | None = None  # [4, 4], in the axes of a PLY
-        placements = []
-        for mesh, matrix in self._meshes():
-            for primitive in tree["meshes"][mesh]["primitives"]:
-                extension = primitive.get("extensions", {}).get(EXTENSION)
-                if extension is not None:
-                    self._check(extension)
-                    self.primitives.append(primitive)
-                    placements.append(matrix)
+        self.left = self.unpacked = 0  # bytes that may still be read, and bytes of unpacked SPZ data
+        self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
+        self.notes: set[str] = set()  # about the file, for the user
+        primitives = [
+            (primitive, matrix) for mesh, matrix in self._meshes() for primitive in tree["meshes"][mesh]["primitives"]
+        ]
+        self.primitives = [pair for pair in primitives if EXTENSION in (own := _extensions(pair[0])) or _spz_view(own)]
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
-        if any(not np.allclose(matrix, placements[0], rtol=1e-7) for matrix in placements):
-            raise DataError(f"{path}: its Gaussians have different transforms; export them separately and merge them")
-        if not np.allclose(placements[0], np.eye(4)):
-            self.placement = FLIP @ placements[0] @ FLIP
+        placement = FLIP_4 @ self.primitives[0][1] @ FLIP_4
+        self.placement = None if np.allclose(placement, np.eye(4)) else placement  # [4, 4], in the axes of a PLY
+
+    def parameters(self) -> Parameters:
+        """Return all Gaussians in the axes of a PLY, before the transform `placement`."""
+        parts = [self._placed(primitive, matrix) for primitive, matrix in self.primitives]
+        degree = max(sh_degree_of(part["sh_rest"].shape[1]) for part in parts)
+        parts = [with_degree(part, degree) for part in parts]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _placed(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
+        """Return the Gaussians of a primitive where its transform, relative to the first one, puts them."""
+        part, first = flip_axes(self._part(primitive)), self.primitives[0][1]
+        if np.allclose(matrix, first, rtol=1e-7):
+            return part
+        relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
+        scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
+        try:
+            moved = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
+        except ValueError as error:
+            raise DataError(f"{self.path}: the transform of a node is not supported: {error}") from error
+        return part | {name: table.astype(np.float32) for name, table in moved.items()}
+
+    def _part(self, primitive: dict[str, Any]) -> Parameters:
+        """Return the Gaussians of one primitive, in the axes of glTF."""
+        extensions = _extensions(primitive)
+        extension, names = extensions.get(EXTENSION, {}), primitive["attributes"]
+        kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", SRGB)
+        if kernel != "ellipse":
+            raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
+        if (view := _spz_view(extensions)) is not None:
+            part = self._spz(view, names)
+        elif compressed := [name for name in extension.get("extensions", {}) if "compression" in name]:
+            raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
+        else:
+            part = self._attributes(names)
+        if space == LINEAR:
+            self.notes.add("its colors are linear: they are converted to sRGB, exactly where they have no harmonics")
+            bands = np.concatenate([part["sh_base"], part["sh_rest"]], axis=1)
+            bands = map_colors(bands.reshape(len(bands), -1, 3), _to_srgb).reshape(bands.shape).astype(np.float32)
+            part |= {"sh_base": bands[:, :3], "sh_rest": bands[:, 3:]}
+        elif space != SRGB:
+            self.notes.add(f"its colors are {quote(space)}; they are used unchanged")
+        return part
+
+    def _spz(self, view: Any, names: dict[str, Any]) -> Parameters:
+        """Return the Gaussians of an SPZ file in a view, in the axes of glTF.
+
+        They are to be unpacked to x left, y up, z front; some programs keep the axes of SPZ, which the bounds show.
+        """
+        data, start, length, _ = self._view(view)
+        splats, _ = decode_spz(self.path, data[start : start + length])
+        self.unpacked += sum(table.nbytes for table in splats.parameters.values())
+        if self.unpacked > 4 * max(RATIO * sum(map(len, self.files.values())), ALIKE):  # as much as a single SPZ
+            raise DataError(f"{self.path}: its SPZ data unpack to {self.unpacked} bytes; export it again")
+        part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
+        position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
+        if len(splats) and {"min", "max"} <= position.keys():
+            ends = [part["means"].min(axis=0), part["means"].max(axis=0)]
+            declared = np.array([position["min"], position["max"]], np.float64)
+            axes.sort(key=lambda signs: float(np.abs(np.sort(ends * np.array(signs), axis=0) - declared).sum()))
+        return flip_axes(part, axes[0])
+
+    def _attributes(self, names: dict[str, Any]) -> Parameters:
+        """Return the Gaussians of the attributes of a primitive, in the axes of glTF."""
+
+        def table(name: str, width: int) -> NDArray[np.float32]:
+            if name not in names:
+                raise DataError(f"{self.path}: its Gaussians have no attribute {name}; export the file again")
+            return self.accessor(names[name], width)
+
+        degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in names), default=0)
+        orders = [(d, m) for d in range(degree + 1) for m in range(2 * d + 1)]
+        bands = [table(f"{PREFIX}SH_DEGREE_{d}_COEF_{m}", 3) for d, m in orders]
+        means = table("POSITION", 3)
+        parameters = {
+            "means": means,
+            "quats": np.roll(table(f"{PREFIX}ROTATION", 4), 1, axis=1),
+            "log_scales": scales_to_logs(table(f"{PREFIX}SCALE", 3), self.notes),
+            "logit_opacity": opacities_to_logits(table(f"{PREFIX}OPACITY", 1), self.notes),
+            "sh_base": bands[0],
+            "sh_rest": np.concatenate(bands[1:], axis=1) if degree else np.zeros((len(means), 0), np.float32),
+        }
+        if len({len(one) for one in parameters.values()}) > 1:
+            raise DataError(f"{self.path}: the attributes of its Gaussians have different counts; export it again")
+        return parameters
 
     def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
         """Return the rows of an accessor, [count, width]; normalized integers are scaled to [-1, 1]."""
         one = self.tree["accessors"][_index(number)]
         kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
-        view = self.tree["bufferViews"][_index(one["bufferView"])]
-        buffer = self.tree["buffers"][_index(view["buffer"])]
-        if WIDTHS.get(one["type"]) != width or "sparse" in one or view["buffer"] or "uri" in buffer:
+        if WIDTHS.get(one["type"]) != width or "sparse" in one or "bufferView" not in one:
             raise DataError(
-                f"{self.path}: accessor {number} is a {quote(one['type'])} or outside of the file; expected {width} "
-                "numbers per row in the file itself; export it again"
+                f"{self.path}: accessor {number} is a {quote(one['type'])}, sparse, or without data; expected {width} "
+                "numbers per row in a buffer; export it again without compression"
             )
+        data, offset, length, stride = self._view(one["bufferView"])
         size = width * np.dtype(kind).itemsize
-        stride = _index(view.get("byteStride", size))
-        length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
+        stride = size if stride is None else stride
         if stride < size:
             raise DataError(
                 f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected at least {size}; "
                 "export it again"
             )
-        held = min(_index(buffer["byteLength"]), len(self.binary))
-        if offset + length > held or start + stride * max(count - 1, 0) + size * min(count, 1) > length:
+        if start + stride * max(count - 1, 0) + size * min(count, 1) > length:
             raise DataError(
-                f"{self.path}: accessor {number} has {count} rows, more than fit into its view of {length} bytes at "
-                f"{offset}, or into the file, whose buffer has {held} bytes; copy or export it again"
+                f"{self.path}: accessor {number} has {count} rows, more than fit into its view of {length} bytes; "
+                "copy or export it again"
             )
-        start += offset
         self.left -= count * size
         if self.left < 0:
             raise DataError(f"{self.path}: its accessors share too much data; export it again")
-        rows = np.ndarray((count, width), kind, self.binary, start, (stride, np.dtype(kind).itemsize))
+        require_memory(self.path, count, 0)
+        rows = np.ndarray((count, width), kind, data, start + offset, (stride, np.dtype(kind).itemsize))
         if not one.get("normalized") or kind == "<f4":
             return rows.astype(np.float32)
         return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
 
-    def _check(self, extension: dict[str, Any]) -> None:
-        kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
-        if kernel != "ellipse":
-            raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
-        if space != "srgb_rec709_display":
-            LOG.warning("%s: its colors are %s; they are used unchanged", self.path, quote(space))
+    def _view(self, number: Any) -> tuple[bytes, int, int, int | None]:
+        """Return the data of a buffer, and offset, length, and stride of a view in it."""
+        view = self.tree["bufferViews"][_index(number)]
+        if compressed := [name for name in view.get("extensions", {}) if "compression" in name]:
+            raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
+        buffer = self.tree["buffers"][_index(view["buffer"])]
+        data = self._content(buffer.get("uri"), view["buffer"])
+        length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
+        held = min(_index(buffer["byteLength"]), len(data))
+        if offset + length > held:
+            raise DataError(
+                f"{self.path}: view {number} has {length} bytes at {offset}, more than its buffer of {held} bytes; "
+                "copy or export it again"
+            )
+        return data, offset, length, _index(view["byteStride"]) if "byteStride" in view else None
+
+    def _content(self, uri: Any, number: int) -> bytes:
+        """Return the bytes of a buffer: of the GLB itself, of a data URI, or of a file in the same folder."""
+        if uri in self.files:
+            return self.files[uri]
+        if uri is None:
+            data = self.binary if number == 0 else None
+        elif uri.startswith("data:"):
+            data = base64.b64decode(uri.partition(",")[2]) if ";base64," in uri[:MAX_TYPE] else None
+        else:
+            data = None
+            if is_inside(name := unquote(uri)):
+                data = read_file(self.path.parent / name, f"a buffer of {self.path.name}", limit=MAX_FILE)
+        if data is None:
+            raise DataError(
+                f"{self.path}: buffer {number} is {quote(uri)}; expected data in the file, or a file in its folder; "
+                "export it again"
+            )
+        self.files[uri] = data
+        self.left += SHARED * len(data)
+        return data
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the meshes of the scene, each with the matrix of its node."""
@@ -160,6 +279,23 @@ class Gltf:
         return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
 
 
+def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:
+    """Return the extensions of a primitive, and those of KHR_gaussian_splatting."""
+    extensions: dict[str, Any] = primitive.get("extensions", {})
+    return {**extensions, **extensions.get(EXTENSION, {}).get("extensions", {})}
+
+
+def _spz_view(extensions: dict[str, Any]) -> Any:
+    """Return the view that holds an SPZ file, as several drafts name it, or None."""
+    return next((one["bufferView"] for name, one in extensions.items() if "spz" in name), None)
+
+
+def _to_srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sRGB values of linear colors, IEC 61966-2-1; those below 0 become 0, as they are shown."""
+    color = np.maximum(linear, 0)
+    return np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
+
+
 def _index(value: Any) -> int:
     """Check an index, size, or offset.  Raises ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
@@ -175,23 +311,38 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 MAX_JSON = 1 << 26  # bytes
 
 
-def read_glb(path: Path) -> SplatFile:
-    """Read the Gaussians of a .glb file.  Raises DataError if it is missing, damaged, or has none."""
-    data = read_file(path, "a .glb file", limit=MAX_FILE)
-    text, binary = _chunks(path, data)
+def looks_like_gltf(data: bytes) -> bool:
+    """Return whether the first bytes are those of a .glb, or of a .gltf with Gaussians."""
+    return data.startswith(MAGIC) or (data.lstrip()[:1] == b"{" and EXTENSION.encode() in data)
+
+
+def gltf_files(path: Path) -> list[Path]:
+    """Return a .gltf and the existing files of its buffers; only itself if it is damaged."""
+    try:
+        uris = [buffer["uri"] for buffer in read_json(path)["buffers"]]
+        return [path, *(path.parent / unquote(uri) for uri in uris if is_inside(uri) and not uri.startswith("data:"))]
+    except (DataError, KeyError, TypeError, AttributeError):
+        return [path]
+
+
+def read_gltf(path: Path) -> SplatFile:
+    """Read the Gaussians of a .glb or .gltf file.  Raises DataError if it is missing, damaged, or has none."""
+    data = read_file(path, "a .glb or .gltf file", limit=MAX_FILE)
+    is_text = not data.startswith(MAGIC) and (path.suffix.lower() == ".gltf" or data.lstrip()[:1] == b"{")
+    text, binary = (data, None) if is_text else _chunks(path, data)
+    if is_text and len(data) > MAX_TEXT:
+        raise DataError(f"{path}: has {len(data)} bytes; expected at most {MAX_TEXT}; export it as .glb")
     try:
         tree = json.loads(text)
         found = Gltf(path, tree, binary)
-        parts = [_parameters(path, found, primitive) for primitive in found.primitives]
-        degrees = {part["sh_rest"].shape[1] for part in parts}
+        parameters = found.parameters()
         extras = tree.get("asset", {}).get("extras")
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise DataError(
             f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
         ) from error
-    if len(degrees) > 1:
-        raise DataError(f"{path}: its parts have different SH degrees; export them separately")
-    parameters = flip_axes({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    for note in sorted(found.notes):
+        LOG.warning("%s: %s", path, note)
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
     rendering, placement = check_rendering(path, ours) if isinstance(ours, dict) else {}, found.placement
     if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
@@ -222,7 +373,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(attributes)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SRGB}},
     }
     asset: dict[str, Any] = {"version": "2.0", "generator": "clsplat"}
     if splats.rendering:
@@ -253,7 +404,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
 def _origin(splats: SplatFile) -> list[float] | None:
     """Return the origin of a model in the axes of glTF; None if it has none."""
     origin: list[float] | None = splats.rendering.get("origin")
-    return origin and (np.diag(FLIP)[:3] * origin).tolist()
+    return origin and (np.array(FLIP) * origin).tolist()
 
 
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
@@ -301,32 +452,6 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
             f"{path}: its JSON has {len(text)} bytes; expected at most {MAX_JSON}; export it with fewer primitives"
         )
     return text, chunks.get(BINARY, b"")
-
-
-def _parameters(path: Path, found: Gltf, primitive: dict[str, Any]) -> Parameters:
-    """Return the Gaussians of one primitive, in the axes of glTF."""
-    names = primitive["attributes"]
-
-    def table(name: str, width: int) -> NDArray[np.float32]:
-        if name not in names:
-            raise DataError(f"{path}: its Gaussians have no attribute {name}; export the file again")
-        return found.accessor(names[name], width)
-
-    degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in names), default=0)
-    orders = [(d, m) for d in range(degree + 1) for m in range(2 * d + 1)]
-    bands = [table(f"{PREFIX}SH_DEGREE_{d}_COEF_{m}", 3) for d, m in orders]
-    means, scale = table("POSITION", 3), table(f"{PREFIX}SCALE", 3)
-    parameters = {
-        "means": means,
-        "quats": np.roll(table(f"{PREFIX}ROTATION", 4), 1, axis=1),
-        "log_scales": logs(np.abs(scale)),
-        "logit_opacity": logits(table(f"{PREFIX}OPACITY", 1)),
-        "sh_base": bands[0],
-        "sh_rest": np.concatenate(bands[1:], axis=1) if degree else np.zeros((len(means), 0), np.float32),
-    }
-    if len({len(one) for one in parameters.values()}) > 1:
-        raise DataError(f"{path}: the attributes of its Gaussians have different counts; export the file again")
-    return parameters
 
 
 # OpenUSD as text: a prim ParticleField3DGaussianSplat (UsdVol 26.03 and later), write only.

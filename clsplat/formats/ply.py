@@ -9,6 +9,7 @@ Comments contain the numbers for rendering, and the mode for viewers: `SplatRend
 opacities to conserve energy, else `default`.
 """
 
+import io
 import json
 import os
 import re
@@ -28,13 +29,16 @@ from clsplat.formats.splats import (
     MAX_DEGREE,
     MOTION,
     PARAMETERS,
+    STORED_DEGREE,
     Parameters,
     SplatFile,
     find_motion_columns,
     motion_columns,
     reorder_columns,
+    require_memory,
     require_size,
     sh_coefficients,
+    warn_dropped,
 )
 
 # The header of a PLY file: comments, and position and properties of its vertices.
@@ -124,6 +128,31 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
     return _vertices(path, form, tuple(comments), elements, end.end())
 
 
+def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
+    """Return the vertices of an ascii file, one per line, as a structured array, [count].  Raises DataError."""
+    body = io.BytesIO(data[header.start :])
+    for _ in range(header.lines_before):
+        if not body.readline():
+            break
+    # Each number needs a digit and a space, but the last space may be missing.
+    size = header.start + body.tell() + 2 * len(header.dtype.names or ()) * header.count
+    require_size(path, len(data) + 1, size, f"{header.count} vertices")
+    if header.count == 0:
+        return np.empty(0, header.dtype)
+    try:
+        table = np.loadtxt(body, header.dtype, comments=None, max_rows=header.count, ndmin=1)
+    except (ValueError, OverflowError) as error:
+        raise DataError(
+            f"{path}: {shorten(str(error), 200)} after the header; expected one number for each property"
+        ) from error
+    if len(table) < header.count:
+        raise DataError(
+            f"{path}: expected {header.count} lines with vertices, found {len(table)}; the file is truncated: "
+            "copy or export it again"
+        )
+    return table
+
+
 def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
     """Return the header of a binary little-endian file.
 
@@ -197,12 +226,16 @@ def read_ply(path: Path) -> SplatFile:
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
-        if header.format == "ascii":
-            raise DataError(f"{path}: is an ascii PLY; export it as binary")
+        warn_dropped(path, _degree(path, header.dtype.names or ()))
         rendering, size = rendering_of(path, header), header.count * header.dtype.itemsize
-        require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
-        file.seek(header.start)
-        parameters = _read(path, file, header)
+        if header.format == "ascii":
+            file.seek(0)
+            parameters = _parameters(path, read_ascii(path, file.read(), header))
+        else:
+            require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
+            require_memory(path, header.count, _degree(path, header.dtype.names or ()))
+            file.seek(header.start)
+            parameters = _read(path, file, header)
     return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else render_mode(header))
 
 
@@ -303,6 +336,17 @@ def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
     return tables
 
 
+def _degree(path: Path, names: Sequence[str]) -> int:
+    """Return the SH degree from the property names.  Raises DataError."""
+    rest = sum(name.startswith("f_rest_") for name in names)
+    degree = next((d for d in range(STORED_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
+    if degree is None or not {f"f_rest_{i}" for i in range(rest)} <= set(names):
+        raise DataError(
+            f"{path}: has {rest} f_rest properties; expected 0, 9, 24, 45, or 72, numbered from 0; export it again"
+        )
+    return degree
+
+
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
     columns_of = dict(_COLUMNS)
@@ -314,20 +358,14 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
             "to train from a point cloud, use `clsplat run`"
         )
-    rest = sum(name.startswith("f_rest_") for name in names)
-    degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
-    columns = tuple(f"f_rest_{i}" for i in range(rest))
-    if degree is None or not set(columns) <= set(names):
-        raise DataError(
-            f"{path}: has {rest} f_rest properties; expected 0, 9, 24, or 45, numbered from 0; export it again"
-        )
+    columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_degree(path, names)) - 1)))
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
         wide = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), wide, parameters["means"])
     by_channel = _columns(vertices, columns)
-    per_channel = sh_coefficients(degree) - 1
-    parameters["sh_rest"] = reorder_columns(by_channel, 3, per_channel)
+    most = 3 * (sh_coefficients(MAX_DEGREE) - 1)
+    parameters["sh_rest"] = np.ascontiguousarray(reorder_columns(by_channel, 3, len(columns) // 3)[:, :most])
     if parameters["log_scales"].shape[1] == 2:
         parameters["log_scales"] = np.pad(parameters["log_scales"], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
     parameters = {name: parameters[name] for name in PARAMETERS}

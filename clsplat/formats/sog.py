@@ -51,6 +51,7 @@ from clsplat.formats.splats import (
     opacities,
     require_gaussians,
     require_in_range,
+    require_memory,
     sh_coefficients,
     unit,
 )
@@ -103,7 +104,8 @@ class Files:
         return self.contents[name]
 
     def _sibling(self, name: str) -> bytes:
-        return read_file(self.path.with_name(name), "a file of a SOG", limit=MAX_META if name == META else MAX_IMAGE)
+        path = self.path if name == META else self.path.with_name(name)
+        return read_file(path, "a file of a SOG", limit=MAX_META if name == META else MAX_IMAGE)
 
     def _member(self, archive: zipfile.ZipFile, name: str) -> bytes:
         info = next((info for info in archive.infolist() if info.filename.rpartition("/")[2] == name), None)
@@ -124,7 +126,7 @@ class Files:
 @contextmanager
 def sog_files(path: Path) -> Iterator[Files]:
     """Open the files of a folder or of a ZIP.  Raises DataError."""
-    if path.name == META:
+    if path.suffix.lower() == ".json":
         yield Files(path)
         return
     data = read_file(path, "a .sog file", limit=MAX_FILE)
@@ -135,7 +137,8 @@ def sog_files(path: Path) -> Iterator[Files]:
         raise DataError(f"{path}: a damaged ZIP ({quote(error)}); copy or export the file again") from error
 
 
-PIXELS_PER_BYTE = 16  # of all images; real files have less than one
+PIXELS_PER_BYTE = 2  # of all images; real files have less than one
+ALIKE = 1 << 19  # splats that any file may have: 0.1 GB in memory
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
@@ -170,10 +173,11 @@ class _Sog:
             raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
         self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
-        if self.count > SLACK + PIXELS_PER_BYTE * files.size:
+        if self.count > ALIKE + PIXELS_PER_BYTE * files.size:
             raise DataError(
                 f"{path}: declares {self.count} splats, but its files have only {files.size} bytes; copy it again"
             )
+        require_memory(path, self.count, MAX_DEGREE if "shN" in meta else 0)
 
     def splats(self) -> SplatFile:
         """Decode all parameters."""

@@ -28,7 +28,9 @@ from clsplat.formats.splats import (
     logs,
     opacities,
     require_gaussians,
+    require_memory,
     require_size,
+    scales_to_logs,
     sh_coefficients,
     unit,
 )
@@ -57,17 +59,21 @@ def read_splat(path: Path) -> SplatFile:
     if len(data) % ROW.itemsize:
         raise DataError(f"{path}: has {len(data)} bytes, not a multiple of 32; expected {EXPECTED}; copy it again")
     rows = np.frombuffer(data, ROW)
-    if (rows["scale"] < 0).any():
-        raise DataError(f"{path}: has scales below 0; expected {EXPECTED}; it may be of another format")
+    require_memory(path, len(rows), 0)
+    notes: set[str] = set()
     color = rows["color"] / 255.0
     parameters: Parameters = {
         "means": rows["position"].astype(np.float32),
         "quats": unit(rows["rotation"] / 128.0 - 1).astype(np.float32),
-        "log_scales": logs(rows["scale"]),
+        "log_scales": scales_to_logs(rows["scale"], notes),
         "logit_opacity": logits(color[:, 3:]),
         "sh_base": ((color[:, :3] - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": np.zeros((len(rows), 0), np.float32),
     }
+    if (rows["scale"] < 0).any() and not notes:
+        raise DataError(f"{path}: has scales below 0; expected {EXPECTED}; it may be of another format")
+    for note in notes:
+        LOG.warning("%s: %s", path, note)
     return SplatFile(parameters)
 
 
@@ -100,6 +106,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
 HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
 SH_ENDS = (-1.5, 1.5)
+EMPTY = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 0}  # columns
 RANGE = 32767
 KINDS = (
     ("<f4", "<f4", "<f4"),
@@ -151,16 +158,19 @@ def looks_like_ksplat(data: bytes, size: int) -> bool:
         return False
     most, sections, _, splats = struct.unpack_from("<4I", data, 4)
     (level,) = struct.unpack_from("<H", data, 20)
-    return bool(1 <= sections <= most <= size // SECTION and level < len(KINDS) and splats <= size // 24)
+    return bool(sections <= most <= size // SECTION and level < len(KINDS) and 0 < splats <= size // 24)
 
 
 def read_ksplat(path: Path) -> SplatFile:
     """Read a `.ksplat` file.  Raises DataError if it is missing or damaged."""
     data = read_file(path, "a .ksplat file", limit=MAX_FILE)
-    if not looks_like_ksplat(data, len(data)):
+    most, sections, _, splats, level = struct.unpack_from("<4IH", data.ljust(HEADER, b"\xff"), 4)
+    is_empty = len(data) >= HEADER and data[0] == 0 and not sections and not splats
+    if not is_empty and not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
-    most, sections = struct.unpack_from("<2I", data, 4)
-    (level,) = struct.unpack_from("<H", data, 20)
+    if is_empty:
+        return SplatFile({name: np.zeros((0, width), np.float32) for name, width in EMPTY.items()})
+    sections = sections or most  # the number of those loaded so far, which some writers leave at 0
     ends = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * most
     require_size(path, len(data), start, f"{most} sections")
@@ -170,6 +180,7 @@ def read_ksplat(path: Path) -> SplatFile:
         _check(path, section, number)
         sizes = section.sizes(level)
         require_size(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
+        require_memory(path, section.count, section.degree)
         parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_ENDS))
         start += sum(sizes)
     width = max(part["sh_rest"].shape[1] for part in parts)

@@ -10,7 +10,7 @@ Axes are those of a 3DGS PLY: x right, y down, z forward.
 
 import logging
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError
+from clsplat.core.errors import DataError, MemoryLimitError
+from clsplat.core.harmonics import rotate_sh
+from clsplat.core.machine import available_memory
+from clsplat.core.quaternions import multiply, unit_quaternions
 
 # The columns of the table `motion` and their names in a PLY.
 
@@ -77,6 +80,7 @@ def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+STORED_DEGREE = 4  # of some formats; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
 NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: near plane and screen filter of 3DGS
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
@@ -84,10 +88,13 @@ MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
+MOST = 0.5  # share of values outside of their range that shows another unit
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
-FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # signs of bands 1 to 3 when y and z change sign
+# axes in which the functions of bands 1 to 3 are odd
+PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
 Quality = Literal["small", "balanced", "high"]  # precision of SPZ and SOG
 Parameters = dict[str, NDArray[np.float32]]  # by the names in PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
@@ -188,22 +195,43 @@ def unit(quats: Floats) -> NDArray[np.float64]:
         return np.where(length > 0, wide / length, [1.0, 0, 0, 0])
 
 
-def flip_axes(parameters: Parameters) -> Parameters:
-    """Return the parameters with y and z reversed: between down and forward, and up and back."""
-    signs = _signs(parameters)
+def flip_axes(parameters: Parameters, axes: Sequence[float] = FLIP) -> Parameters:
+    """Return the parameters with each axis multiplied by 1 or -1."""
+    signs = _signs(parameters, axes)
     return {name: table * signs[name] if name in signs else table for name, table in parameters.items()}
 
 
-def flip_axes_in_place(parameters: Parameters) -> None:
-    """Reverse y and z as `flip_axes` does, in place."""
-    for name, signs in _signs(parameters).items():
+def flip_axes_in_place(parameters: Parameters, axes: Sequence[float] = FLIP) -> None:
+    """Multiply each axis by 1 or -1 as `flip_axes` does, in place."""
+    for name, signs in _signs(parameters, axes).items():
         parameters[name] *= signs
 
 
-def _signs(parameters: Parameters) -> Parameters:
-    rest = np.repeat(FLIP_SH, 3)[: parameters["sh_rest"].shape[1]]
-    signs = {"means": (1, -1, -1), "quats": (1, 1, -1, -1), "sh_rest": rest}
+def _signs(parameters: Parameters, axes: Sequence[float]) -> Parameters:
+    by_axis = dict(zip("xyz", axes, strict=True))
+    (x, y, z), odd = axes, [math.prod(by_axis[axis] for axis in names) for names in PARITY]
+    rest = np.repeat(odd, 3)[: parameters["sh_rest"].shape[1]]
+    signs = {"means": axes, "quats": (1, y * z, x * z, x * y), "sh_rest": rest}
     return {name: np.array(values, np.float32) for name, values in signs.items()}
+
+
+def transform(
+    parameters: Parameters, scale: float, rotation: NDArray[np.float64], translation: Any
+) -> dict[str, NDArray[np.float64]]:
+    """Return the tables that change by x -> scale · rotation x + translation.
+
+    Raises ValueError for a matrix that is not a rotation, and for a scale that is not positive.
+    """
+    if not scale > 0 or rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
+        raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("expected a rotation; this matrix mirrors")
+    return {
+        "means": scale * parameters["means"].astype(np.float64) @ rotation.T + translation,
+        "quats": multiply(unit_quaternions(rotation), parameters["quats"].astype(np.float64)),
+        "log_scales": parameters["log_scales"] + np.log(scale),
+        "sh_rest": rotate_sh(parameters["sh_rest"], rotation),
+    }
 
 
 def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
@@ -238,6 +266,44 @@ def _beyond(table: Floats) -> NDArray[np.bool_]:
     """Return which rows have finite values beyond MAX_VALUE, [N]."""
     size = np.abs(table)
     return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
+
+
+def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+    """Replace the logits of opacities 0 and 1, and the logarithms of scales 0, by finite numbers."""
+    logit, log_scales = (splats.parameters[name] for name in ("logit_opacity", "log_scales"))
+    infinite, flat = np.isinf(logit), np.isneginf(log_scales)
+    count = int((infinite.any(axis=1) | flat.any(axis=1)).sum())
+    if not count:
+        return splats
+    if not options.quiet:
+        LOG.warning(
+            "%s: %s Gaussians have an opacity of 0 or 1, or a scale of 0, which have no finite logit or logarithm; "
+            "they are moved by %g",
+            path,
+            f"{count:,}",
+            MIN_ALPHA,
+        )
+    limits = {
+        "logit_opacity": np.where(infinite, logits((logit > 0).astype(np.float32)), logit),
+        "log_scales": np.where(flat, np.float32(FLAT_LOG_SCALE), log_scales),
+    }
+    return replace(splats, parameters={**splats.parameters, **limits})
+
+
+def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
+    """Return logarithms of scales; mostly negative scales are logarithms already, which a note says."""
+    if np.count_nonzero(scales < 0) > MOST * scales.size:
+        notes.add("its scales are negative: they are read as logarithms")
+        return scales.astype(np.float32)
+    return logs(np.abs(scales))
+
+
+def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
+    """Return logits of opacities; values that are mostly outside of [0, 1] are logits already, which a note says."""
+    if np.count_nonzero((alpha < 0) | (alpha > 1)) > MOST * alpha.size:
+        notes.add("its opacities are outside of 0 to 1: they are read as logits")
+        return alpha.astype(np.float32)
+    return logits(alpha)
 
 
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
@@ -283,6 +349,22 @@ def require_size(path: Path, held: int, expected: int, what: str) -> None:
             f"{path}: has {held} bytes, but its header declares {what}, {expected} bytes; "
             "the file is truncated: copy or export it again"
         )
+
+
+def require_memory(path: Path, count: int, degree: int = MAX_DEGREE) -> None:
+    """Raise MemoryLimitError, before allocating, if the tables of `count` Gaussians exceed the free memory."""
+    size, free = 4 * count * (11 + 3 * sh_coefficients(degree)), available_memory()
+    if free is not None and size > free:
+        raise MemoryLimitError(
+            f"{path}: declares {count:,} Gaussians, which take {size / 2**30:.1f} GiB of memory, but "
+            f"{free / 2**30:.1f} GiB are free; use a machine with more, or a smaller model"
+        )
+
+
+def warn_dropped(path: Path, degree: int) -> None:
+    """Warn about SH bands beyond MAX_DEGREE."""
+    if degree > MAX_DEGREE:
+        LOG.warning("%s: dropped the bands of SH degree %d", path, degree)
 
 
 def require_gaussians(path: Path, splats: SplatFile) -> None:

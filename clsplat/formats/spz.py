@@ -7,7 +7,8 @@
                511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
     harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
 
-Axes are x right, y up, z back.  Some programs keep those of the PLY, and the file does not say which.
+Axes are x right, y up, z back, or those that a record of an extension names.  Some programs keep those of the PLY, and
+the file does not say so.
 """
 
 import io
@@ -46,6 +47,7 @@ from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_FILE,
     PARAMETERS,
+    STORED_DEGREE,
     Parameters,
     Reading,
     SplatFile,
@@ -56,8 +58,11 @@ from clsplat.formats.splats import (
     opacities,
     require_gaussians,
     require_in_range,
+    require_memory,
     sh_coefficients,
+    transform,
     unit,
+    warn_dropped,
 )
 
 # Encoding and decoding the planes of an SPZ file.
@@ -66,7 +71,6 @@ LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
 MIP, EXTENSIONS = 1, 2  # flags
 HEADER = 16  # bytes
-STORED_DEGREE = 4  # of the format; bands beyond MAX_DEGREE are dropped
 COLOR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
@@ -311,29 +315,44 @@ def _module() -> tuple[ModuleType, bool]:
 WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
-GZIP_RATIO = 1032  # largest compression ratio of deflate
-RATIO4 = 1024  # largest accepted compression ratio of positions in version 4, as in Niantic's library
-ALIKE = 1 << 27  # bytes of planes that any file of version 4 may decode to: 0.6 GB in memory
+CODE_RATIO = 1032  # largest compression ratio of deflate
+RATIO = 32  # largest accepted compression ratio; that of real files is below 8
+ALIKE = 1 << 26  # bytes of planes that any file may decode to: 0.3 GB in memory
 BLOCK = 1 << 16  # bytes read at once
 GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without time and system, so that the same model gives the same bytes
-ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
+AXES_RECORD = 0xADBE0003  # an extension of Adobe: the number, from 1, of a name in AXES
+AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
+USUAL_AXES = "RUB"
+QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # to a vertical y
 EXPECTED = "an SPZ file"
 
 
 def read_spz(path: Path, options: Reading) -> SplatFile:
-    """Read an SPZ file.  Raises DataError if it is missing or damaged, or has custom axes."""
-    data = read_file(path, EXPECTED, limit=MAX_FILE)
-    header, parameters = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
-    if header.degree > MAX_DEGREE:
-        LOG.warning("%s: dropped the bands of SH degree 4", path)
-    flip_axes_in_place(parameters)
-    if not options.quiet:
+    """Read an SPZ file.  Raises DataError if it is missing or damaged, and MemoryLimitError."""
+    splats, axes = decode_spz(path, read_file(path, EXPECTED, limit=MAX_FILE))
+    if axes and not options.quiet:
+        LOG.info("%s: read with the axes that it declares, %s", path, axes)
+    elif not options.quiet:
         LOG.info(
             "%s: read with the axes of SPZ; if the model is upside down, use "
             "`clsplat convert --transform 'rotate=180,0,0'`",
             path,
         )
-    return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
+    return splats
+
+
+def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
+    """Decode the bytes of an SPZ file; also return the axes that it declares, or ''.  Raises as `read_spz`."""
+    is_new = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
+    header, parameters, axes = (_unpacked_4 if is_new else _unpacked)(path, data)
+    warn_dropped(path, header.degree)
+    name = axes or USUAL_AXES
+    if name[1] in "BF":  # z is vertical
+        turned = transform(parameters, 1.0, QUARTER_TURN, 0.0)
+        parameters |= {table: values.astype(np.float32) for table, values in turned.items()}
+        name = name[0] + name[2] + ("B" if name[1] == "F" else "F")
+    flip_axes_in_place(parameters, [1.0 if letter in "RDF" else -1.0 for letter in name])
+    return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default"), axes
 
 
 def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
@@ -359,13 +378,13 @@ def _gzip(data: bytes) -> bytes:
     return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
-    """Decode header and parameters of versions 1 to 3."""
-    stream = _Gzip(path, data)
+def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
+    """Decode header, parameters, and declared axes of versions 1 to 3, in gzip or plain."""
+    stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
     header = SpzHeader.parse(path, stream.read(HEADER))
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
-    _check_size(path, header, sum(header.sizes), len(data) * GZIP_RATIO)
+    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _most(data)))
 
     def read(size: int) -> bytes:
         if len(part := stream.read(size)) < size:
@@ -374,12 +393,12 @@ def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
         return part
 
     parameters = unpacked(header, [read] * len(header.sizes))
-    if header.flags & EXTENSIONS:
-        _check_extensions(path, stream.read)
+    axes = _read_axes(path, stream.read) if header.flags & EXTENSIONS else ""
     if stream.read(1):
         raise DataError(f"{path}: has data after its {header.count} splats; copy or export it again")
-    stream.require_end()
-    return header, parameters
+    if isinstance(stream, _Gzip):
+        stream.require_end()
+    return header, parameters, axes
 
 
 class _Gzip:
@@ -412,13 +431,11 @@ class _Gzip:
             raise DataError(f"{self.path}: has {rest} bytes after its gzip data; copy or export it again")
 
 
-def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
-    """Decode header and parameters of version 4."""
+def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
+    """Decode header, parameters, and declared axes of version 4."""
     header = SpzHeader.parse(path, data)
-    if header.version != 4 or len(data) < HEADER4:
-        raise DataError(
-            f"{path}: SPZ of version {header.version} without gzip; only version 4 has none; export it again"
-        )
+    if len(data) < HEADER4:
+        raise DataError(f"{path}: has {len(data)} bytes; expected a header of {HEADER4}; copy or export it again")
     streams, table = struct.unpack_from("<BI", data, HEADER - 1)
     present = [size for size in header.sizes if size]
     if streams != len(present) or not HEADER4 <= table <= len(data) - 16 * streams:
@@ -426,10 +443,8 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
             f"{path}: has {streams} streams and their table at byte {table}; expected {len(present)} streams within "
             f"{len(data)} bytes; copy or export it again"
         )
-    _check_size(path, header, header.sizes[0], len(data) * RATIO4)
-    _check_size(path, header, sum(header.sizes), max(len(data) * RATIO4, ALIKE))
-    if header.flags & EXTENSIONS:
-        _check_extensions(path, io.BytesIO(data[HEADER4:table]).read)
+    _check_size(path, header, _most(data))
+    axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
     start, frames = table + 16 * streams, []
     for number, size in enumerate(present):
         held, declared = struct.unpack_from("<2Q", data, table + 16 * number)
@@ -442,25 +457,38 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
         start += held
     if start != len(data):
         raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
-    return header, unpacked(header, [frame.read for frame in frames])
+    return header, unpacked(header, [frame.read for frame in frames]), axes
 
 
-def _check_size(path: Path, header: SpzHeader, size: int, most: int) -> None:
+def _most(data: bytes) -> int:
+    """Return how many bytes of planes a compressed file may decode to."""
+    return max(len(data) * RATIO, ALIKE)
+
+
+def _check_size(path: Path, header: SpzHeader, most: int) -> None:
     """Raise DataError, before allocating, if a file cannot contain as many splats as it declares."""
-    if size > most:
+    if (size := sum(header.sizes)) > most:
         raise DataError(
             f"{path}: declares {header.count} splats of {size} bytes, more than it can contain ({most}); "
             "the file is truncated or damaged: copy or export it again"
         )
+    require_memory(path, header.count, min(header.degree, MAX_DEGREE))
 
 
-def _check_extensions(path: Path, read: Callable[[int], bytes]) -> None:
-    """Raise DataError for an extension that changes the axes; skip others, as Niantic's library does."""
+def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
+    """Return the declared axes, or ''; skip other extensions, as Niantic's library does.  Raises DataError."""
+    axes = ""
     while len(record := read(8)) == 8:
         kind, length = struct.unpack("<2I", record)
-        if kind == ADOBE_AXES:
-            raise DataError(
-                f"{path}: uses custom axes (extension {kind:#x}), which are not supported; export it without them"
-            )
+        if kind == AXES_RECORD:
+            data = read(4) if length == 4 else b""
+            if len(data) < 4 or (number := int.from_bytes(data, "little")) > len(AXES):
+                raise DataError(
+                    f"{path}: its record of axes has {length} bytes with {data.hex() or 'nothing'}; expected 4 bytes "
+                    f"with a number from 0 to {len(AXES)}; export it again"
+                )
+            axes = AXES[number - 1] if number else ""
+            continue
         while length and (part := read(min(length, BLOCK))):
             length -= len(part)
+    return axes

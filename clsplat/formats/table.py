@@ -11,7 +11,7 @@ import numpy as np
 from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shorten
 from clsplat.core.reading import open_file
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply
-from clsplat.formats.gltf_usd import read_glb, write_glb, write_usda
+from clsplat.formats.gltf_usd import gltf_files, looks_like_gltf, read_gltf, write_glb, write_usda
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, check_rendering, parse_ply_header, read_ply, write_ply
 from clsplat.formats.sog import META, looks_like_sog, read_sog, sog_folder_files, write_sog
 from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_ksplat, read_splat, write_splat
@@ -23,6 +23,7 @@ from clsplat.formats.splats import (
     SplatFile,
     Writing,
     apply_not_finite,
+    clamp_limits,
     not_finite,
     require_static,
 )
@@ -81,9 +82,10 @@ def model_file(path: Path) -> Path:
 
 def model_files(path: Path) -> list[Path]:
     """Return a model's main file and the files that it names."""
-    if path.name == META:
-        return sog_folder_files(path)
-    return lod_files(path) if path.name == LOD_META else [path]
+    if path.name == LOD_META:
+        return lod_files(path)
+    files = {".json": sog_folder_files, ".gltf": gltf_files}.get(path.suffix.lower())
+    return files(path) if files else [path]
 
 
 def model_bytes(path: Path) -> int:
@@ -147,9 +149,15 @@ CODECS = (
         "GLB",
         (".glb",),
         lambda start: start.data.startswith(b"glTF"),
-        lambda path, options: read_glb(path),
+        lambda path, options: read_gltf(path),
         write_glb,
         keeps_numbers=True,
+    ),
+    Codec(
+        "glTF",
+        (".gltf",),
+        lambda start: looks_like_gltf(start.data),
+        lambda path, options: read_gltf(path),
     ),
     Codec(
         "OpenUSD",
@@ -208,7 +216,7 @@ def read(path: Path, options: Reading | None = None) -> SplatFile:
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} can be written but not read; convert the model that it was made from")
     with np.errstate(all="ignore"):  # values that are not finite are handled below
-        return apply_not_finite(path, codec.read(path, options), options)
+        return apply_not_finite(path, clamp_limits(path, codec.read(path, options), options), options)
 
 
 def writing_format(path: Path) -> Codec:

@@ -105,8 +105,9 @@ class Changes:
             changed = changed[((changed.means >= low) & (changed.means <= high)).all(axis=1)]
         if self.sh_degree is not None and self.sh_degree < changed.sh_degree:
             changed = replace(changed, sh_rest=with_degree(changed.tables(), self.sh_degree)["sh_rest"])
-        if not len(changed) and len(model):
-            raise DataError(f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold")
+        if not len(changed):
+            fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
+            raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
         return changed
 
 

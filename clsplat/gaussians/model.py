@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import METRICS, is_inside
-from clsplat.core.harmonics import rotate_sh
-from clsplat.core.quaternions import multiply, unit_quaternions
 from clsplat.core.reading import read_json
 from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
@@ -34,6 +32,7 @@ from clsplat.formats.splats import (
     opacities,
     sh_coefficients,
     sh_degree_of,
+    transform,
 )
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
@@ -219,20 +218,11 @@ class Model:
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
         if np.shape(translation) != (3,):
             raise ValueError(f"the translation has shape {np.shape(translation)}; expected (3,)")
-        if not scale > 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
-            raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
-        if np.linalg.det(turn) < 0:
-            raise ValueError("expected a rotation; this matrix mirrors")
         origin, shift = self.origin, np.asarray(translation, np.float64)
-        if origin.any():
-            origin, shift = scale * turn @ origin + shift, np.zeros(3)
         with np.errstate(over="ignore", invalid="ignore"):
-            changed: dict[str, Any] = {
-                "means": scale * self.means.astype(np.float64) @ turn.T + shift,
-                "quats": multiply(unit_quaternions(turn), self.quats.astype(np.float64)),
-                "log_scales": self.log_scales + np.log(scale),
-                "sh_rest": rotate_sh(self.sh_rest, turn),
-            }
+            if origin.any():
+                origin, shift = scale * turn @ origin + shift, np.zeros(3)
+            changed: dict[str, Any] = transform(self.tables(), scale, turn, shift)
             if self.motion is not None:
                 changed["motion"] = transformed_motion(self.motion, scale, turn)
             if self.filter_variance is not None:

@@ -12,6 +12,7 @@ from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
 from clsplat.scene.scene import position_text
 
+OTHERS = (".usd", ".usdc", ".usdz", ".obj", ".fbx", ".las", ".laz", ".rad", ".lcc")  # models that cannot be read
 MIN_COUNT = 16  # Gaussians needed for statistics
 FLAT = 1e-6  # scene units; smaller scales are those of discs or needles
 FAINT = 0.999 / 255  # opacities below are not rendered
@@ -25,7 +26,7 @@ def is_model(path: Path) -> bool:
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
-    return bool(format_of_name(file) or (file.is_file() and detect(file)))
+    return bool(format_of_name(file) or file.suffix.lower() in OTHERS or (file.is_file() and detect(file)))
 
 
 def examine(path: Path) -> dict[str, Any]:

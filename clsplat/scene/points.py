@@ -1,6 +1,5 @@
 """Read and write sparse colored points as PLY."""
 
-import io
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quote, shorten
+from clsplat.core.errors import DataError, quote
 from clsplat.core.files import open_atomic
 from clsplat.core.reading import read_file
-from clsplat.formats.ply import PlyHeader, format_ply_header, parse_ply_header
+from clsplat.formats.ply import PlyHeader, format_ply_header, parse_ply_header, read_ascii
+from clsplat.formats.splats import require_size
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.times import Clock
 from clsplat.scene.view import Floats
@@ -74,7 +74,7 @@ def read_ply_table(path: Path) -> PointTable:
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
         raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quote(names)}")
-    table = _read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
+    table = read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
     positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
     times = np.asarray(table[TIME], np.float64) if TIME in names else np.empty(0)
     return PointTable(path, positions, rgb, times=times)
@@ -98,39 +98,7 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())
 
 
-def _require(path: Path, count: int, stride: int, size: int) -> None:
-    if count * stride > size:
-        raise DataError(
-            f"{path}: {count} points need {count * stride} bytes, {max(size, 0)} follow the header; "
-            "the file is truncated or damaged: copy or export it again"
-        )
-
-
 def _read_binary(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
     """Return the vertices as a structured array, [count]."""
-    _require(path, header.count, header.dtype.itemsize, len(data) - header.start)
+    require_size(path, len(data), header.start + header.count * header.dtype.itemsize, f"{header.count} points")
     return np.frombuffer(data, header.dtype, header.count, header.start)
-
-
-def _read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
-    """Return the vertices, one per line, as a structured array, [count]."""
-    body = io.BytesIO(data[header.start :])
-    for _ in range(header.lines_before):
-        if not body.readline():
-            break
-    # Each number needs a digit and a space, but the last space may be missing.
-    _require(path, header.count, 2 * len(header.dtype.names or ()), len(data) - header.start - body.tell() + 1)
-    if header.count == 0:
-        return np.empty(0, header.dtype)
-    try:
-        table = np.loadtxt(body, header.dtype, comments=None, max_rows=header.count, ndmin=1)
-    except (ValueError, OverflowError) as error:
-        raise DataError(
-            f"{path}: {shorten(str(error), 200)} after the header; expected one number for each property"
-        ) from error
-    if len(table) < header.count:
-        raise DataError(
-            f"{path}: expected {header.count} lines with points, found {len(table)}; the file is truncated: "
-            "copy or export it again"
-        )
-    return table

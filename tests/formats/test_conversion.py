@@ -453,3 +453,47 @@ def test_formats_page_lists_every_format():
     for codec in CODECS:
         row = f"| {codec.name} | {', '.join(f'`{ending}`' for ending in codec.endings)} |"
         assert row in page, row
+
+
+def test_infinite_opacities_and_flat_scales_are_limits(tmp_path, rng, caplog):
+    """NaN, and infinite scales, are not."""
+    one = splats(rng, 6, 0)
+    one.parameters["logit_opacity"][:2, 0] = np.inf, -np.inf
+    one.parameters["log_scales"][1:3, 0] = -np.inf
+    write(tmp_path / "a.ply", one)
+    assert examine(tmp_path / "a.ply")["valid"]
+    assert [text for text in caplog.messages if "3 Gaussians have an opacity of 0 or 1, or a scale of 0" in text]
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb")["gaussians"] == 6
+    found = load(tmp_path / "b.glb")
+    np.testing.assert_allclose(found.opacities[:2], [1, 0], atol=2e-6)
+    np.testing.assert_allclose(found.scales[1:3, 0], 1e-6, rtol=1e-5)
+    one.parameters["log_scales"][3] = np.inf
+    one.parameters["logit_opacity"][4] = np.nan
+    write(tmp_path / "a.ply", one)
+    with pytest.raises(DataError, match="log_scales, logit_opacity have values that are not finite"):
+        load(tmp_path / "a.ply")
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 4
+
+
+def test_an_empty_result_is_an_error(tmp_path, rng):
+    one = splats(rng, 6, 0)
+    write(tmp_path / "a.ply", one.rows(slice(0)))
+    one.parameters["means"][:] = np.nan
+    write(tmp_path / "b.ply", one)
+    for name in ("a.ply", "b.ply"):
+        with pytest.raises(DataError, match="the model has no Gaussians, or none with valid values"):
+            clsplat.convert(tmp_path / name, tmp_path / "c.ply")
+    assert not (tmp_path / "c.ply").exists()
+
+
+def test_what_looks_like_a_model_is_no_pipeline(tmp_path, rng):
+    write(tmp_path / "meta.json", splats(rng, 6, 0))
+    (tmp_path / "meta.json").rename(tmp_path / "Scene.JSON")
+    assert clsplat.check(tmp_path / "Scene.JSON")["format"] == "SOG"
+    assert clsplat.convert(tmp_path / "Scene.JSON", tmp_path / "a.ply")["gaussians"] == 6
+    for name in ("a.gltf", "A.SPLAT", "b.Spz", "c.usdz", "d.USDA", "e.ksplat", "lod-meta.json", "f.compressed.ply"):
+        (tmp_path / name).write_text("no model")
+        with pytest.raises(DataError, match=name):
+            clsplat.check(tmp_path / name)
+        with pytest.raises(DataError, match=f"{name}: cannot be read|no/{name}: unknown model format"):
+            clsplat.check(tmp_path / "no" / name)

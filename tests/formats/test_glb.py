@@ -1,5 +1,8 @@
 """glTF and OpenUSD: validity, axes, nodes, and what a file may not declare."""
 
+import base64
+import gzip
+import json
 import struct
 
 import numpy as np
@@ -7,12 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.core.errors import DataError
+from clsplat.core.harmonics import basis
 from clsplat.core.reading import sha256
 from clsplat.formats.gltf_usd import write_glb
-from clsplat.formats.splats import Writing, opacities, unit
-from clsplat.formats.table import detect, read, write
+from clsplat.formats.splats import SH_C0, Writing, flip_axes, opacities, unit
+from clsplat.formats.table import detect, model_files, read, write
 from clsplat.gaussians.model import Model, load
-from tests.support.models import angles, assert_close, interop, join_glb, round_trip, splats, split_glb
+from tests.support.models import angles, assert_close, interop, join_glb, round_trip, splats, split_glb, spz_tree
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {5121: 1, 5126: 4}
@@ -153,10 +157,13 @@ REFUSED = {
     "stride": (change(["bufferViews", 0, "byteStride"], 4), "are 4 bytes apart; expected at least 12"),
     "no stride": (change(["bufferViews", 0, "byteStride"], 0), "are 0 bytes apart; expected at least 12"),
     "short view": (change(["bufferViews", 0, "byteLength"], 1), "has 4 rows, more than fit into its view of 1 bytes"),
-    "long view": (change(["bufferViews", 0, "byteLength"], 10**9), "or into the file"),
+    "long view": (change(["bufferViews", 0, "byteLength"], 10**9), "at 0, more than its buffer of [0-9]+ bytes"),
     "length of a view": (change(["bufferViews", 0, "byteLength"], "a"), "expected a whole number from 0, got 'a'"),
-    "short buffer": (change(["buffers", 0, "byteLength"], 3), "whose buffer has 3 bytes; copy or export it again"),
-    "other buffer": (change(["buffers"], [{"byteLength": 0}] * 2), "whose buffer has 0 bytes"),
+    "short buffer": (
+        change(["buffers", 0, "byteLength"], 3),
+        "more than its buffer of 3 bytes; copy or export it again",
+    ),
+    "other buffer": (change(["buffers"], [{"byteLength": 0}] * 2), "more than its buffer of 0 bytes"),
     "view": (change(["accessors", 0, "bufferView"], 99), r"its JSON is damaged \(IndexError"),
     "negative": (change(["bufferViews", 0, "byteOffset"], -4), "expected a whole number from 0, got -4"),
     "kind": (change(["accessors", 0, "componentType"], 7), r"its JSON is damaged \(KeyError: 7\)"),
@@ -173,7 +180,10 @@ REFUSED = {
     "asset": (change(["asset"], []), "its JSON is damaged"),
     "no splats": (change(["meshes", 0, "primitives", 0, "extensions"], {}), "has no Gaussians"),
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
-    "elsewhere": (change(["buffers", 0, "uri"], "a.bin"), "in the file itself"),
+    "elsewhere": (
+        change(["buffers", 0, "uri"], "../a.bin"),
+        "buffer 0 is '../a.bin'; expected data in the file, or a file in its folder",
+    ),
 }
 
 
@@ -293,3 +303,129 @@ def test_lost_render_settings_are_reported(tmp_path, rng, caplog):
     source.rendering["near"] = 0.2
     write(tmp_path / "a.spz", source)
     assert "does not store" not in caplog.text
+
+
+def parted(tmp_path, rng, degree=1, count=40):
+    """A model as .glb, and the JSON and the binary chunk of that file."""
+    source = splats(rng, count, degree)
+    write(tmp_path / "a.glb", source)
+    return source, *split_glb((tmp_path / "a.glb").read_bytes())
+
+
+def assert_same(found, expected):
+    for name, table in expected.parameters.items():
+        np.testing.assert_array_equal(found.parameters[name], table, err_msg=name)
+
+
+@pytest.mark.parametrize("where", ["data:application/octet-stream;base64,", "a%20b/c.bin"])
+def test_a_gltf_is_its_glb_twin(where, tmp_path, rng):
+    _, tree, binary = parted(tmp_path, rng)
+    if where.startswith("data"):
+        where += base64.b64encode(binary).decode()
+    else:
+        (tmp_path / "a b").mkdir()
+        (tmp_path / "a b" / "c.bin").write_bytes(binary)
+    tree["buffers"][0]["uri"] = where
+    path = tmp_path / "B.GLTF"
+    path.write_text(json.dumps(tree, indent=1))
+    assert detect(path).name == "glTF"
+    assert_same(read(path), read(tmp_path / "a.glb"))
+    assert len(model_files(path)) == 1 + where.endswith(".bin")
+
+
+@pytest.mark.parametrize("uri", ["../c.bin", "%2e%2e/c.bin", "/etc/hostname", "file:///etc/hostname", 7, "data:,abc"])
+def test_a_buffer_outside_of_the_folder_is_refused(uri, tmp_path, rng):
+    _, tree, binary = parted(tmp_path, rng)
+    (tmp_path / "c.bin").write_bytes(binary)
+    (tmp_path / "d").mkdir()
+    tree["buffers"][0]["uri"] = uri
+    (tmp_path / "d" / "a.gltf").write_text(json.dumps(tree))
+    with pytest.raises(DataError, match=r"a\.gltf: (buffer 0 is|its JSON is damaged)|hostname: cannot be read"):
+        read(tmp_path / "d" / "a.gltf")
+
+
+@pytest.mark.parametrize("quantity", ["SCALE", "OPACITY"])
+def test_logarithms_and_logits_are_read_as_such(quantity, tmp_path, rng, caplog):
+    source, tree, binary = parted(tmp_path, rng)
+    view = tree["bufferViews"][tree["meshes"][0]["primitives"][0]["attributes"][f"{KHR}:{quantity}"]]
+    name = {"SCALE": "log_scales", "OPACITY": "logit_opacity"}[quantity]
+    data, start = source.parameters[name].tobytes(), view["byteOffset"]
+    (tmp_path / "b.glb").write_bytes(join_glb(tree, binary[:start] + data + binary[start + len(data) :]))
+    np.testing.assert_array_equal(read(tmp_path / "b.glb").parameters[name], source.parameters[name])
+    assert len(caplog.messages) == 1
+    assert "they are read as log" in caplog.text
+
+
+def test_linear_colors_become_srgb(tmp_path, rng, caplog):
+    """Exactly without harmonics, also in a part of a larger degree; otherwise the closest colors."""
+    source, tree, binary = parted(tmp_path, rng, 3)
+    first = tree["meshes"][0]["primitives"][0]
+    first["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+    few = {name: number for name, number in first["attributes"].items() if "SH_DEGREE_" not in name or "_0_" in name}
+    tree["meshes"][0]["primitives"] = [{**first, "attributes": few}, first]
+    (tmp_path / "b.glb").write_bytes(join_glb(tree, binary))
+    found = read(tmp_path / "b.glb").parameters
+    assert caplog.text.count("its colors are linear") == 1
+    linear = np.maximum(source.parameters["sh_base"] * SH_C0 + 0.5, 0)
+    shown = found["sh_base"][:40] * SH_C0 + 0.5
+    back = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(back, linear, atol=1e-5)
+    assert not found["sh_rest"][:40].any()
+    directions = unit(rng.normal(size=(50, 4)))[:, :3]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def colors(base, rest):
+        return base[:, None] * SH_C0 + 0.5 + np.einsum("dk,nkc->ndc", basis(directions), rest.reshape(-1, 15, 3))
+
+    before = np.maximum(colors(source.parameters["sh_base"], source.parameters["sh_rest"]), 0)
+    wanted = np.where(before <= 0.0031308, 12.92 * before, 1.055 * before ** (1 / 2.4) - 0.055)
+    error = np.abs(colors(found["sh_base"][40:], found["sh_rest"][40:]) - wanted)
+    assert error.mean() < 0.02 < np.abs(before - wanted).mean() / 3
+
+
+def test_parts_of_other_degrees_and_transforms_are_joined(tmp_path, rng):
+    _, tree, binary = parted(tmp_path, rng, 2, 20)
+    first = tree["meshes"][0]["primitives"][0]
+    few = {name: number for name, number in first["attributes"].items() if "SH_DEGREE_2" not in name}
+    tree["meshes"].append({"primitives": [{**first, "attributes": few}]})
+    tree["nodes"] = [{"mesh": 0, "translation": [1, 2, 3], "scale": [2, 2, 2]}, {"mesh": 1, "rotation": [0, 1, 0, 1]}]
+    for nodes in ([0, 1], [0], [1]):
+        tree["scenes"] = [{"nodes": nodes}]
+        (tmp_path / f"{len(nodes)}{nodes[0]}.glb").write_bytes(join_glb(tree, binary))
+    both, one, other = (load(tmp_path / f"{name}.glb") for name in ("20", "10", "11"))
+    assert (both.sh_degree, one.sh_degree, other.sh_degree) == (2, 2, 1)
+    for found, expected in ((both[:20], other), (both[20:], one)):  # the last node comes first
+        np.testing.assert_allclose(found.means, expected.means, atol=1e-4)
+        np.testing.assert_allclose(found.log_scales, expected.log_scales, atol=1e-5)
+        np.testing.assert_allclose(covariances(found), covariances(expected), atol=1e-3)
+        width = expected.sh_rest.shape[1]
+        np.testing.assert_allclose(found.sh_rest[:, :width], expected.sh_rest, atol=1e-5)
+        assert not found.sh_rest[:, width:].any()
+
+
+def test_an_spz_in_a_glb_has_the_axes_that_its_bounds_show(tmp_path, rng):
+    """Its axes are x left, y up, z front; some programs keep those of SPZ."""
+    write(tmp_path / "a.spz", splats(rng, 30, 1))
+    data, plain = (tmp_path / "a.spz").read_bytes(), read(tmp_path / "a.spz")
+    as_gltf = flip_axes(plain.parameters)["means"]
+    half = flip_axes(plain.parameters, (-1.0, 1.0, -1.0))
+    for bounds, expected in ((None, half), (as_gltf * [-1, 1, -1], half), (as_gltf, plain.parameters)):
+        (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data, bounds), data))
+        for name, table in read(tmp_path / "b.glb").parameters.items():
+            np.testing.assert_array_equal(table, expected[name], err_msg=name)
+    (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data[:-9]), data[:-9]))
+    with pytest.raises(DataError, match=r"b\.glb: is truncated before the checksum"):
+        read(tmp_path / "b.glb")
+    (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data, name="EXT_other_compression"), data))
+    with pytest.raises(DataError, match="is compressed with 'EXT_other_compression'; export it without compression"):
+        read(tmp_path / "b.glb")
+
+
+def test_many_spz_in_a_glb_unpack_to_a_share_of_it(tmp_path):
+    header = struct.pack("<4s2I4B", b"NGSP", 2, 100_000, 3, 12, 0, 0)
+    data = gzip.compress(header + bytes(64 * 100_000), 1)
+    tree = spz_tree(data)
+    tree["meshes"][0]["primitives"] *= 20
+    (tmp_path / "b.glb").write_bytes(join_glb(tree, data))
+    with pytest.raises(DataError, match=r"its SPZ data unpack to [0-9]{9} bytes"):
+        read(tmp_path / "b.glb")

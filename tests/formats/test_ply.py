@@ -117,7 +117,7 @@ def test_refusals(tmp_path, rng):
         "empty": (b"", "not a PLY"),
         "text": (b"hello", "not a PLY"),
         "huge count": (data.replace(b"element vertex 20", b"element vertex 99999999999999"), "truncated"),
-        "ascii": (data.replace(b"binary_little_endian", b"ascii"), "binary"),
+        "ascii": (data.replace(b"binary_little_endian", b"ascii"), "expected one number for each property"),
         "points only": (data.replace(b"property float opacity", b"property float intensity"), "not a splat"),
         "odd f_rest": (data.replace(b"property float f_rest_44", b"property float extra"), "44 f_rest"),
         "no vertices": (data.replace(b"element vertex", b"element point"), "no vertices"),

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from clsplat.core.errors import DataError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import FLAT_LOG_SCALE
-from clsplat.formats.table import detect, read
-from tests.support.models import interop, round_trip, splats
+from clsplat.formats.table import detect, read, write
+from tests.support.models import as_text, interop, round_trip, splats
 
 MARKS = {
     "comment SplatRenderMode: mip": "mip",
@@ -108,3 +108,33 @@ def test_a_damaged_compressed_ply_is_refused(fault, tmp_path):
     (tmp_path / "b.ply").write_bytes(b"end_header\n".join(change(*packed())))
     with pytest.raises(DataError, match=words):
         read(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_an_ascii_ply_is_its_binary_twin(degree, tmp_path, rng):
+    write(tmp_path / "a.ply", splats(rng, 20, degree, "mip"))
+    text = as_text((tmp_path / "a.ply").read_bytes())
+    for name, content in (("b.ply", text), ("c.ply", text.replace(b"\n", b"\r\n"))):
+        (tmp_path / name).write_bytes(content)
+        found = read(tmp_path / name)
+        assert found.mode == "mip"
+        for table, values in read(tmp_path / "a.ply").parameters.items():
+            np.testing.assert_array_equal(found.parameters[table], values)
+    (tmp_path / "b.ply").write_bytes(text.replace(b"element vertex 20", b"element vertex 999999999"))
+    with pytest.raises(DataError, match=r"declares 999999999 vertices, .* bytes; the file is truncated"):
+        read(tmp_path / "b.ply")
+
+
+def test_degree_four_of_a_ply_is_cut_to_three(tmp_path, rng, caplog):
+    write(tmp_path / "a.ply", splats(rng, 5, 3))
+    before = read(tmp_path / "a.ply").parameters["sh_rest"].reshape(5, 15, 3)
+    wide = np.pad(before, ((0, 0), (0, 9), (0, 0)), constant_values=7).transpose(0, 2, 1).reshape(5, 72)
+    data = (tmp_path / "a.ply").read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    table = np.frombuffer(body, "<f4").reshape(5, -1)
+    more = "".join(f"property float f_rest_{i}\n" for i in range(45, 72)).encode()
+    head = head.replace(b"property float opacity\n", more + b"property float opacity\n")
+    rows = np.concatenate([table[:, :9], wide, table[:, 54:]], axis=1)
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + rows.astype("<f4").tobytes())
+    np.testing.assert_array_equal(read(tmp_path / "b.ply").parameters["sh_rest"].reshape(5, 15, 3), before)
+    assert caplog.messages == [f"{tmp_path / 'b.ply'}: dropped the bands of SH degree 4"]

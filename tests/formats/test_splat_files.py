@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from clsplat.core.errors import ConfigError, DataError
+from clsplat.formats.splat import ROW
 from clsplat.formats.splats import opacities
 from clsplat.formats.table import detect, read, write
 from tests.support.models import angles, assert_close, interop, ksplat, round_trip, splats
@@ -75,6 +76,22 @@ def test_a_damaged_splat_is_refused(data, words, tmp_path):
         read(tmp_path / "a.splat")
 
 
+def test_scales_of_a_splat_may_be_logarithms(tmp_path, rng, caplog):
+    source = splats(rng, 40, 0)
+    write(tmp_path / "a.splat", source)
+    rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), ROW).copy()
+    expected = np.log(rows["scale"])
+    rows["scale"] = expected
+    (tmp_path / "a.splat").write_bytes(rows.tobytes())
+    np.testing.assert_array_equal(read(tmp_path / "a.splat").parameters["log_scales"], expected)
+    assert "its scales are negative: they are read as logarithms" in caplog.text
+    rows["scale"] = np.abs(expected)
+    rows["scale"][0] = -1
+    (tmp_path / "a.splat").write_bytes(rows.tobytes())
+    with pytest.raises(DataError, match="has scales below 0"):
+        read(tmp_path / "a.splat")
+
+
 @pytest.mark.parametrize("level", LEVELS)
 def test_ksplat_of_another_program_equals_its_source(level):
     """Its writer keeps degree 2 and the order of the source."""
@@ -112,8 +129,15 @@ DAMAGED = {
     "places": ({"rows": 3, "buckets": 10**6}, "truncated"),
     "empty buckets": ({"held": 2}, "have fewer splats"),
     "full buckets": ({"full": 1}, "do not match"),
-    "no sections": ({"sections": 0}, "not a .ksplat"),
+    "no places": ({"most": 0}, "not a .ksplat"),
 }
+
+
+def test_a_ksplat_without_a_count_of_sections_has_all_its_places(tmp_path):
+    (tmp_path / "a.ksplat").write_bytes(ksplat(sections=0))
+    assert len(read(tmp_path / "a.ksplat")) == 3
+    (tmp_path / "a.ksplat").write_bytes(ksplat(count=0, sections=0)[:4096])
+    assert len(read(tmp_path / "a.ksplat")) == 0
 
 
 @pytest.mark.parametrize("fault", DAMAGED)

@@ -9,11 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
+from clsplat.core.harmonics import basis
 from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import log_weights
-from clsplat.formats.splats import Reading, Writing, flip_axes
+from clsplat.formats.splats import Reading, Writing, flip_axes, unit
+from clsplat.formats.spz import AXES
 from clsplat.formats.table import detect, read, write
 from tests.support.models import angles, assert_close, interop, round_trip, splats, spz_version_4
 
@@ -145,23 +148,85 @@ def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, cap
     assert not caplog.messages
 
 
-def test_only_the_extension_that_rotates_axes_is_refused(tmp_path):
+def test_unknown_extensions_are_skipped(tmp_path):
     path = tmp_path / "a.spz"
     other = struct.pack("<2I4s", 7, 4, b"abcd")
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
     assert len(read(path)) == 2
     long = struct.pack("<2I", 7, 200_000) + bytes(200_000)
-    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=long + struct.pack("<2II", 0xADBE0003, 4, 1))))
-    with pytest.raises(DataError, match="uses custom axes"):
+    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=long + struct.pack("<2II", 0xADBE0003, 4, 17))))
+    with pytest.raises(DataError, match="its record of axes has 4 bytes with 11000000; expected 4 bytes with a number"):
         read(path)
     damaged = bytearray(gzip.compress(legacy(2, flags=2, rest=other)))
     damaged[-5] ^= 1  # of the checksum, which is read with the records
     path.write_bytes(damaged)
     with pytest.raises(DataError, match="incorrect data check"):
         read(path)
-    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2II", 0xADBE0003, 4, 1))))
-    with pytest.raises(DataError, match=r"uses custom axes \(extension 0xadbe0003\)"):
+    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2IH", 0xADBE0003, 2, 1))))
+    with pytest.raises(DataError, match="its record of axes has 2 bytes with nothing"):
         read(path)
+
+
+def test_declared_axes_are_turned_to_those_of_a_ply(tmp_path, caplog):
+    """Each name gives the same scene: its points, and the color that each direction sees."""
+    caplog.set_level("INFO")
+    axes = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+    path, draw = tmp_path / "a.spz", np.random.default_rng(0).integers
+    planes = [draw(0, 256, 2 * 13), draw(140, 180, 2 * 3), draw(60, 196, 2 * 3), draw(0, 256, 2 * 45)]
+    rest = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
+    direction = np.array([0.48, 0.6, 0.64])
+    for number, name in enumerate(AXES, 1):
+        header = struct.pack("<4s2I4B", b"NGSP", 2, 2, 3, 12, 2, 0)
+        path.write_bytes(header + rest + struct.pack("<2II", 0xADBE0003, 4, number))
+        found = read(path)
+        path.write_bytes(header + rest + struct.pack("<2II", 0xADBE0003, 4, 6))
+        stored = read(path)  # of the axes of a PLY
+        matrix = np.array([axes[letter] for letter in name], np.float64).T
+        assert f"axes that it declares, {name}" in caplog.text
+        np.testing.assert_allclose(found.parameters["means"], stored.parameters["means"] @ matrix.T, atol=1e-6)
+        colors = [
+            basis(seen[None]) @ one.parameters["sh_rest"].reshape(2, 15, 3)
+            for one, seen in ((stored, direction), (found, matrix @ direction))
+        ]
+        np.testing.assert_allclose(*colors, atol=1e-5)
+        spreads = [
+            Rotation.from_quat(np.roll(unit(one.parameters["quats"]), -1, axis=1)).as_matrix()
+            * np.exp(one.parameters["log_scales"])[:, None, :]
+            for one in (stored, found)
+        ]
+        before, after = (spread @ spread.transpose(0, 2, 1) for spread in spreads)
+        np.testing.assert_allclose(matrix @ before @ matrix.T, after, atol=1e-5 * before.max())
+
+
+def test_a_plain_file_of_an_old_version_is_read(tmp_path):
+    (tmp_path / "a.spz").write_bytes(legacy(2))
+    (tmp_path / "b.spz").write_bytes(gzip.compress(legacy(2)))
+    for name, table in read(tmp_path / "a.spz").parameters.items():
+        np.testing.assert_array_equal(table, read(tmp_path / "b.spz").parameters[name])
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_more_splats_than_an_old_version_allows_are_refused(degree, tmp_path):
+    """A gzip file of 2 MB could stand for a hundred million splats."""
+    header = struct.pack("<4s2I4B", b"NGSP", 3, 10_000_000, degree, 12, 0, 0)
+    data = gzip.compress(header + bytes(1 << 22), 1)
+    (tmp_path / "a.spz").write_bytes(data + bytes(2_000_000))
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"declares 10000000 splats of .* more than it can contain"):
+            read(tmp_path / "a.spz")
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_more_splats_than_the_memory_holds_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("clsplat.formats.splats.available_memory", lambda: 100)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(legacy(2)))
+    with pytest.raises(
+        MemoryLimitError, match=r"a\.spz: declares 2 Gaussians, which take 0.0 GiB of memory, but 0.0 GiB"
+    ):
+        read(tmp_path / "a.spz")
 
 
 def test_degree_four_is_cut_to_three(tmp_path, caplog):
@@ -183,7 +248,8 @@ REFUSED = {
     "rubbish": (gzip.compress(legacy(2)) + b"rubbish", "has 7 bytes after its gzip data; copy"),
     "two members": (gzip.compress(legacy(2)) * 2, "has [0-9]+ bytes after its gzip data"),
     "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
-    "version 3 without gzip": (legacy(3), "without gzip"),
+    "plain and short": (legacy(3)[:-1], "more than it can contain|too short"),
+    "plain and long": (legacy(2) + b"a", "has data after its 2 splats"),
     "header": (b"NGSP\4\0\0\0", "whose header has 16 bytes"),
 }
 
@@ -272,6 +338,6 @@ def test_more_splats_than_version_4_allows_are_refused(tmp_path):
     table = b"".join(struct.pack("<2Q", 8000, count * width) for width in (9, 1, 3, 3, 4))
     path.write_bytes(struct.pack("<4s2I4BI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + table + bytes(5 * 8000))
     with pytest.raises(
-        DataError, match=r"20000000 splats of 180000000 bytes, more than it can contain \([0-9]+\); .*copy"
+        DataError, match=r"20000000 splats of 400000000 bytes, more than it can contain \([0-9]+\); .*copy"
     ):
         read(path)

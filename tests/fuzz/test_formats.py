@@ -1,7 +1,9 @@
 """Damaged model files of every format: read or refused, soon and in little memory."""
 
+import base64
 import io
 import json
+import struct
 import warnings
 import zipfile
 import zlib
@@ -17,7 +19,7 @@ from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.validate import examine
 from tests.fuzz.mutation import damaged, fuzzed, one_of, rearranged_json
 from tests.fuzz.outcome import outcome
-from tests.support.models import interop, join_glb, ksplat, splats, split_glb, spz_version_4
+from tests.support.models import interop, join_glb, ksplat, splats, split_glb, spz_tree, spz_version_4
 
 RNG = np.random.default_rng(0)
 WORDS = {
@@ -39,6 +41,8 @@ WORDS = {
 }
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 NAMES = {"compressed PLY": "a.compressed.ply", "SPZ": "a.spz", "SOG": "a.sog", "GLB": "a.glb", "splat": "a.splat"}
+NAMES |= {"glTF": "a.gltf"}
+AXES = struct.pack("<2I4s2II", 7, 4, b"abcd", 0xADBE0003, 4, 12)  # records of an SPZ file
 
 
 def seeds(name: str, folder: Path) -> list[bytes]:
@@ -47,13 +51,27 @@ def seeds(name: str, folder: Path) -> list[bytes]:
         return [ksplat(degree=degree, level=level) for degree in range(3) for level in range(1, 3)]
     if name == "compressed PLY":
         return [interop("train1000.compressed.ply").read_bytes()]
+    if name == "glTF":
+        return [as_gltf(data) for data in seeds("GLB", folder)]
     found = []
     for count, degree, mode in ((3, 0, "mip"), (40, 1, "default"), (5, 3, "mip")):
         write(folder / NAMES[name], splats(RNG, count, degree, mode))
         found.append((folder / NAMES[name]).read_bytes())
-        if name == "SPZ" and find_spec("zstandard"):
-            found.append(spz_version_4(found[-1]))
+        if name == "SPZ":
+            found += [spz_version_4(found[-1])] * bool(find_spec("zstandard"))
+            plain = zlib.decompress(found[0], 31)
+            found.append(plain[:14] + bytes([plain[14] | 2]) + plain[15:] + AXES)
+        if name == "GLB":
+            spz = (seeds("SPZ", folder))[-1]
+            found.append(join_glb(spz_tree(spz, np.ones((2, 3))), spz))
     return found
+
+
+def as_gltf(data: bytes) -> bytes:
+    """A .glb file as .gltf, with a data URI."""
+    tree, binary = split_glb(data)
+    tree["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
+    return json.dumps(tree).encode()
 
 
 def reads_or_refuses(path: Path) -> None:
@@ -137,6 +155,7 @@ def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
 def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
     """Its JSON is whole, but no glTF."""
     tree, binary = split_glb(seeds("GLB", folder)[0])
+    spz = seeds("SPZ", folder)[-1]
     doubled = {**tree, "nodes": [*({"children": [i + 1] * 2} for i in range(50)), {}]}
 
     @fuzzed(300, data=rearranged_json([tree, tree, tree, doubled]))
@@ -144,7 +163,15 @@ def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
         (folder / "b.glb").write_bytes(join_glb(json.loads(data), binary))
         reads_or_refuses(folder / "b.glb")
 
+    @fuzzed(100, data=rearranged_json([spz_tree(spz, np.ones((2, 3)))]))
+    def unpacks(data):
+        (folder / "b.glb").write_bytes(join_glb(json.loads(data), spz))
+        reads_or_refuses(folder / "b.glb")
+        (folder / "b.gltf").write_bytes(as_gltf(join_glb(json.loads(data), spz)) if b'"buffers": [{' in data else data)
+        reads_or_refuses(folder / "b.gltf")
+
     reads()
+    unpacks()
 
 
 def test_a_sog_of_another_shape_is_read_or_refused(folder: Path):

@@ -14,6 +14,7 @@ from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome
+from tests.support.models import as_text
 
 RNG = np.random.default_rng(0)
 WORDS = [
@@ -37,7 +38,7 @@ def splats(folder: Path) -> list[bytes]:
         more = {"filter_variance": np.ones((3, 1), np.float32)} if filtered else {}
         write_ply(folder / "seed.ply", tables | more, {"near": 0.2, "compensate": 1.0, "background": "white"})
         files.append((folder / "seed.ply").read_bytes())
-    return files
+    return [*files, as_text(files[0]), as_text(files[4]).replace(b"\n", b"\r\n")]
 
 
 def clouds(folder: Path) -> list[bytes]:

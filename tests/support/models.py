@@ -102,9 +102,29 @@ def join_glb(tree, binary):
     return head + struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x4E4942) + binary
 
 
-def ksplat(count=3, rows=3, degree=1, level=1, buckets=1, full=0, partial=1, held=3, sections=1):
+def spz_tree(data, bounds=None, name="KHR_gaussian_splatting_compression_spz_2"):
+    """The JSON of a .glb with an SPZ file inside, as the draft of the extension says."""
+    position = {"componentType": 5126, "count": 1, "type": "VEC3"}
+    if bounds is not None:
+        position |= {"min": bounds.min(axis=0).tolist(), "max": bounds.max(axis=0).tolist()}
+    extensions = {"KHR_gaussian_splatting": {"extensions": {name: {"bufferView": 0}}}}
+    primitive = {"mode": 0, "attributes": {"POSITION": 0}, "extensions": extensions}
+    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]}
+    size = {"byteLength": len(data)}
+    return {**tree, "accessors": [position], "buffers": [size], "bufferViews": [{"buffer": 0, **size}]}
+
+
+def as_text(data):
+    """A binary PLY of floats as ascii."""
+    head, _, body = data.partition(b"end_header\n")
+    table = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property float"))
+    lines = "\n".join(" ".join(repr(float(value)) for value in row) for row in table)
+    return head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode() + b"\n"
+
+
+def ksplat(count=3, rows=3, degree=1, level=1, buckets=1, full=0, partial=1, held=3, sections=1, most=1):
     header, section = bytearray(HEADER), bytearray(SECTION)
-    struct.pack_into("<BB2x4IH", header, 0, 0, 1, 1, sections, rows, count, level)
+    struct.pack_into("<BB2x4IH", header, 0, 0, 1, most, sections, rows, count, level)
     struct.pack_into("<4IfHxx4IH", section, 0, count, rows, 256, buckets, 5.0, 12, 32767, 0, full, partial, degree)
     row = (24, 42, 72)[degree] if degree < 3 else 72
     return bytes(header + section) + struct.pack("<I3f", held, 1, 2, 3) + bytes(row * rows)
