@@ -332,18 +332,15 @@ class ColmapReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         model, images = _largest_model(path)
         cameras = read_cameras(model)
-        images, files, masks = self._files_of(path, images)
+        images, files, masks = self._files(path, images)
         views = [view_of(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
-        on_disk = files.existing(path, self.missing, [image.where for image in images])
-        ordered = sorted(zip(views, on_disk, strict=True), key=lambda pair: pair[0].name)
-        skipped = tuple(view.name for view, exists in ordered if not exists)
-        views = add_times([view for view, exists in ordered if exists], files.folder)
-        if files.reduced:
-            images, views = _fit_reduced(images, views, files.reduced)
-        table = read_point_table(model)
-        points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
+        views = sorted((views[i] for i in files.existing(path, self.missing)), key=lambda view: view.name)
+        views, table = add_times(views, files.folder), read_point_table(model)
+        original = [view for view in views if view.image_path not in files.reduced]
+        points, tracks = (table.cloud(), tracks_of(images, table, original)) if table else (None, None)
+        views = [fit_to_photograph(view) if view.image_path in files.reduced else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
-        return replace(scene, tracks=tracks and tracks.shifted(scene.origin), skipped=skipped)
+        return replace(scene, tracks=tracks and tracks.shifted(scene.origin), skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         models = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
@@ -352,7 +349,7 @@ class ColmapReader(Reader):
         model, images = models[0]
         cameras = parts.attempt(read_cameras, model)
         parts.points = parts.attempt(read_point_table, model)
-        images, files, masks = self._files_of(parts.path, images)
+        images, files, masks = self._files(parts.path, images)
         parts.image_folder = files.folder
         parts.expect(files)
         for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
@@ -361,24 +358,12 @@ class ColmapReader(Reader):
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = image.observed
 
-    def _files_of(
-        self, path: Path, images: Sequence[ImageRecord]
-    ) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
+    def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
         """Return images with the names of their files, the files, and masks."""
         folder = image_folder(path, self.root)
         files = FileLookup(self.root or folder.parent, folder, [image.name for image in images])
-        renamed = [image._replace(name=name) for image, name in zip(images, files.names, strict=True)]
-        return renamed, files, find_masks(folder.with_name("masks"), files.names)
-
-
-def _fit_reduced(
-    images: list[ImageRecord], views: list[View], reduced: set[Path]
-) -> tuple[list[ImageRecord], list[View]]:
-    """Return images and views with pixels and cameras at the size of reduced photographs."""
-    fitted = [fit_to_photograph(view) if view.image_path in reduced else view for view in views]
-    widths = [[(view.lens or view.camera).width for view in pair] for pair in zip(fitted, views, strict=True)]
-    scales = {view.name: new / old for view, (new, old) in zip(views, widths, strict=True)}
-    return [image._replace(pixels=image.pixels * scales.get(image.name, 1.0)) for image in images], fitted
+        images = [image._replace(name=name) for image, name in zip(images, files.names, strict=True)]
+        return images, files, find_masks(folder.with_name("masks"), files.names)
 
 
 def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:

@@ -1,6 +1,7 @@
 """Find the reader of a dataset among shipped readers and those of plug-ins."""
 
 import logging
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
@@ -50,61 +51,49 @@ def find_reader(path: Path) -> Reader | None:
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
-Found = tuple[Reader, Path]  # a dataset: its reader and its folder
 MAX_DEPTH = 2  # folders between a scene and the dataset in it
 logger = logging.getLogger("clsplat")
 
 
-def find_datasets(path: Path) -> list[Found]:
-    """Return the dataset in a folder, otherwise all in the folders one and two levels below it."""
-    datasets = list[Found]()
-    if reader := find_reader(path):
-        return [(reader, path)]
+def find_datasets(path: Path) -> list[Reader]:
+    """Return the reader of the dataset in a folder, otherwise those of all in the folders one and two levels below."""
+    datasets = list[Reader]()
     for folder, _ in walk_folders(path, MAX_DEPTH):
-        if any(folder.is_relative_to(above) for _, above in datasets):
-            continue
-        if reader := find_reader(folder):
-            reader.root = path
-            datasets.append((reader, folder))
+        if not any(folder.is_relative_to(reader.folder) for reader in datasets) and (reader := find_reader(folder)):
+            reader.root, reader.folder = path, folder
+            datasets.append(reader)
+            if folder == path:
+                break
     return datasets
 
 
-def find_dataset(path: Path) -> Found | None:
-    """Return the dataset in a folder or, if it is the only one, below it; None without one.
+def find_dataset(path: Path) -> Reader | None:
+    """Return the reader of the dataset in a folder or, if it is the only one, below it; None without one.
 
-    Several COLMAP models of the same photographs count as one: the model next to a folder `images`, otherwise that with
-    the most images, otherwise that of binary files.  Raises DataError, with a list, for other datasets.
+    Several COLMAP models of the same photographs count as one: that with the photographs, otherwise the largest, the
+    first by name in a tie.  Raises DataError, with a list, for other datasets.
     """
     datasets = find_datasets(path)
-    if len(datasets) <= 1:
+    if len(datasets) < 2:
         return datasets[0] if datasets else None
-    names = {folder: image_names(folder) for _, folder in datasets if find_models(folder)}
-    ranks = {
-        folder: ((folder / "images").is_dir(), len(images), bool([*folder.rglob("cameras.bin")]))
-        for folder, images in names.items()
-    }
-    best = max(ranks.values(), default=None)
-    chosen = [found for found in datasets if ranks.get(found[1]) == best]
-    if len(names) == len(datasets) and len(chosen) == 1:
-        reader, folder = chosen[0]
-        if all(images & names[folder] for images in names.values()):
-            return reader, folder
-    listed = first_few([f"{folder.relative_to(path)} ({reader.name})" for reader, folder in datasets])
-    raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {listed}; give the folder of one of them")
+    names = [_image_names(reader.folder) for reader in datasets]
+    has_photographs = [
+        any(is_image(Path(name)) for _, files in walk_folders(reader.folder, MAX_DEPTH) for name in files)
+        for reader in datasets
+    ]
+    best = max(range(len(datasets)), key=lambda i: (has_photographs[i], len(names[i])))
+    if sum(has_photographs) > 1 or not all(names[i] & names[best] for i in range(len(names))):
+        listed = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
+        raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {listed}; give one of these")
+    datasets[best].choice = f", of {len(datasets)} models of these photographs"
+    return datasets[best]
 
 
-def image_names(folder: Path) -> set[str]:
-    """Return the comparable names of the images of a COLMAP dataset; none if it is damaged."""
-    try:
+def _image_names(folder: Path) -> set[str]:
+    """Return the names of the images of a COLMAP dataset without folder and suffix; none if it is damaged."""
+    with suppress(DataError):
         return {PureWindowsPath(image.name).stem for model in find_models(folder) for image in read_images(model)}
-    except DataError:
-        return set()
-
-
-def place_note(path: Path, found: Found) -> str:
-    """Return a sentence that says which dataset below `path` is read; "" for a dataset in `path` itself."""
-    reader, folder = found
-    return "" if folder == path else f"the {reader.name} dataset in {folder.relative_to(path).as_posix()} is used"
+    return set()
 
 
 def is_scene(path: Path) -> bool:
@@ -126,12 +115,11 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             fault = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
         raise DataError(f"{path}: {fault}; expected the folder of a dataset")
     split = holdout if isinstance(holdout, Split) else Split(holdout)
-    if found := find_dataset(path):
-        reader, folder = found
-        if note := place_note(path, found):
-            logger.info("%s: %s", path, note)
+    if reader := find_dataset(path):
+        if reader.note:
+            logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
-        return split.applied(replace(reader.read(folder, split.of_reader), path=path))
+        return split.applied(replace(reader.read(reader.folder, split.of_reader), path=path))
     if any(is_image(file) for file in path.iterdir()):
         above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"

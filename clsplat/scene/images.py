@@ -191,6 +191,12 @@ def read_header(path: Path) -> Header:
     return parse_header(head, tail, lambda: read_file(path, "an image", limit=MAX_BYTES)) or Header(*image_size(path))
 
 
+def stored_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of an image file in pixels, as stored.  Raises DataError when it cannot be read."""
+    header = read_header(path)
+    return header.width, header.height
+
+
 def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
     """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` rotates it by its EXIF tag."""
     return decode_image(read_file(path, "an image", limit=MAX_BYTES), path, upright)

@@ -6,8 +6,9 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Literal
 from urllib.parse import unquote
@@ -19,15 +20,14 @@ from clsplat.scene.images import is_image
 Missing = Literal["refuse", "skip"]  # what to do about missing photographs
 Parts = tuple[str, ...]  # of a path
 MAX_DEPTH = 6  # folders below that of the scene
-MAX_FILES = 300_000
 MAX_COMPARED = 5000  # file names, to find the nearest one
 RESULTS = {STATUS, "record.json"}  # files that mark the folders of runs and of prepared photographs
-CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)", re.IGNORECASE)
+CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)")
 OTHER_CONTENT = re.compile(  # folders whose images are photographs only where a name contains the folder
     r"mask|depth|normal|segment|semantic|label|render|output|thumb|preview|^(train|test|val|validation|eval)$"
 )
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
-NOWHERE, ELSEWHERE = Path(), "…"  # the second stands for folders outside of the scene
+ELSEWHERE = "…"  # stands for folders outside of the scene
 logger = logging.getLogger("clsplat")
 
 
@@ -40,23 +40,19 @@ def safe_join(folder: Path, name: str, where: str) -> Path:
 
 def _is_safe(name: str) -> bool:
     path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
-    return bool(path.parts) and not path.anchor and ".." not in path.parts and _is_printable(name)
-
-
-def _is_printable(name: str) -> bool:
-    return not any(letter < " " for letter in name)
+    return bool(path.parts) and not path.anchor and ".." not in path.parts and min(name) >= " "
 
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError that names the first few `files` of the dataset at `path` that do not exist, if any."""
     paths = list(files)
     if lost := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
-        raise DataError(f"{_missing_text(path, lost, len(paths))}; put them back")
+        raise DataError(f"{path}: {_missing_text(lost, len(paths))}; put them back")
 
 
-def _missing_text(path: Path, lost: Sequence[str], count: int) -> str:
+def _missing_text(lost: Sequence[str], count: int) -> str:
     names = ", ".join(map(shorten, lost[:3])) + (", ..." if len(lost) > 3 else "")
-    return f"{path}: {len(lost)} of {count} image files are missing: {names}"
+    return f"{len(lost)} of {count} image files are missing: {names}"
 
 
 def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
@@ -92,165 +88,134 @@ class FileLookup:
         names: Sequence[str],
         spellings: Callable[[str], Sequence[str]] = lambda name: (name,),
         strict: bool = False,
-        taken: Collection[Path] = (),
+        taken: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.given = list(names)
-        self.names = list(names)  # those of the views
-        self.paths = [NOWHERE] * len(names)  # where a missing file is expected
+        self.given, self.names = list(names), list(names)  # in the dataset, and those of views
+        self.paths = [folder / ELSEWHERE / _printable(PureWindowsPath(name).name) for name in names]
         self.matched: dict[int, int] = {}  # the length of the common end of each inexact match
         self.reduced: set[Path] = set()  # photographs from a folder such as images_4
-        self.choices: dict[int, list[Parts]] = {}  # several files that fit a name equally well
-        self._taken = {*taken}
+        self.choices: dict[int, list[Path]] = {}  # several files that fit a name equally well
         lost = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
-        if any(map(self._target, lost)):
-            self._match(lost)
+        self._match(lost, {*taken} | {*self.paths} - {self.paths[i] for i in lost})
+        self.skipped = tuple(self.names[i] for i in lost if i not in self.matched)
         if self.matched:
             logger.info("%s: %s", root, self.note)
 
     def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
         """Take the file that a name spells, and return whether it exists."""
-        given = self.given[i]
-        for name in dict.fromkeys((given, PureWindowsPath(given).as_posix())):
-            paths = [self.folder / spelling for spelling in spellings(name)] if _is_safe(name) else []
-            if found := next((path for path in paths if os.path.exists(path)), None):
-                self.names[i], self.paths[i] = name, found
-                if name != given:
-                    self.matched[i] = len(PureWindowsPath(name).parts)
-                return True
-            self.paths[i] = paths[-1] if paths else self.folder / ELSEWHERE / PureWindowsPath(given).name
+        for name in filter(_is_safe, dict.fromkeys((self.given[i], PureWindowsPath(self.given[i]).as_posix()))):
+            for path in (self.folder / spelling for spelling in spellings(name)):
+                self.paths[i] = path
+                if os.path.exists(path):
+                    self.names[i] = name
+                    if name != self.given[i]:
+                        self.matched[i] = name.count("/") + 1
+                    return True
         return False
 
-    def _target(self, i: int) -> Parts:
-        """Return the parts of a name's path, as far as they may be below `root`; none for an impossible name."""
-        path = PureWindowsPath(self.given[i])
+    def _target(self, name: str) -> Parts:
+        """Return the comparable parts of a path, as far as they may be below `root`; none for an impossible name."""
+        path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
-        if not parts or parts[-1] == ".." or not _is_printable(self.given[i]):
+        if not parts or parts[-1] == ".." or min(name) < " ":
             return ()
         if ".." in parts:
-            return parts[len(parts) - parts[::-1].index("..") :]
-        inner = self.folder.relative_to(self.root).parts if self.folder.is_relative_to(self.root) else ()
-        return parts if path.anchor else inner + parts
+            parts = parts[len(parts) - parts[::-1].index("..") :]
+        elif not path.anchor and self.folder.is_relative_to(self.root):
+            parts = self.folder.relative_to(self.root).parts + parts
+        return tuple(map(_comparable, parts))
 
     @cached_property
-    def _files(self) -> dict[str, list[Parts]]:
-        """The image files below `root` by comparable stem, as parts of their relative paths."""
-        files, count = defaultdict[str, list[Parts]](list), 0
-        real = os.path.realpath(self.root)
+    def _files(self) -> dict[str, list[tuple[Parts, Path]]]:
+        """The image files below `root` and the comparable parts of their paths, by the comparable stem."""
+        files, real = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
         for folder, names in walk_folders(self.root, MAX_DEPTH):
-            parts = folder.relative_to(self.root).parts
-            for name in filter(lambda name: name[0] != "." and is_image(PurePath(name)), names):
-                path = folder / name
+            parts = tuple(map(_comparable, folder.relative_to(self.root).parts))
+            for path in (folder / name for name in names if name[0] != "." and is_image(PurePath(name))):
                 if os.path.isfile(path) and Path(os.path.realpath(path)).is_relative_to(real):
-                    files[_stem(name)].append((*parts, name))
-            count += len(names)
-            if count > MAX_FILES:
-                logger.warning("%s: has more than %d files; photographs are looked for in these", self.root, MAX_FILES)
-                break
+                    files[_stem(path.name)].append(((*parts, _comparable(path.name)), path))
         return files
 
-    def _match(self, lost: Sequence[int]) -> None:
-        targets = {i: target for i in range(len(self.given)) if (target := self._target(i))}
-        by_key = defaultdict[str, list[Parts]](list)
-        for target in dict.fromkeys(targets.values()):
-            for key in _keys(target[-1]):
-                by_key[key].append(target)
-        exact = self._taken.union({*self.paths} - {self.paths[i] for i in lost})  # lost ones do not exist
+    def _match(self, lost: Sequence[int], taken: set[Path]) -> None:
+        targets = list(map(self._target, self.given)) if lost else []
+        by_key = defaultdict[str, set[Parts]](set)
+        for target in targets:
+            for key in _keys(target):
+                by_key[key].add(target)
         for i in lost:
-            target = targets.get(i, ())
-            ranked = defaultdict[tuple[int, ...], list[Parts]](list)
-            for key in _keys(target[-1]) if target else ():
-                for parts in self._files.get(key, ()):
-                    if self.root.joinpath(*parts) not in exact and (rank := self._rank(i, target, parts)):
-                        ranked[rank].append(parts)
+            ranked = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
+            for parts, path in (file for key in _keys(targets[i]) for file in self._files.get(key, ())):
+                if path not in taken and (rank := self._rank(self.given[i], targets[i], parts, path)):
+                    ranked[rank].append((parts, path))
             best = ranked[max(ranked)] if ranked else []
             if len(best) > 1:
-                self.choices[i] = best
-            elif best:
-                length, others = _common_end(target, best[0]), by_key[_stem(best[0][-1])]
-                if all(_common_end(other, best[0]) < length for other in others if _folded(other) != _folded(target)):
-                    self._take(i, best[0], length)
+                self.choices[i] = [path for _, path in best]
+            for parts, path in best if len(best) == 1 else ():
+                length = _common_end(targets[i], parts)
+                others = by_key[_stem(path.name)] - {targets[i]}
+                if all(_common_end(other, parts) < length for other in others):
+                    base = self.folder if path.is_relative_to(self.folder) else self.root
+                    self.names[i], self.paths[i], self.matched[i] = path.relative_to(base).as_posix(), path, length
+                    self.reduced |= {path} if _divisor(parts[:-length]) > 1 else set()
 
-    def _rank(self, i: int, target: Parts, parts: Parts) -> tuple[int, ...] | None:
+    def _rank(self, given: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return how well a file fits a name, or None if it does not."""
-        length = _common_end(target, parts)
-        above = [part.casefold() for part in parts[:-length]]
-        if self.strict:
-            given = PureWindowsPath(self.given[i]).parts
-            if length < min(len(parts), len(target), len(given)):
-                return None
-        elif any(map(OTHER_CONTENT.search, above)):
+        length, name = _common_end(target, parts), PureWindowsPath(given)
+        if self.strict and length < min(len(parts), len(target), len(name.parts)):
             return None
-        same_name = parts[-1] == target[-1], PurePath(parts[-1]).stem == PurePath(target[-1]).stem
-        return (length, -_divisor(above), *map(int, same_name))
-
-    def _take(self, i: int, parts: Parts, length: int) -> None:
-        path = self.root.joinpath(*parts)
-        base = self.folder if path.is_relative_to(self.folder) else self.root
-        self.names[i], self.paths[i] = path.relative_to(base).as_posix(), path
-        self.matched[i] = length
-        if _divisor([part.casefold() for part in parts[:-length]]) > 1:
-            self.reduced.add(path)
+        if not self.strict and any(map(OTHER_CONTENT.search, parts[:-length])):
+            return None
+        return length, -_divisor(parts[:-length]), path.name == name.name, path.stem == name.stem
 
     @property
     def note(self) -> str:
         """What was matched, and how, in one sentence; "" if all names are exact."""
-        if not self.matched:
-            return ""
-        i, length = next(iter(self.matched.items()))
-        how = "base name" if length == 1 else "the end of their paths"
-        reduced = ", with cameras scaled to these smaller photographs" if self.reduced else ""
-        file = self.paths[i].relative_to(self.root).as_posix()
-        kind = "image" if self.strict else "photograph"
-        verb = "was" if len(self.matched) == 1 else "were"
-        return (
-            f"{pluralize(len(self.matched), kind)} of {len(self.given)} {verb} matched by {how}, such as {file} for "
-            f"{quote(self.given[i])}{reduced}"
-        )
+        for i, length in self.matched.items():
+            count = f"{len(self.matched)} of {pluralize(len(self.given), 'image' if self.strict else 'photograph')}"
+            how = "base name" if length == 1 else "the end of their paths"
+            reduced = ", with cameras scaled to these smaller photographs" if self.reduced else ""
+            file = self.paths[i].relative_to(self.root).as_posix()
+            return f"{count} matched by {how}, such as {file} for {quote(self.given[i])}{reduced}"
+        return ""
 
-    def existing(self, where: Path, missing: Missing, sources: Sequence[str] = ()) -> list[bool]:
-        """Return which of the files exist.
+    def existing(self, where: Path, missing: Missing) -> list[int]:
+        """Return the indices of the files that exist.
 
         Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are.
-        where: the dataset, for messages; sources: the part of it that has each name.
+        where: the dataset, for messages.
         """
-        exists = [os.path.exists(path) for path in self.paths]
-        lost = sorted((i for i, is_there in enumerate(exists) if not is_there), key=self.names.__getitem__)
-        if not lost:
-            return exists
-        is_refused = missing == "refuse" or len(lost) == len(exists)
-        hint = self.hint
-        if is_refused and (outside := next((i for i in lost if not _is_safe(self.given[i])), None)) is not None:
-            place = sources[outside] if sources else where
-            more = f"; {len(lost)} of {len(exists)} image files are missing" if len(lost) > 1 else ""
-            raise DataError(
-                f"{place}: the file name {quote(self.given[outside])} is not a path below {self.folder}{hint}{more}; "
-                "rename it, or copy the file into that folder"
-            )
-        fault = f"{_missing_text(where, [str(self.paths[i]) for i in lost], len(exists))}{hint}"
-        if is_refused:
-            skip = ", or --set scene.missing=skip to train without them" if len(lost) < len(exists) else ""
-            raise DataError(f"{fault}; put them back{'' if self.strict else skip}")
-        logger.warning("%s; the scene is read without them", fault)
-        return exists
+        rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
+        if lost := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
+            fault = f"{where}: {_missing_text([str(self.paths[i]) for i in lost], len(self.paths))}"
+            for name in [self.given[i] for i in lost if not _is_safe(self.given[i])][:1]:
+                fault += f"; {quote(name)} is not a path below {self.folder}"
+            if missing == "refuse" or not rows:
+                skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
+                raise DataError(f"{fault}{self.hint}; put them back{skip}")
+            logger.warning("%s%s; the scene is read without them", fault, self.hint)
+        return rows
 
     @cached_property
     def hint(self) -> str:
         """What is there instead of the first missing file, in brackets with a space before them; "" if all exist."""
-        lost = [i for i, path in enumerate(self.paths) if not os.path.exists(path)]
-        if not lost:
+        if not self.skipped:
             return ""
-        if (several := next((i for i in lost if i in self.choices), None)) is not None:
-            choices = ["/".join(parts) for parts in self.choices[several]]
-            return f" ({first_few(choices)} fit {quote(self.given[several])} equally well)"
-        folders = Counter("/".join(parts[:-1]) or "." for files in self._files.values() for parts in files)
-        if not folders:
+        relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
+        for i, choices in self.choices.items():
+            fit = [relative[path].as_posix() for path in choices]
+            return f" ({first_few(fit)} fit {quote(self.given[i])} equally well)"
+        if not relative:
             return " (no images in that folder)"
-        used, name = {*self.paths}, PureWindowsPath(self.given[lost[0]]).name
-        free = {stem: parts[0] for stem, parts in self._files.items() if self.root.joinpath(*parts[0]) not in used}
-        near = difflib.get_close_matches(_stem(name), [*free][:MAX_COMPARED], 1)
-        nearest = f"the nearest file is {'/'.join(free[near[0]])}, " if near else ""
+        free = {_stem(path.name): name for path, name in relative.items() if path not in {*self.paths}}
+        near = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
+        nearest = f"the nearest file is {free[near[0]].as_posix()}, " if near else ""
+        folders = Counter(path.parent.as_posix() for path in relative.values())
         return f" ({nearest}searched: {first_few([folder for folder, _ in folders.most_common()])})"
+
+
+def _printable(name: str) -> str:
+    return "".join(letter if letter >= " " else "?" for letter in name)
 
 
 def _comparable(text: str) -> str:
@@ -259,27 +224,18 @@ def _comparable(text: str) -> str:
 
 def _stem(name: str) -> str:
     """Return the comparable name of an image without its suffix."""
-    path = PurePath(name.strip())
-    return _comparable(path.stem if is_image(path) or CONVERTED.fullmatch(path.suffix) else name)
+    path = PureWindowsPath(_comparable(name))
+    return path.stem if is_image(path) or CONVERTED.fullmatch(path.suffix) else path.name
 
 
-def _keys(name: str) -> tuple[str, ...]:
+def _keys(parts: Parts) -> set[str]:
     """Return the stems that files of a name may have: `a` for a.jpg, and `a.jpg` for a.jpg.png."""
-    return tuple(dict.fromkeys((_stem(name), _comparable(name))))
+    return {_stem(parts[-1]), parts[-1]} if parts else set()
 
 
-def _folded(parts: Parts) -> Parts:
-    return tuple(map(_comparable, parts))
-
-
-def _common_end(target: Parts, parts: Parts) -> int:
+def _common_end(a: Parts, b: Parts) -> int:
     """Return how many parts two paths with matching file names have in common at their ends."""
-    length = 1
-    for a, b in zip(reversed(_folded(target[:-1])), reversed(_folded(parts[:-1])), strict=False):
-        if a != b:
-            break
-        length += 1
-    return length
+    return 1 + len([*takewhile(lambda pair: pair[0] == pair[1], zip(a[-2::-1], b[-2::-1], strict=False))])
 
 
 def _divisor(folders: Sequence[str]) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path, PureWindowsPath
 
 from clsplat.core.errors import DataError, first_few, shell_quote
 from clsplat.scene.colmap import camera_views, find_models, read_images
-from clsplat.scene.images import is_image, read_header
+from clsplat.scene.images import is_image, stored_size
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock
@@ -120,8 +120,7 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
     if (path / TRANSFORMS).is_file():
         transforms = Transforms(path / TRANSFORMS)
         first = next(iter(frames.values()))[0]
-        header = read_header(first)
-        size = header.width, header.height
+        size = stored_size(first)
         posed = [view_of(frame, frame.image_name(), size) for frame in transforms.frames]
         points = transforms.points(Clock(0.0, 1.0))
     else:

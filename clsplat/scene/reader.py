@@ -71,6 +71,8 @@ class Reader(ABC):
     expects: ClassVar[str]  # the files that mark the format, in a few words
     missing: Missing = "refuse"  # what to do about missing photographs
     root: Path | None = None  # of the scene, where files are looked for; None: the folder of the dataset
+    folder: Path = Path()  # of the dataset, in `root`
+    choice: str = ""  # among several datasets
     defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -83,6 +85,13 @@ class Reader(ABC):
         if missing:
             kind = f"{type(self).__module__}.{type(self).__name__}"
             raise ConfigError(f"the reader {kind} has no {' and no '.join(missing)}; add it to the class")
+
+    @property
+    def note(self) -> str:
+        """Which dataset is read, in one sentence; "" for the only one in the scene's folder."""
+        if self.root in (None, self.folder):
+            return ""
+        return f"the {self.name} dataset in {self.folder.relative_to(self.root).as_posix()} is used{self.choice}"
 
     @abstractmethod
     def matches(self, path: Path) -> bool:

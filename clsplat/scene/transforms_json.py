@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import repeat
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -15,13 +14,13 @@ import numpy as np
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens
-from clsplat.scene.images import read_header
+from clsplat.scene.images import stored_size
 from clsplat.scene.lookup import FileLookup, Missing, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock, make_clock
-from clsplat.scene.view import NO_FILE, Floats, View, fit_to_photograph
+from clsplat.scene.view import Floats, View, fit_to_photograph
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
@@ -107,65 +106,46 @@ class Transforms:
         return safe_join(self.path.parent, given, str(self.path))
 
 
-class FrameFiles:
-    """The photographs and masks of frames of one folder, looked for below `root`."""
+class FrameFiles(FileLookup):
+    """The photographs of frames of one folder, looked for below `root`, and their masks."""
 
     def __init__(self, root: Path, folder: Path, frames: Sequence[JsonFrame]) -> None:
-        self.root, self.folder, self.frames = root, folder, frames
-        self.photographs = FileLookup(root, folder, [frame.image_name() for frame in frames], _with_png)
+        super().__init__(root, folder, [frame.image_name() for frame in frames], _with_png)
+        self.frames = frames
+        self.masks: dict[str, dict[int, Path]] = {"mask_path": {}, "static_path": {}}  # by key and frame
 
-    def layers(self, where: Path, key: str, exists: Sequence[bool]) -> list[Path | None]:
-        """Return the file `key` of each frame that exists, or None.  Raises DataError when one is missing."""
-        names = [
-            frame.file_name(key) if is_there else None for frame, is_there in zip(self.frames, exists, strict=True)
-        ]
-        rows = [i for i, name in enumerate(names) if name is not None]
-        files = FileLookup(
-            self.root, self.folder, [name for name in names if name], strict=True, taken=self.photographs.paths
-        )
-        files.existing(where, "refuse", [self.frames[i].where for i in rows])
-        paths = dict(zip(rows, files.paths, strict=True))
-        return [paths.get(i) for i in range(len(names))]
+    def find_masks(self, where: Path, rows: Sequence[int]) -> None:
+        """Find the masks of some of the frames.  Raises DataError when one is missing."""
+        for key in self.masks:
+            names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
+            files = FileLookup(self.root, self.folder, [*names.values()], strict=True, taken=self.paths)
+            files.existing(where, "refuse")
+            self.masks[key] = dict(zip(names, files.paths, strict=True))
 
-    def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View | None]:
-        """Return the view of each frame; None for missing photographs, as `missing` says.
+    def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
+        """Return the view of each frame; of those whose image is missing as `missing` says.
 
-        An image without a size in the file has that of its photograph.  Photographs of lenses with distortion are
-        undistorted when they are read.
         Raises DataError for damaged numbers and missing files.
         """
-        exists = self.photographs.existing(where, missing, [frame.where for frame in self.frames])
-        masks, still = (self.layers(where, key, exists) for key in ("mask_path", "static_path"))
-        views = list[View | None]()
-        for i, (frame, path) in enumerate(zip(self.frames, self.photographs.paths, strict=True)):
-            if not exists[i]:
-                views.append(None)
-                continue
-            view = view_of(frame, self.photographs.names[i], size_of(frame, path), path, masks[i], still[i], clock)
-            views.append(fit_to_photograph(view) if path in self.photographs.reduced else view)
-        return views
+        rows = self.existing(where, missing)
+        self.find_masks(where, rows)
+        return [self.view(i, clock) for i in rows]
 
-    def skipped(self, views: Sequence[View | None]) -> tuple[str, ...]:
-        """Return the names of missing photographs."""
-        return tuple(name for name, view in zip(self.photographs.names, views, strict=True) if view is None)
+    def view(self, i: int, clock: Clock | None = None) -> View:
+        """Return the view of a frame.  An image without a size in the file has that of its photograph.
 
-    @property
-    def renamed(self) -> dict[str, str]:
-        """The names of the views by those in the file."""
-        return dict(zip(self.photographs.given, self.photographs.names, strict=True))
+        Photographs of lenses with distortion are undistorted when they are read.  Raises DataError.
+        """
+        frame, path, masks = self.frames[i], self.paths[i], [files.get(i) for files in self.masks.values()]
+        size = None if frame.number("w") and frame.number("h") else stored_size(path)
+        view = view_of(frame, self.names[i], size, clock)
+        view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
+        return fit_to_photograph(view) if path in self.reduced else view
 
 
 def _with_png(name: str) -> list[str]:
     """Return a file name; Blender's exporter omits the suffix."""
     return [name if PurePosixPath(name).suffix else f"{name}.png"]
-
-
-def size_of(frame: JsonFrame, path: Path) -> tuple[int, int] | None:
-    """Return the size of the photograph of a frame, or None if the frame has one.  Raises DataError."""
-    if frame.number("w") and frame.number("h"):
-        return None
-    header = read_header(path)
-    return header.width, header.height
 
 
 def list_frames(parts: Parts, root: Path, *names: str) -> None:
@@ -175,16 +155,13 @@ def list_frames(parts: Parts, root: Path, *names: str) -> None:
     clock = parts.attempt(make_clock, parts.path, moments)
     frames = [frame for file in filter(None, files) for frame in file.frames]
     lookup = FrameFiles(root, parts.path, [frame for frame in frames if parts.attempt(frame.image_name)])
-    parts.expect(lookup.photographs)
+    parts.expect(lookup)
     if parts.scene is None:
-        exists = [os.path.isfile(path) for path in lookup.photographs.paths]
-        masks = parts.attempt(lookup.layers, parts.path, "mask_path", exists) or repeat(None)
-        rows = zip(lookup.frames, lookup.photographs.names, lookup.photographs.paths, masks, exists, strict=False)
-        for frame, name, path, mask, is_there in rows:
-            size = parts.attempt(size_of, frame, path) if is_there else None
-            if is_there or (frame.value("w") and frame.value("h")):  # otherwise the missing file is the only fault
-                view = parts.attempt(view_of, frame, name, size, path, mask, None, clock)
-                parts.views += [view] if view else []
+        exists = [os.path.isfile(path) for path in lookup.paths]
+        parts.attempt(lookup.find_masks, parts.path, np.flatnonzero(exists).tolist())
+        for i, frame in enumerate(lookup.frames):
+            has_size = exists[i] or (frame.value("w") and frame.value("h"))  # or else only the missing file is a fault
+            parts.views += filter(None, [parts.attempt(lookup.view, i, clock) if has_size else None])
     if files and files[0]:
         place = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, place) if place else None
@@ -197,18 +174,10 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def view_of(
-    frame: JsonFrame,
-    name: str,
-    size: tuple[int, int] | None,
-    image: Path = NO_FILE,
-    mask: Path | None = None,
-    still: Path | None = None,
-    clock: Clock | None = None,
-) -> View:
-    """Return the view of a frame; `size` is the image's where the frame has none.
+def view_of(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+    """Return the view of a frame without a photograph; `size` is the image's where the frame has none.
 
-    still: the mask of what does not move; clock: of the scene, where it moves.  Raises DataError.
+    clock: of the scene, where it moves.  Raises DataError.
     """
     lens = intern_lens(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
@@ -216,7 +185,7 @@ def view_of(
     time = None if clock is None or moment is None else float(clock(moment))
     matrix = camera_to_world_of(frame)
     pose = np.linalg.inv(matrix)[:3]
-    return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still, camera_to_world=matrix)
+    return View(name, camera, pose, lens=distortion, time=time, camera_to_world=matrix)
 
 
 def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
@@ -318,13 +287,12 @@ class BlenderReader(Reader):
         held = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
         clock = make_clock(path, transforms.moments() + (held.moments() if held else []))
         files = FrameFiles(self.root or path, path, transforms.frames + (held.frames if held else []))
-        every = files.views(path if held else transforms.path, self.missing, clock)
-        train = list(filter(None, every[: len(transforms.frames)]))
-        test = list(filter(None, every[len(transforms.frames) :]))
-        held_out = set(range(len(train), len(train) + len(test)))
+        views = files.views(path if held else transforms.path, self.missing, clock)
+        tested = {*files.names[len(transforms.frames) :]}
+        held_out = {i for i, view in enumerate(views) if view.name in tested}
         # NeRF and later papers render these scenes on white.
-        scene = make_scene(path, train + test, held_out, transforms.points(clock), background="white")
-        return replace(scene, skipped=files.skipped(every))
+        scene = make_scene(path, views, held_out, transforms.points(clock), background="white")
+        return replace(scene, skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRAIN_FILE, TEST_FILE)
@@ -353,18 +321,18 @@ class NerfstudioReader(Reader):
         transforms = Transforms(path / TRANSFORMS_FILE)
         clock = make_clock(transforms.path, transforms.moments())
         files = FrameFiles(self.root or path, path, transforms.frames)
-        every = files.views(transforms.path, self.missing, clock)
-        views, skipped = sorted(filter(None, every), key=lambda view: view.name), files.skipped(every)
-        train, test = (_listed(transforms, key, files.renamed) for key in ("train_filenames", "test_filenames"))
+        views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
+        renamed = dict(zip(files.given, files.names, strict=True))
+        train, test = (_listed(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             scene = make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
-            return replace(scene, skipped=skipped)
+            return replace(scene, skipped=files.skipped)
         test = test or set()
         kept = views if train is None else [view for view in views if view.name in train | test]
         if len(kept) < len(views):
             logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
         held_out = {i for i, view in enumerate(kept) if view.name in test}
-        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=skipped)
+        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
@@ -403,19 +371,15 @@ class MultiscaleReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)
-        first, second = (_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
-        files = FrameFiles(self.root or path, path, first + second)
-        every = files.views(path, self.missing)
-        sized = [
-            view and replace(view, downscale=2 ** (frame.number("label") or 0))
-            for frame, view in zip(files.frames, every, strict=True)
-        ]
-        train, test = list(filter(None, sized[: len(first)])), list(filter(None, sized[len(first) :]))
+        train, test = (_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
+        files = FrameFiles(self.root or path, path, train + test)
+        levels = {name: frame.number("label") or 0 for name, frame in zip(files.names, files.frames, strict=True)}
+        views = [replace(view, downscale=2 ** levels[view.name]) for view in files.views(path, self.missing)]
+        tested = {*files.names[len(train) :]}
+        held_out = {i for i, view in enumerate(views) if view.name in tested}
         points = path / POINTS
-        held_out = set(range(len(train), len(train) + len(test)))
         cloud = read_points_ply(points) if points.is_file() else None
-        scene = make_scene(path, train + test, held_out, cloud, background="white")
-        return replace(scene, skipped=files.skipped(every))
+        return replace(make_scene(path, views, held_out, cloud, background="white"), skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
 from clsplat.scene.camera import MODELS, Camera, Lens, intern_lens
-from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_header, read_image
+from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image, stored_size
 
 Floats = NDArray[np.floating]
 ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
@@ -265,15 +265,15 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
 
 def fit_to_photograph(view: View) -> View:
     """Return a view whose photograph is smaller than its camera, but of its shape, with a camera of that size."""
-    header, camera = read_header(view.image_path), view.lens or view.camera
-    across, down = header.width / camera.width, header.height / camera.height
-    if across >= 1 or abs(header.height - across * camera.height) > MAX_ROUNDING:
+    (width, height), camera = stored_size(view.image_path), view.lens or view.camera
+    across, down = width / camera.width, height / camera.height
+    if across >= 1 or abs(height - across * camera.height) > MAX_ROUNDING:
         return view
     if view.lens is None:
-        return replace(view, camera=view.camera.resized(header.width, header.height))
+        return replace(view, camera=view.camera.resized(width, height))
     scales = (*(across, down)[: MODELS[view.lens.model][0]], across, down)
     scaled = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
-    lens = intern_lens(replace(view.lens, width=header.width, height=header.height, params=scaled))
+    lens = intern_lens(replace(view.lens, width=width, height=height, params=scaled))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 

@@ -79,7 +79,7 @@ def test_a_photograph_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture,
     assert all(Path(file).name.startswith(Path(name).name) for name, file in views.items())
     lines = [line for line in caplog.messages if "matched" in line]
     assert len(lines) == 1
-    assert f"of {len(names)} w" in lines[0]
+    assert f"{len(names)} of {len(names)} photograph" in lines[0]
     assert files[0] in lines[0]
     notes = [finding.text for finding in Inspection.from_folder(scene).findings if finding.level == "note"]
     assert lines[0].removeprefix(f"{scene}: ") in notes
@@ -136,7 +136,7 @@ def test_cameras_are_scaled_to_reduced_photographs(tmp_path: Path, caplog: pytes
     assert view.image_path == scene / "images_2" / "a.jpg"
     assert (view.camera.width, view.camera.height, view.camera.fx) == (32, 24, 25.0)
     assert load_image(view).shape == (24, 32, 3)
-    assert "2 photographs of 2 were matched" in caplog.text
+    assert "2 of 2 photographs matched" in caplog.text
     assert "cameras scaled to these smaller photographs" in caplog.text
 
 
@@ -198,11 +198,18 @@ def test_of_several_models_below_the_largest_of_the_same_photographs_is_used(tmp
     write_model(tmp_path / "colmap_a" / "0", small)
     write_model(tmp_path / "colmap_b", orbit(), "txt")
     write_model(tmp_path / "colmap_c" / "0", orbit())
-    assert "colmap_c" in Inspection.from_folder(tmp_path).facts.notes[0]
+    note = "the COLMAP dataset in colmap_b is used, of 3 models of these photographs"
+    assert Inspection.from_folder(tmp_path).facts.notes == [note]
     write_model(tmp_path / "colmap_c" / "0", replace(small, images=[ImageEntry("other.png")]))
     message = refusal(read_scene, tmp_path)
     assert "has 3 datasets in its subfolders: colmap_a/0 (COLMAP), colmap_b (COLMAP), colmap_c/0 (COLMAP)" in message
     assert Inspection.from_folder(tmp_path).findings[0].text == message
+
+
+def test_several_scenes_below_are_listed(tmp_path: Path) -> None:
+    for name in ("fox", "horse"):
+        made(tmp_path / name, "colmap", ["0.jpg", "1.jpg"], ["images/0.jpg", "images/1.jpg"])
+    assert "fox (COLMAP), horse (COLMAP); give one of these" in refusal(read_scene, tmp_path)
 
 
 def test_a_transforms_file_below_is_read(tmp_path: Path) -> None:

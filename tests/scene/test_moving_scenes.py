@@ -134,7 +134,7 @@ def test_scene_without_times_is_static(tmp_path):
         ([0, None, 1], "1 of 3 frames have no `time`: .*frames[1]; expected a time in every frame or in none"),
         ([2, 2, 2], "all 3 frames have the time 2; expected at least two times"),
         ([0, float("nan"), 1], "frames[1]: time is nan; expected a number between -1e+15 and 1e+15"),
-        ([0, "1", 2], "frames[1]: time is '1'; expected a number between"),
+        ([0, "one", 2], "frames[1]: time is 'one'; expected a number between"),
         ([-1e300, 1e300, 0], "frames[0]: time is -1e+300; expected a number between"),
         ([0, 10**17, 1e17], "frames[1]: time is 100000000000000000; expected a number between -1e+15 and 1e+15"),
     ],

@@ -18,7 +18,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.progress import captured_log, counted, log_level
 from clsplat.prepare.gather import list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
-from clsplat.scene.detect import find_dataset, place_note, read_scene
+from clsplat.scene.detect import find_dataset, read_scene
 from clsplat.scene.identity import ImageFile, decode_all
 from clsplat.scene.images import CameraExposure, is_image, read_exif_exposure, read_gray
 from clsplat.scene.points import MAX_VALUE
@@ -399,12 +399,11 @@ def read_parts(path: Path) -> Parts:
             if not path.is_dir():
                 raise
             parts.refusal = str(error)
-        if found := parts.attempt(find_dataset, path):
-            reader, parts.path = found
-            parts.kind = reader.name
+        if reader := parts.attempt(find_dataset, path):
+            parts.path, parts.kind = reader.folder, reader.name
             reader.list_parts(parts)
             parts.path = path
-            parts.notes += filter(None, [place_note(path, found)])
+            parts.notes += filter(None, [reader.note])
             if parts.scene and parts.points:
                 parts.points = parts.points._replace(positions=parts.points.positions - parts.scene.origin)
     if parts.kind == "none":
