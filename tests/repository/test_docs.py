@@ -52,6 +52,7 @@ HOW_TO = (
         "blocks",
     ),
     *("formats", "viewer", "video", "live", "pipelines", "training", "moving", "nerf", "python"),
+    *("datasets", "devices", "sweeps", "deploy", "extending", "plugin_examples", "reliability", "first_scene"),
 )
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 

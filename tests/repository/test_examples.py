@@ -201,7 +201,7 @@ def test_documented_edit_methods_match_the_class():
     """Each `edit.name` of the page exists, and so do the arguments that the table gives to it."""
     gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), 1, 0, Survey(None, None, None, [], 0, 1))
-    page = (ROOT / "docs" / "extending.md").read_text()
+    page = (ROOT / "docs" / "plugin_examples.md").read_text()
     found = re.findall(r"`edit\.([\w.]+)(?:\(([^)`]*)\))?", page)
     assert {name for name, _ in found} >= {"mark", "choose", "set_rows", "room", "scene_scale.extent"}
     for name, arguments in found:

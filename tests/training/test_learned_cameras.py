@@ -42,7 +42,7 @@ def test_original_and_optimized_cameras_are_compared_fairly(rng, tmp_path, monke
     assert all(f"splat_7k-{scene}" in page for scene in ("my_scene", "learned_scene"))
 
 
-def test_the_page_has_the_commands_of_the_file():
+def test_page_has_the_commands_of_the_file():
     commands = re.findall(r"^#   (clsplat .*)$", RECIPE.read_text(), re.M)
     page = (ROOT / "docs" / "difficult_captures.md").read_text()
     assert len(commands) == 3
