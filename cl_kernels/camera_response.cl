@@ -1,8 +1,8 @@
-/* Camera response y = f(v c) of every pixel c, with the falloff v of the lens and the curve f of each channel; forward
+/* Camera response y = f(v c) of every pixel c, with the falloff v of the lens and a curve f for each channel; forward
  * and backward.
  *
  * v = 1 + a q + b q^2 + c q^3; q is the squared distance from a center, 1 at a corner of the image.
- * The slope of f is piecewise linear between NODES places from 0 to 1, and constant beyond them; f(0) = 0.
+ * The slope of f is piecewise linear between NODES nodes from 0 to 1, and constant beyond them; f(0) = 0.
  * A fourth plane is copied.  Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.
  * One group of TEAM items = one row; each sum is written once.  Deterministic. */
 #include "planes.h"
@@ -11,12 +11,12 @@
 #define SUMS (5 + 3 * NODES)  // gradients of the center, of a, b, c, and of the slopes of each channel
 
 /* Forward: the response to an image.  Backward: the gradient with respect to the image, from that with respect to the
- * response, and the row sums that give the derivatives.  numbers: a, b, c, then the slopes of each channel; center:
- * px; per_px: px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
+ * response, and the row sums from which the parameters' gradient follows.  numbers: a, b, c, then the slopes of each
+ * channel; center: px; per_px: px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void camera_response(
     __global const float *restrict image, __global const float *restrict gradient,  // [channels,H',stride] 3 or 4
-    __global float *restrict found, __global float *restrict row_sums,  // [channels,H',stride]; [SUMS,H']
+    __global float *restrict out, __global float *restrict row_sums,  // [channels,H',stride]; [SUMS,H']
     __global const float *restrict numbers, const float center_x, const float center_y, const float per_px,  // [18]
     const uint back, const uint channels, const uint width, const uint height, const uint rows, const uint stride)
 {
@@ -42,10 +42,10 @@ void camera_response(
                 total[2 + first + k] += passed * part;
             }
             grad_falloff += passed * slope * c;
-            VSTORE(back ? passed * slope * falloff : inside * value, found + at);
+            VSTORE(back ? passed * slope * falloff : inside * value, out + at);
         }
         if (channels > 3)
-            VSTORE(VLOAD((back ? gradient : image) + (3 * rows + y) * stride + x), found + (3 * rows + y) * stride + x);
+            VSTORE(VLOAD((back ? gradient : image) + (3 * rows + y) * stride + x), out + (3 * rows + y) * stride + x);
         const VF grad_q = grad_falloff * (numbers[0] + q * (2.0f * numbers[1] + q * 3.0f * numbers[2]));
         total[0] -= 2.0f * dx * grad_q;
         total[1] -= 2.0f * dy * grad_q;

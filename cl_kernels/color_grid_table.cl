@@ -15,7 +15,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_smoothness(
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict grad_smoothness,   // [ENTRIES,nz,ny,nx]
-    __global float *restrict shares,          // [ENTRIES,nz,ny,nx]
+    __global float *restrict terms,           // [ENTRIES,nz,ny,nx]
     const uint first,                         // value of the photograph
     const uint nx,
     const uint ny,
@@ -30,17 +30,17 @@ void color_grid_smoothness(
         return;
     const uint nodes[3] = {nx, ny, nz}, steps[3] = {1, nx, nx * ny};
     const float weights[3] = {weight_x, weight_y, weight_z};
-    float derivative = 0.0f, share = 0.0f;
+    float derivative = 0.0f, term = 0.0f;
     for (uint axis = 0; axis < 3; axis++) {
-        const uint place = e / steps[axis] % nodes[axis];
-        const float own = values[first + e];
-        const float after = place + 1 < nodes[axis] ? values[first + e + steps[axis]] - own : 0.0f;
-        const float before = place > 0 ? own - values[first + e - steps[axis]] : 0.0f;
+        const uint node = e / steps[axis] % nodes[axis];
+        const float value = values[first + e];
+        const float after = node + 1 < nodes[axis] ? values[first + e + steps[axis]] - value : 0.0f;
+        const float before = node > 0 ? value - values[first + e - steps[axis]] : 0.0f;
         derivative += 2.0f * weights[axis] * (before - after);
-        share += weights[axis] * after * after;
+        term += weights[axis] * after * after;
     }
     grad_smoothness[e] = derivative;
-    shares[e] = share;
+    terms[e] = term;
 }
 
 /* One update of a photograph's grid by Adam.  One item = one value. */

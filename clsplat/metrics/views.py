@@ -135,18 +135,18 @@ PIXELS = 64
 class Fitted(Protocol):
     """A color model that can be fitted to a photograph."""
 
-    fitted_to_a_channel: ClassVar[int]  # parameters per channel that `fitted` fits
+    numbers_per_channel: ClassVar[int]  # parameters per channel that `fit_matrix` fits
 
-    def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
+    def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrix, [3, 4], that fits an image to a photograph, pixels [M, 3]."""
 
 
 class Gains:
     """Gains of red, green and blue."""
 
-    fitted_to_a_channel: ClassVar[int] = 1
+    numbers_per_channel: ClassVar[int] = 1
 
-    def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
+    def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares, pixels [M, 3]."""
         squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
         gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
@@ -194,13 +194,13 @@ def in_colors_of(
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
     middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :middle], np.s_[:, middle:]
-    min_pixels = PIXELS * model.fitted_to_a_channel
+    min_pixels = PIXELS * model.numbers_per_channel
     if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
         return None
     for half, other in ((left, right), (right, left)):
         below = usable[other] & (image[other] < 1).all(axis=2)
         fitted_to = below if np.count_nonzero(below) >= min_pixels else usable[other]
-        matrix = model.fitted(image[other][fitted_to], truth[other][fitted_to])
+        matrix = model.fit_matrix(image[other][fitted_to], truth[other][fitted_to])
         changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return changed
 

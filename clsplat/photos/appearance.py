@@ -17,9 +17,9 @@ from clsplat.opencl.device import constants
 Floats = NDArray[np.float64]
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
-MEANING = "a color c of the model, red, green and blue, is min(1, E c + b) in the photograph"
+MEANING = "a color c of the model (red, green, blue) is min(1, E c + b) in the photograph"
 
-# Adam on scalars in a dictionary, which also holds their moments, and is saved in checkpoints.
+# Adam on scalars in a dictionary, which also holds their moments and is saved in checkpoints.
 
 ADAM = constants("adam.h")
 ByNumber = dict[str, float]
@@ -28,7 +28,7 @@ ByNumber = dict[str, float]
 def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
     """Update scalars by Adam (Kingma and Ba 2015), with the constants of the Gaussians' Adam.
 
-    values: current values by name; `scalars` also holds NAME/updates, NAME/moment1 and NAME/moment2.
+    values: current values by name; `scalars` also holds NAME/updates, NAME/moment1, and NAME/moment2.
     """
     beta1, beta2 = ADAM["BETA1"], ADAM["BETA2"]
     for name, value in values.items():
@@ -42,12 +42,12 @@ def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients:
         scalars |= dict(zip(names, (updates, moment1, moment2), strict=True))
 
 
-# A table with a row of parameters for each photograph; a step updates the row of its photograph.
+# A table with one row of parameters per photograph; a step updates the row of its photograph.
 
 
 @dataclass(frozen=True)
 class ViewTable:
-    """The layout of a table in a dictionary of scalars; all are 0 before the first step."""
+    """The layout of a table in a dictionary of scalars; missing scalars are 0."""
 
     name: str
     views: tuple[str, ...]  # names of the training views, each once
@@ -62,19 +62,19 @@ class ViewTable:
         """Return a row, [columns]."""
         return np.array([scalars.get(key, 0.0) for key in self.keys(view)])
 
-    def begun(self, scalars: Mapping[str, float]) -> bool:
+    def is_in(self, scalars: Mapping[str, float]) -> bool:
         """Return whether the dictionary holds the table."""
         return self.keys(self.views[0])[0] in scalars
 
     def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:
-        """Set all rows, to 0 if not given, then `center`."""
+        """Set all rows, missing ones to 0, then `center`."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
             scalars.update(zip(self.keys(view), map(float, values), strict=True))
         self.center(scalars)
 
     def update(self, scalars: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Update the row of a view by Adam, with its own update count, then `center` a centered table."""
+        """Update the row of a view by Adam, with its own update count; then `center` a centered table."""
         values = {key: scalars.get(key, 0.0) for key in self.keys(view)}
         adam_step(scalars, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:
@@ -88,20 +88,20 @@ class ViewTable:
                 scalars[key] -= mean
 
     def write(self, path: Path, rows: Mapping[str, Floats]) -> None:
-        """Write rows by the name of a view as a side file."""
-        named = {view: dict(zip(self.columns, map(float, row), strict=True)) for view, row in rows.items()}
-        write_text(path, json.dumps({"photographs": named}, indent=1) + "\n")
+        """Write rows, by view name, to a side file.  Raises OutputError."""
+        photographs = {view: dict(zip(self.columns, map(float, row), strict=True)) for view, row in rows.items()}
+        write_text(path, json.dumps({"photographs": photographs}, indent=1) + "\n")
 
     def read(self, path: Path) -> dict[str, Floats]:
-        """Return the rows of a side file by the name of a view; empty without a file.
+        """Read the rows of a side file, by view name; empty if there is no file.
 
         Raises DataError if it is damaged.
         """
         if not path.is_file():
             return {}
         try:
-            named = read_json(path, f"{self.name} of photographs")["photographs"].items()
-            rows = {view: np.array([float(row[column]) for column in self.columns]) for view, row in named}
+            items = read_json(path, f"{self.name} of photographs")["photographs"].items()
+            rows = {view: np.array([float(row[column]) for column in self.columns]) for view, row in items}
         except (AttributeError, KeyError, TypeError, ValueError):
             rows = {"": np.array([np.nan])}
         if not all(np.isfinite(row).all() for row in rows.values()):

@@ -1,8 +1,8 @@
-"""Estimate the relative exposures of photographs from the pixels in which they show the same points.
+"""Estimate the relative exposures of photographs from pixels that show the same points.
 
-For each channel, ln y = e + a, with the exposure e of a photograph and the color a of a point.  Both minimize the sum
-of |ln y - e - a| exp(a), which is robust to hidden, glossy or misplaced points, and weights differences as they appear
-in the image, where haze on a dark point is small.  The solver is iteratively reweighted least squares, by conjugate
+For each channel, ln y = e + a, with the exposure e of a photograph and the color a of a point.  They minimize the sum
+of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced points, and weights differences as they appear
+in the image, where haze on a dark point is small.  The solver is iteratively reweighted least squares, with conjugate
 gradients on sums in a fixed order.
 """
 
@@ -19,13 +19,13 @@ from clsplat.photos.photographs import Mask
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View, load_exposures
 
-DARKEST, BRIGHTEST = 0.05, 0.95  # valid values; beyond them, noise and clipping dominate
+DARKEST, BRIGHTEST = 0.05, 0.95  # bounds of valid values; beyond them, noise and clipping dominate
 SIDE = 3  # px, side of the square around a point that is averaged
-GAMMA = 2.2  # of the values of images
-MIN_VALUES = 20  # per photograph
-ROUNDS = 10
+GAMMA = 2.2  # of image values
+MIN_VALUES = 20  # per photograph and channel
+ROUNDS = 10  # of reweighting
 EXACT = 0.01  # log units: smaller differences do not get larger weights
-CONVERGED = 1e-6  # of the first residual
+TOLERANCE = 1e-6  # relative to the first residual
 ROUNDING = 1e-9  # log units: differences that count as zero
 Integers = NDArray[np.intp]
 Read = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
@@ -33,11 +33,11 @@ Read = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
 
 @dataclass(frozen=True)
 class Exposures:
-    """Log gains of red, green and blue, [3], by the name of a view; their mean is 0."""
+    """Log gains of red, green, and blue, [3], by view name; their mean is 0."""
 
     log_gains: dict[str, Floats]
     source: str  # in words
-    explained: float = 1.0  # share of the differences between photographs of one point that the gains remove
+    explained: float = 1.0  # fraction of the differences between photographs of the same point that gains remove
 
     @property
     def spread(self) -> float:
@@ -52,15 +52,15 @@ class Exposures:
         return f"exposures of {len(self.log_gains)} photographs differ by {self.spread:.1%} {self.source}"
 
 
-UNKNOWN = Exposures({}, "exposures are unknown, from tracks as well as from EXIF")
+UNKNOWN = Exposures({}, "neither tracks nor EXIF give exposures")
 
 
-def noted(views: Sequence[View]) -> Exposures:
-    """Return exposures from EXIF: EV = log2(t ISO / N²), with a gamma of 2.2.
+def read_exposures(views: Sequence[View]) -> Exposures:
+    """Return exposures from EXIF, EV = log2(t ISO / N²), with a gamma of 2.2.
 
     Real tone curves differ, so this is only an initial value.
     """
-    values = {view.name: known.value for view, known in zip(views, load_exposures(views), strict=True) if known}
+    values = {view.name: exif.value for view, exif in zip(views, load_exposures(views), strict=True) if exif}
     if not values:
         return UNKNOWN
     mean = math.fsum(values.values()) / len(values)
@@ -68,26 +68,26 @@ def noted(views: Sequence[View]) -> Exposures:
     return Exposures(gains, "by EXIF")
 
 
-def with_noted(shown: Exposures, noted: Exposures) -> Exposures:
+def complete_exposures(measured: Exposures, exif: Exposures) -> Exposures:
     """Complete exposures measured on tracks by those from EXIF.
 
     Those from EXIF are shifted by the mean difference over the photographs that have both; if there are none, they are
     not used.
     """
-    if not shown.log_gains:
-        return noted
-    both, more = ([name for name in noted.log_gains if (name in shown.log_gains) is known] for known in (True, False))
+    if not measured.log_gains:
+        return exif
+    both, more = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
     if not both or not more:
-        return shown
-    apart = np.mean([shown.log_gains[name] - noted.log_gains[name] for name in both], axis=0)
-    found = {**shown.log_gains, **{name: noted.log_gains[name] + apart for name in more}}
-    mean = np.mean(list(found.values()), axis=0)
-    source = f"{shown.source}, those of {len(more)} {noted.source}"
-    return Exposures({name: gains - mean for name, gains in found.items()}, source, shown.explained)
+        return measured
+    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in both], axis=0)
+    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in more}}
+    mean = np.mean(list(combined.values()), axis=0)
+    source = f"{measured.source}, those of {len(more)} {exif.source}"
+    return Exposures({name: gains - mean for name, gains in combined.items()}, source, measured.explained)
 
 
-def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
-    """Measure the exposures of photographs on tracks; views of a name that was seen before are skipped.
+def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
+    """Measure the exposures of photographs on tracks; of views with the same name, only the first is used.
 
     read: returns the photograph of a view, [height, width, 3], and its mask.
     """
@@ -97,28 +97,28 @@ def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
     per_view = [samples(tracks, view, *read(view)) for view in by_name.values()]
     photograph = np.repeat(np.arange(len(per_view)), [len(rows) for rows, _ in per_view])
     point, values = (np.concatenate([part[i] for part in per_view]) for i in (0, 1))
-    log_gains, shared, left = np.full((len(per_view), 3), np.nan), 0, np.zeros(2)
+    log_gains, shared, residuals = np.full((len(per_view), 3), np.nan), 0, np.zeros(2)
     for channel in range(3):
         usable = (values[:, channel] > DARKEST) & (values[:, channel] < BRIGHTEST)
         photographs = np.bincount(point[usable], minlength=len(tracks.positions))
         usable &= photographs[point] > 1
         shared = max(shared, int(np.count_nonzero(photographs > 1)))
         parts = photograph[usable], point[usable], values[usable, channel], len(per_view)
-        log_gains[:, channel], with_gains = _fitted(*parts)
-        left += with_gains, _fitted(*parts, rounds=0)[1]
-    known = np.isfinite(log_gains).all(axis=1)
-    log_gains -= log_gains[known].mean(axis=0) if known.any() else 0
-    explained = float(1 - left[0] / left[1]) if left[1] > 0 else 0.0
-    source = f"at {shared:,} points, which is {explained:.0%} of what differs between photographs of one point"
-    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if known[i]}, source, explained)
+        log_gains[:, channel], with_gains = _fit(*parts)
+        residuals += with_gains, _fit(*parts, rounds=0)[1]
+    is_known = np.isfinite(log_gains).all(axis=1)
+    log_gains -= log_gains[is_known].mean(axis=0) if is_known.any() else 0
+    explained = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
+    source = f"at {shared:,} points, which explains {explained:.0%} of the variance between photographs of a point"
+    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, explained)
 
 
 def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
-    """Return the points in a photograph, rows [S], and their colors there, [S, 3] in [0, 1]."""
+    """Return the rows of the points in a photograph, [S], and their colors there, [S, 3] in [0, 1]."""
     rows = tracks.seen.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
-    turned = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # no sum depends on threads
-    x, y, z = turned + view.world_to_camera[:, 3:]
+    rotated = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # independent of threads
+    x, y, z = rotated + view.world_to_camera[:, 3:]
     in_front = z > 0
     depth = np.where(in_front, z, 1)
     xy = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
@@ -130,40 +130,40 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
     return rows[inside], sums[row[inside], column[inside]] / (255.0 * SIDE**2)
 
 
-def _fitted(
+def _fit(
     photograph: Integers, point: Integers, values: Floats, count: int, rounds: int = ROUNDS
 ) -> tuple[Floats, float]:
-    """Return the exposures of photographs, [count], NaN for one with too few values, and the sum of residuals.
+    """Return the exposures of photographs, [count], NaN for those with too few values, and the sum of residuals.
 
     rounds: 0 to keep all exposures equal.
     """
     exposures, logarithms, weights = np.zeros(count), np.log(values), np.ones(len(values))
-    left = np.zeros(len(values))
+    residuals = np.zeros(len(values))
     for number in range(ROUNDS):
         if number < rounds:
             exposures += _corrections(photograph, point, logarithms - exposures[photograph], weights, count)
-        of_points = _means(point, logarithms - exposures[photograph], weights)[point]
-        left = np.abs(logarithms - exposures[photograph] - of_points)
-        weights = np.exp(of_points) / np.maximum(left, EXACT)
-    few = np.bincount(photograph, minlength=count) < MIN_VALUES
-    return np.where(few, np.nan, exposures), float(left.sum())
+        colors = _means(point, logarithms - exposures[photograph], weights)[point]
+        residuals = np.abs(logarithms - exposures[photograph] - colors)
+        weights = np.exp(colors) / np.maximum(residuals, EXACT)
+    has_too_few = np.bincount(photograph, minlength=count) < MIN_VALUES
+    return np.where(has_too_few, np.nan, exposures), float(residuals.sum())
 
 
-def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: Floats, count: int) -> Floats:
-    """Return the exposures, [count], that fit `rest` best with a color per point, by conjugate gradients."""
+def _corrections(photograph: Integers, point: Integers, target: Floats, weights: Floats, count: int) -> Floats:
+    """Return the exposures, [count], that fit `target` best with a color per point, by conjugate gradients."""
 
-    def gathered(values: Floats) -> Floats:
-        left = weights * (values - _means(point, values, weights)[point])
-        return np.bincount(photograph, left, minlength=count).astype(np.float64)
+    def apply(values: Floats) -> Floats:
+        differences = weights * (values - _means(point, values, weights)[point])
+        return np.bincount(photograph, differences, minlength=count).astype(np.float64)
 
-    solution, residual = np.zeros(count), gathered(rest)
+    solution, residual = np.zeros(count), apply(target)
     direction, square = residual.copy(), float((residual**2).sum())
-    of_rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
-    goal = max(CONVERGED**2 * square, float((of_rounding**2).sum()))
+    rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
+    goal = max(TOLERANCE**2 * square, float((rounding**2).sum()))
     for _ in range(count):
         if square <= goal:
             break
-        image = gathered(direction[photograph])
+        image = apply(direction[photograph])
         step = square / float((direction * image).sum())
         solution, residual = solution + step * direction, residual - step * image
         before, square = square, float((residual**2).sum())
@@ -172,6 +172,6 @@ def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: F
 
 
 def _means(group: Integers, values: Floats, weights: Floats) -> Floats:
-    """Return weighted means of groups; 0 for an empty one."""
+    """Return the weighted means of groups; 0 for empty groups."""
     sums = np.bincount(group, weights)
     return np.bincount(group, weights * values) / np.where(sums > 0, sums, 1)

@@ -23,7 +23,7 @@ from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, spli
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_yaml, yaml_text
 from clsplat.prepare.cache import PlannedStep, plan
 from clsplat.scene.quality import Measures
-from clsplat.training.stage import Scheduled, Stage, Training, written_twice
+from clsplat.training.stage import Scheduled, Stage, Training, find_output_conflict
 
 LOG = logging.getLogger("clsplat")
 
@@ -303,10 +303,10 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
             raise ConfigError(
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
-        removed |= dict.fromkeys(available & stage.takes, f"stages[{i}] {stage.stage}")
-        available = (available - stage.takes) | stage.makes
+        removed |= dict.fromkeys(available & stage.removes, f"stages[{i}] {stage.stage}")
+        available = (available - stage.removes) | stage.makes
         if isinstance(stage, Training):
-            available.update(part for inner in stage.acting(step) for part in inner.makes)
+            available.update(part for inner in stage.active_stages(step) for part in inner.makes)
             step += stage.steps
-    if file := written_twice(settings.stages):
+    if file := find_output_conflict(settings.stages):
         raise ConfigError(f"{path}: two stages write '{file}'; give one of them another name")

@@ -31,7 +31,7 @@ from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import MissingViewError
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.sky_choice import choose_sky, sky_share
+from clsplat.training.modules.sky_choice import choose_sky, sky_fraction
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -246,7 +246,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
-            pipeline = adapted(pipeline, measure_scene(run.scene, lambda: sky_share(run)))
+            pipeline = adapted(pipeline, measure_scene(run.scene, lambda: sky_fraction(run)))
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
         pipeline = _with_modules(pipeline, run)

@@ -48,7 +48,7 @@ def start_refit_if_due(run: Run) -> None:
         len(run.original.train) + len(run.original.validation),
         run.best.measured.step,
     )
-    run.records.set_aside()
+    run.records.move_to_trial()
     run.restart_for_refit(run.best.model_copy(update={"refit": "begun"}))
 
 
@@ -168,7 +168,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     previous = previous_sums(pipeline, run) if restored else {}
     run.status.enter("running", step=run.step)  # before this line, an error leaves the folder unchanged
     save_checksums(run, previous)
-    checkpoint.drop_later(run.out, restored)
+    checkpoint.rename_damaged(run.out, restored)
     write_pipeline(pipeline, run)
     write_inputs(run)
     if run.prepared:
@@ -197,7 +197,7 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     """
     restored, remarks = checkpoint.restore(run)
     if restored:
-        require_same_inputs(run.scene.path, run.identity, run.out, run.inputs_before)
+        require_same_inputs(run.scene.path, run.identity, run.out, run.resumed_inputs)
         stage = pipeline.stages[run.stage_index] if run.stage_index < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(

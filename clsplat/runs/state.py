@@ -49,7 +49,7 @@ class RunState:
         names = frozenset[str]()
         with suppress(OSError):
             names = frozenset(path.name for path in out.iterdir())
-        return cls(out, names, read_status(out), tuple(checkpoint.saved(out)), read_sums(out))
+        return cls(out, names, read_status(out), tuple(checkpoint.list_files(out)), read_sums(out))
 
     @cached_property
     def phase(self) -> Phase:

@@ -139,7 +139,7 @@ def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, until: float) 
 
     until: deadline, s, on the clock.  Raises ConfigError as `rehearse` does.
     """
-    steps, started, trend = min(STEPS, pipeline.settings.training.rehearsed), time.perf_counter(), 0.0
+    steps, started, trend = min(STEPS, pipeline.settings.training.rehearsal_steps), time.perf_counter(), 0.0
     rehearsal = rehearse(pipeline, run, steps, minutes, until)
     while time.perf_counter() - started < MIN_FRACTION * 60 * minutes:
         previous, steps, started = rehearsal, LONGER * steps, time.perf_counter()
@@ -190,7 +190,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
 def min_steps_of(pipeline: Pipeline) -> int:
     """Return the minimum number of training steps: no fewer than a rehearsal, and edits stay at different steps."""
     training = pipeline.settings.training
-    return max(min(STEPS, training.rehearsed), min_steps(training))
+    return max(min(STEPS, training.rehearsal_steps), min_steps(training))
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:

@@ -35,9 +35,9 @@ class Cleanup(Stage):
 
     stage: Literal["cleanup"] = "cleanup"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    takes: ClassVar[frozenset[str]] = frozenset({"stats"})
+    removes: ClassVar[frozenset[str]] = frozenset({"stats"})
     edits: ClassVar[bool] = True
-    edits_last: ClassVar[bool] = True
+    marks_edit: ClassVar[bool] = True
 
     rules: list[OneOf[Rule]] = Field(
         [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
@@ -188,7 +188,7 @@ class ReduceSh(Scheduled):
         dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
         gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
-            run.adam.forget("sh_rest")
+            run.adam.reset_moments("sh_rest")
         LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
 
 

@@ -98,7 +98,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model", "painter"})
-    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "palette", "field", "metrics"})
+    removes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "palette", "field", "metrics"})
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model"] = "auto"

@@ -20,7 +20,7 @@ from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.best_model import Best, Measured
+from clsplat.training.best_model import Best, Scores
 from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
@@ -88,7 +88,7 @@ class ValidatedTraining(Training):
         every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
         return min(self.steps, fire_step(every, 1 + self.patience)) + (fire_step(every, 1) if self.refit else 0)
 
-    def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+    def in_order(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return all stages of `during` in the order in which they run.
 
         The measurements of `keep: best` come first, since they may end the training.
@@ -121,14 +121,14 @@ class ValidatedTraining(Training):
         if self.keep == "last":
             return
         last = first + self.steps
-        stages = [stage for stage in self.in_turn(self.during) if _validates(stage)]
+        stages = [stage for stage in self.in_order(self.during) if _validates(stage)]
         if not any(stage.due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs a measurement of the validation views until the last step; lower "
                 "the `every` of `evaluate` in `during`, or remove it: one is then added"
             )
 
-    def judge(self, run: Run, stage: Scheduled) -> None:
+    def after_stage(self, run: Run, stage: Scheduled) -> None:
         """After a measurement of the validation views, keep the model if it is the best so far."""
         if self.keep == "last" or not _validates(stage):
             return
@@ -137,9 +137,9 @@ class ValidatedTraining(Training):
         train, validation = compared(measured)
         if train is None or validation is None:  # measured at another size, or everything is masked
             return
-        best, now = run.best, Measured(step=run.step, train=train, validation=validation)
+        best, now = run.best, Scores(step=run.step, train=train, validation=validation)
         if best is not None and not validation > best.measured.validation:
-            run.best = best.after(now)
+            run.best = best.with_last(now)
             return
         first_overfit = (best and best.first_overfit) or (now if now.is_overfit else None)
         tables, evaluations = copy_model(run), best.evaluations + 1 if best else 1
@@ -166,7 +166,7 @@ class ValidatedTraining(Training):
         ended = best is not None and self.patience is not None and best.since_best >= self.patience
         return ended or run.stage_step >= self.steps
 
-    def leave(self, run: Run) -> None:
+    def finish(self, run: Run) -> None:
         """At the end of the training, replace the last model by the best one."""
         best = run.best
         if self.keep == "last" or best is None or best.ended is not None:
@@ -280,8 +280,8 @@ class Optimize(ValidatedTraining):
         for module in (*implied_modules(run, self), *self.modules):
             module.check_run(run)
 
-    def leave(self, run: Run) -> None:
-        super().leave(run)
+    def finish(self, run: Run) -> None:
+        super().finish(run)
         for stage in self.during:
             stage.finish(run)
 
@@ -296,7 +296,7 @@ class Optimize(ValidatedTraining):
             memory.check(count, more_room(run))
         is_tight = memory.host or memory.limit < ROOMY * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
-        forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
+        forecast = Forecast.from_rules(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
@@ -314,7 +314,7 @@ class Optimize(ValidatedTraining):
                 seconds.clear()
             self.end_step(run)
             yield view
-        self.leave(run)  # a resumed run may have no step left
+        self.finish(run)  # a resumed run may have no step left
         for module in trainer.modules:
             module.write(run)
 
@@ -345,7 +345,7 @@ class Optimize(ValidatedTraining):
         place_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates = self.rates.settled(views.full_size(last))
+        rates = self.rates.resolve(views.full_size(last))
         states: list[ModuleState] = attach_modules(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, self.update
         return StepTrainer(*parts, *trained, modules=states)

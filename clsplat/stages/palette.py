@@ -73,7 +73,7 @@ class PaletteSh(Scheduled):
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - harmonics.values))
         set_clusters(gaussians, harmonics.labels, error.weights)
         if run.adam is not None:
-            run.adam.forget("sh_rest")
+            run.adam.reset_moments("sh_rest")
         vectors = pluralize(len(harmonics.palette), "vector")
         LOG.info("%s in the palette of %s", vectors, pluralize(gaussians.count, "Gaussian"))
 

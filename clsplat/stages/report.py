@@ -23,10 +23,10 @@ from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS, position_text
 from clsplat.scene.view import View, sample_views
 from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
-from clsplat.training.best_model import Measured
+from clsplat.training.best_model import Scores
 from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.modules.sky_choice import sky_advice
-from clsplat.training.records import VIEWS, over_views
+from clsplat.training.records import VIEWS, moving_average
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
@@ -152,7 +152,7 @@ def training_charts(run: Run) -> list[Markup]:
     train = run.records.read("train")
     measured, trial = _measured(run), _measured(run, trial=True)
     running = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
-    psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
+    psnr = list(zip([r["step"] for r in train], moving_average([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
     seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], running)
     return safe_charts(
@@ -235,7 +235,7 @@ def is_overfit(run: Run) -> bool:
     return now is not None and now.is_overfit
 
 
-def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
+def _psnr_elsewhere(run: Run) -> tuple[str, Scores | None]:
     """Return a split that was not trained on, and the last PSNR there and at training views.
 
     Validation views are preferred to test views; training views that were not measured count as in the log.
@@ -245,7 +245,7 @@ def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
         measured = [line for line in lines if line["split"] == split]
         train = _training(run, lines, measured[-1]["step"]) if measured else None
         if train is not None:
-            return split, Measured(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
+            return split, Scores(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
     return "", None
 
 
@@ -253,7 +253,7 @@ def _training(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
     """Return the PSNR at training views, dB, as measured at a step, or else as logged up to it."""
     measured = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
     reports = [line["psnr"] for line in run.records.read("train") if line["step"] <= step]
-    return measured[-1] if measured else over_views(reports)[-1] if reports else None
+    return measured[-1] if measured else moving_average(reports)[-1] if reports else None
 
 
 # The time of a training step on the device.

@@ -50,7 +50,7 @@ class ResetOpacity(Scheduled):
             return
         cap_opacity(run.model.gaussians, self.value)
         if run.adam is not None:
-            run.adam.forget("logit_opacity")
+            run.adam.reset_moments("logit_opacity")
 
     def _acts(self, run: Run) -> bool:
         return self.when_background in (None, run.photographs.background_name)
@@ -85,16 +85,16 @@ class AverageParameters(Scheduled):
     conflicts = ALL_HARMONICS
 
     def attach(self, run: Run) -> None:
-        adam.attach(run.model.gaussians)
+        adam.attach_average(run.model.gaussians)
 
     def run(self, run: Run) -> None:
         self.attach(run)
-        adam.add(run.model.gaussians)
+        adam.add_to_average(run.model.gaussians)
 
     def finish(self, run: Run) -> None:
         if adam.has_average(run.model.gaussians):  # a resumed run may have replaced the parameters before
             if not any(map(self.due, range(run.step - run.stage_step + 1, run.step))):  # no edit follows the last step
                 LOG.info("average: the training ended before its first step; the model is that of the last step")
             with run.editing_tables():
-                adam.take(run.model.gaussians)
+                adam.take_average(run.model.gaussians)
                 run.refresh_filter()

@@ -34,10 +34,10 @@ class TrainField(Training):
 
     stage: Literal["train_field"] = "train_field"
     makes: ClassVar[frozenset[str]] = frozenset({"painter", "field"})
-    takes: ClassVar[frozenset[str]] = frozenset({"model"})
+    removes: ClassVar[frozenset[str]] = frozenset({"model"})
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "coarse_weight", "epsilon"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"warm_up"})
-    rehearsed: ClassVar[int] = 20  # since all steps take the same time
+    rehearsal_steps: ClassVar[int] = 20  # since all steps take the same time
 
     field: FieldShape = FieldShape()
     """Network and samples."""
@@ -86,7 +86,7 @@ class TrainField(Training):
         self.check_run(run)
         field = run.learned_field = self._field(run)
         last = run.step - run.stage_step + self.steps
-        pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.of(run.step, last, [])
+        pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.from_rules(run.step, last, [])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
@@ -145,7 +145,7 @@ class TrainField(Training):
         loss, error = field.loss(self.coarse_weight)
         broken = field.not_finite()
         if broken or not math.isfinite(loss):
-            raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.set_aside(run, broken)}")
+            raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.save_failed(run, broken)}")
         return loss, -10 * math.log10(max(error, 1e-12))
 
 

@@ -42,7 +42,7 @@ def copy_result(source: Path, target: Path) -> None:
     Raises OutputError.
     """
     with raising_output_error(target):
-        for old in (target / MANIFEST, *checkpoint.saved(target)):  # the checkpoints may belong to another run
+        for old in (target / MANIFEST, *checkpoint.list_files(target)):  # the checkpoints may belong to another run
             old.unlink(missing_ok=True)
         copy_files(source, target, {LEASE, ERRORS, MANIFEST})
         link_or_copy(source / MANIFEST, target / MANIFEST)

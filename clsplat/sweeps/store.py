@@ -231,7 +231,9 @@ class CellAttempt:
 
 def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
     """Yield the readable checkpoints of attempts, the newest first: rank, file and attempt."""
-    saved = [(_rank_of(path.name), path, attempt) for attempt in attempts for path in checkpoint.saved(attempt.path)]
+    saved = [
+        (_rank_of(path.name), path, attempt) for attempt in attempts for path in checkpoint.list_files(attempt.path)
+    ]
     for rank, path, attempt in sorted(saved, key=lambda entry: entry[0], reverse=True):
         try:
             checkpoint.load(path)

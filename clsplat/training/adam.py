@@ -1,4 +1,4 @@
-"""Optimize the tables of Gaussians by Adam, with a learning rate for each, and average them over steps."""
+"""Optimize the tables of Gaussians by Adam, with one learning rate per table, and average them over steps."""
 
 from collections.abc import Collection
 from typing import Annotated, Any, ClassVar, Literal
@@ -26,7 +26,7 @@ class FullSizeDecay(Settings):
     step_keys: ClassVar[frozenset[str]] = frozenset({"until"})
 
     start: Literal["full_size"]
-    """`full_size`: the decay starts at the first step with photographs at full size."""
+    """`full_size`: the decay starts at the first step with full-size photographs."""
     until: Annotated[int, Field(gt=0)]
     """Global step at which the rate is final."""
     initial: Annotated[float, Field(gt=0)]
@@ -62,37 +62,37 @@ class Rates(Settings):
     sh_base: NonNegative = 2.5e-3
     """Of the spherical harmonics of degree 0."""
     sh_rest: NonNegative = 1.25e-4
-    """Of the higher degrees, which cost most time; at 0, they and their moments are not updated."""
+    """Of the higher degrees, which cost the most time; at 0, they and their moments are not updated."""
     motion: MotionRates = MotionRates()
     """Of the motion, if Gaussians move."""
 
     def times(self, factor: float) -> "Rates":
-        """Return all rates times a factor."""
+        """Return all rates multiplied by a factor."""
         values = {name: getattr(self, name) for name in PARAMETERS}
-        times = {name: _times(value, factor) for name, value in values.items()}
-        return self.model_copy(update={**times, "motion": self.motion.times(factor)})
+        scaled = {name: _times(value, factor) for name, value in values.items()}
+        return self.model_copy(update={**scaled, "motion": self.motion.times(factor)})
 
-    def settled(self, full_size: int) -> "Rates":
-        """Return rates that depend only on the step.  full_size: first step with photographs at full size."""
+    def resolve(self, full_size: int) -> "Rates":
+        """Return rates that depend only on the step.  full_size: first step with full-size photographs."""
         if not isinstance(self.means, FullSizeDecay):
             return self
         return self.model_copy(update={"means": self.means.from_step(full_size)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step, by name of parameter and of field of the motion.
+        """Return the rates at a global step by the names of parameters and of motion fields.
 
-        Raises ConfigError if `settled` was not called.
+        extent: of the scene, scene units.  Raises ConfigError unless `resolve` was called.
         """
         if isinstance(self.means, FullSizeDecay):
             raise ConfigError(
-                "a rate with `start: full_size` needs the first step at full size; use the rates that `settled(step)` "
+                "a rate with `start: full_size` needs the first step at full size; use the rates that `resolve(step)` "
                 "returns"
             )
         rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
         return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
-Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, some of them later
+Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, but some of them later
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
@@ -101,10 +101,10 @@ class Adam:
     """Adam (Kingma and Ba 2015), with moments in tables next to the parameters and one update count per parameter.
 
     With rows `seen`, a Gaussian that is culled in the view (no pixel of the photograph with an alpha of 1/255 or more)
-    keeps its parameters and moments, whatever the gradients of penalties.  Bias correction uses the update count of the
+    keeps its parameters and moments, even if penalties have gradients.  Bias correction uses the update count of the
     parameter, although a row may have had fewer updates; published kernels (Taming 3DGS) omit the correction.
 
-    With rows `deferred`, the updates of `sh_rest` are done when a view sees a Gaussian: bit-identical to `all`.
+    With rows `deferred`, `sh_rest` of a Gaussian is updated when a view sees it; results are bit-identical to `all`.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
@@ -127,7 +127,7 @@ class Adam:
         Returns the gradient of the projected means, [2, S] px⁻¹, valid until the next update.
         """
         gaussians = self.gaussians
-        rows = self._possible(rows)
+        rows = self._effective_rows(rows)
         grad_mean2d = self._mean2d()
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
         deferred = self._deferred(rows, model, rates)
@@ -148,7 +148,7 @@ class Adam:
             pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
         )
-        self._end(deferred, frame, arguments["sh_rest_rate"], arguments["sh_rest_correction2"])
+        self._record_sh(deferred, frame, arguments["sh_rest_rate"], arguments["sh_rest_correction2"])
         return grad_mean2d
 
     def step(
@@ -164,7 +164,7 @@ class Adam:
 
         Harmonics above the active degree are skipped, since their gradients and moments are zero.
         """
-        gaussians, rows = self.gaussians, self._possible(rows)
+        gaussians, rows = self.gaussians, self._effective_rows(rows)
         deferred = None if "sh_rest" in without else self._deferred(rows, model, rates)
         for name in PARAMETERS:
             if name in without or (name == "sh_rest" and not rates[name]):
@@ -191,13 +191,13 @@ class Adam:
                 count=gaussians.count,
             )
             if name == "sh_rest":
-                self._end(deferred, frame, rate, correction2)
+                self._record_sh(deferred, frame, rate, correction2)
         if gaussians.is_moving and MOTION not in without:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
     def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
-        """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none is."""
+        """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none are."""
         gaussians = self.gaussians
         if rows != "deferred":
             if gaussians.deferred:
@@ -210,39 +210,39 @@ class Adam:
         return gaussians.deferred
 
     def _mean2d(self) -> Array:
-        """Return the array for the gradient of the projected means; edits change its size."""
+        """Return the array for the gradient of the projected means, [2, S]; edits change its size."""
         shape = (2, self.gaussians.capacity)
         if self._grad_mean2d is None or self._grad_mean2d.shape != shape:
-            self._grad_mean2d = None  # released before its successor is allocated
+            self._grad_mean2d = None  # frees the old array before the new one is allocated
             self._grad_mean2d = self.gaussians.device.empty(shape)
         return self._grad_mean2d
 
-    def _possible(self, rows: Rows) -> Rows:
+    def _effective_rows(self, rows: Rows) -> Rows:
         """Return the rows to update: harmonics on the host are always updated later, when a view sees them."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
-    def _end(self, deferred: DeferredUpdates | None, frame: Frame, rate: float, correction2: float) -> None:
-        """Record that the rows in the view have had this update of `sh_rest`."""
+    def _record_sh(self, deferred: DeferredUpdates | None, frame: Frame, rate: float, correction2: float) -> None:
+        """Record that the rows in the view have received this update of `sh_rest`."""
         if deferred:
             deferred.record(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:
             self.gaussians.on_host.start_download()
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
-        """Return the bias-corrected rate and the correction of moment 2 for a parameter's next update."""
+        """Return the bias-corrected rate and the correction of moment 2 for a parameter's next update; count it."""
         self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
         updates = max(self.updates[name], 1)
         return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
-    def forget(self, name: str) -> None:
-        """Reset the moments of one parameter."""
+    def reset_moments(self, name: str) -> None:
+        """Set the moments of one parameter to zero."""
         self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
 
 
 # The average of the parameters over steps, in tables next to them (Polyak and Juditsky 1992).
 
-FOLDER = "average/"  # prefix of the names of parameters
-NUMBER = f"{FOLDER}number"  # of steps in the average of a row
+FOLDER = "average/"  # prefix of parameter names
+NUMBER = f"{FOLDER}number"  # number of steps in the average of a row
 
 
 def has_average(gaussians: Gaussians) -> bool:
@@ -250,7 +250,7 @@ def has_average(gaussians: Gaussians) -> bool:
     return NUMBER in gaussians.tables
 
 
-def attach(gaussians: Gaussians) -> None:
+def attach_average(gaussians: Gaussians) -> None:
     """Add empty tables for averages, if missing.  Rows of new Gaussians start empty."""
     if not has_average(gaussians):
         for name in gaussians.trained:
@@ -258,7 +258,7 @@ def attach(gaussians: Gaussians) -> None:
         gaussians.add(NUMBER, 1, zero_fresh=True)
 
 
-def add(gaussians: Gaussians) -> None:
+def add_to_average(gaussians: Gaussians) -> None:
     """Add the current parameters to their averages."""
     program, count = gaussians.device.program("average.cl"), gaussians.count
     for name in gaussians.trained:
@@ -273,8 +273,8 @@ def add(gaussians: Gaussians) -> None:
     program.count_step(items=count, number=gaussians[NUMBER], count=count)
 
 
-def take(gaussians: Gaussians) -> None:
-    """Replace the parameters by their averages, where a row has one, and remove the tables."""
+def take_average(gaussians: Gaussians) -> None:
+    """Replace the parameters of rows that have an average by it, and remove the averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

@@ -1,10 +1,10 @@
-"""Write and read named arrays and notes in an .npz file that detects damage: every object has a SHA-256.
+"""Write and read named arrays and notes in an .npz file in which each object has a SHA-256, to detect damage.
 
     NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the notes
-    meta.npy          the notes: JSON, with the key `sha256` by name of array
+    meta.npy          the notes: JSON, with the hashes of arrays by name under the key `sha256`
     meta_sha256.npy   the SHA-256 of meta.npy
 
-NumPy can read the arrays.  A changed byte is detected, unless it has no meaning, such as one in a time stamp.
+NumPy can read the arrays.  A changed byte is detected, unless it is unused, such as those of time stamps.
 """
 
 import errno
@@ -23,13 +23,13 @@ from clsplat.core.errors import DataError, OutputError, one_line, shorten
 from clsplat.core.reading import open_regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
-DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a place before the beginning, a folder, a bad part of the disk
+DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a seek before the start, a folder, a bad sector
 Notes = dict[str, Any]
 Arrays = dict[str, NDArray[np.float32]]
 
 
 def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> None:
-    """Write arrays and notes, which are JSON; one array is held in memory at a time."""
+    """Write arrays, and notes as JSON; only one array is in memory at a time."""
     with zipfile.ZipFile(file, "w") as archive:
         digests = {name: _add(archive, name, array) for name, array in arrays}
         digest = _add(archive, META, np.array(json.dumps({**notes, DIGESTS: digests})))
@@ -37,7 +37,7 @@ def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.f
 
 
 def read(path: Path) -> tuple[Notes, Arrays]:
-    """Return notes and arrays.  Raises DataError, with only the reason, if the file is damaged.
+    """Read notes and arrays.  Raises DataError, with only the reason, if the file is damaged.
 
     Raises OutputError or MemoryError if the system cannot read it, which does not mean that it is damaged.
     """
@@ -65,13 +65,13 @@ def read(path: Path) -> tuple[Notes, Arrays]:
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
-    """Split arrays into those below `folder`, named without it, and the others."""
+    """Split arrays into those whose names start with `folder`, without that prefix, and the others."""
     part = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
     return part, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
-    """Write an array as NumPy does; return the SHA-256 of its bytes."""
+    """Write an array in the .npy format; return the SHA-256 of its bytes."""
     header, values = io.BytesIO(), np.asarray(array, order="C")
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(values))
     digest = hashlib.sha256()
@@ -83,12 +83,12 @@ def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
 
 
 def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
-    """Raise DataError where the members declare more bytes than the file has, or are not plain bytes."""
+    """Raise DataError if the members declare more bytes than the file has, or are compressed or encrypted."""
     members = archive.infolist()
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
-        raise DataError("its contents are not stored as they were written")
+        raise DataError("its contents are compressed or encrypted")
     if sum(max(member.file_size, member.compress_size) for member in members) > size:
-        raise DataError(f"it declares more bytes than the {size} that it has")
+        raise DataError(f"it declares more bytes than the {size} of the file")
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:

@@ -11,14 +11,14 @@ from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel
 from clsplat.gaussians.model import WIDTHS
 
-FOLDER = "best/"  # before the names of its tables in a checkpoint
-OVERFIT_GAP = 6.0  # dB, from the PSNR of training views to that of others (ours)
+FOLDER = "best/"  # prefix of its tables in a checkpoint
+OVERFIT_GAP = 6.0  # dB, between the PSNR of training views and of other views (ours)
 Tables = dict[str, NDArray[np.float32]]
 Count = Annotated[int, Field(ge=0)]
 
 
-class Measured(BaseModel):
-    """The mean PSNR of one model, dB, over training views, some or all, and over the validation views."""
+class Scores(BaseModel):
+    """The mean PSNR of one model, dB, over all or some training views, and over the validation views."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -35,35 +35,35 @@ class Measured(BaseModel):
         figures = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
         return f"At step {self.step:,} the model has {figures}{self.overfit_text()}."
 
-    def overfit_text(self, first: "Measured | None" = None) -> str:
-        """Return a clause that says so if the model overfits, else "".  first: the first model that did."""
+    def overfit_text(self, first: "Scores | None" = None) -> str:
+        """Return a clause for a model that overfits, else "".  first: the first model that did."""
         since = f" since step {first.step:,}" if first and first.step < self.step else ""
         return f", more than {OVERFIT_GAP:g} dB apart{since}: the model overfits" if self.is_overfit else ""
 
 
 class Best(BaseModel):
-    """The best model so far, and the course of validation."""
+    """The best model so far, and the progress of validation."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
-    measured: Measured
-    """Of the best model so far."""
+    measured: Scores
+    """The scores of the best model so far."""
     degree: Annotated[int, Field(ge=0, le=3)]
     """Active degree of its spherical harmonics."""
     metrics: dict[str, dict[str, Any]]
-    """Its averages, by split and downscale."""
+    """Average metrics of the best model, by split and downscale."""
     scalars: dict[str, float] = {}
-    """The scalars of the run at its step."""
+    """The scalars of the run at the step of the best model."""
     modules: dict[str, dict[str, float]] = {}
-    """The scalars of its modules, by type."""
+    """The scalars of the modules at that step, by type."""
     evaluations: Count
-    """Number of measurements so far."""
+    """Number of evaluations so far."""
     since_best: Count
-    """Number of measurements after the best."""
-    first_overfit: Measured | None
-    """The first model that overfitted."""
-    last: Measured
-    """The last that was measured."""
+    """Number of evaluations after the best model."""
+    first_overfit: Scores | None
+    """The scores of the first model that overfitted."""
+    last: Scores
+    """The scores of the last model."""
     growth_ended: Count | None = None
     """Global step at which growth stopped, because validation no longer improved; None: growth continues."""
     ended: Count | None = None
@@ -71,14 +71,14 @@ class Best(BaseModel):
     refit: Literal["none", "due", "begun"] = "none"
     """Whether training is repeated on all training photographs, for the same number of steps."""
 
-    def after(self, last: Measured) -> "Best":
-        """Return the record after one more measurement that was no better."""
+    def with_last(self, last: Scores) -> "Best":
+        """Return the record after one more evaluation, which was not better."""
         more = {"last": last, "evaluations": self.evaluations + 1, "since_best": self.since_best + 1}
         first_overfit = self.first_overfit or (last if last.is_overfit else None)
         return self.model_copy(update=more | {"first_overfit": first_overfit})
 
     def figures(self) -> dict[str, Any]:
-        """Return its entry in metrics.json."""
+        """Return the entry of the best model in metrics.json."""
         facts = self.model_dump(include={"evaluations", "last", "first_overfit", "growth_ended", "ended"})
         return {**self.measured.model_dump(), **facts, "refit": self.refit != "none"}
 
@@ -96,14 +96,14 @@ class Best(BaseModel):
 
 
 def model_tables(model: DeviceModel) -> Tables:
-    """Copy the tables that rendering a model, and training it from new moments, need to the host."""
+    """Copy to the host the tables that are needed to render a model, and to train it with new moments."""
     gaussians = model.gaussians
     names = (*gaussians.trained, "filter_variance", *({INTERVAL2} & gaussians.tables.keys()))
     return {name: gaussians.get(name) for name in names}
 
 
 def check(best: Best | None, tables: Tables) -> None:
-    """Raise DataError if tables cannot be those of the Gaussians of a best model."""
+    """Raise DataError if tables do not fit the Gaussians of the best model."""
     if best is None or best.ended is not None:
         if tables:
             raise DataError("it has the tables of a best model, but no record of one")

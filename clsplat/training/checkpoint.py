@@ -1,7 +1,7 @@
-"""Save and restore a run, bit for bit: parameters, Adam moments, statistics and counters, without pickle.
+"""Save and restore a run, bit for bit: parameters, Adam moments, statistics, and counters, without pickle.
 
 Random numbers and the order of views depend only on (seed, step), so the step is their state.  A state with values that
-are not finite is saved as failed_N.npz, from which no run resumes.
+are not finite is saved as failed_N.npz, which is never resumed.
 """
 
 import logging
@@ -43,7 +43,7 @@ from clsplat.training import archive, best_model, field
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.archive import Arrays, split
 from clsplat.training.best_model import Best, Tables, model_tables
-from clsplat.training.modules.base import Scalars, class_of, modules_so_far, restore_modules
+from clsplat.training.modules.base import Scalars, module_class, modules_so_far, restore_modules
 from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
@@ -65,7 +65,7 @@ class State(BaseModel):
     stage_step: Count
     during_index: Count
     edited: bool
-    field: dict[str, Any] | None  # kind, shape and parameters of the field that is trained instead of Gaussians
+    field: dict[str, Any] | None  # kind, shape, and parameters of a field, which is trained instead of Gaussians
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
@@ -98,7 +98,7 @@ def check_tables(state: State, tables: Arrays) -> None:
         if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
             raise DataError(f"{name} is not [{count}, components] of float32")
     if count == 0:
-        raise DataError("it holds no Gaussians")
+        raise DataError("it has no Gaussians")
     trained = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
     for name in trained:
         if tables[name].shape[1] not in WIDTHS[name]:
@@ -107,36 +107,36 @@ def check_tables(state: State, tables: Arrays) -> None:
             raise DataError(f"{name} has {tables[name].shape[1]} components, too few for degree {state.degree}")
         moments = [moment for moment in moment_tables(name) if moment in tables]
         if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
-            raise DataError(f"{broken[0]} holds values that are not finite")
+            raise DataError(f"{broken[0]} has values that are not finite")
         if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
-            raise DataError(f"the moments of {name} have another shape than it")
+            raise DataError(f"the moments of {name} do not have its shape")
     if state.updates and state.updates.keys() != set(trained):
-        raise DataError("its update counts are of other parameters")
+        raise DataError("its update counts belong to other parameters")
 
 
 # The tables of a run's modules in a checkpoint, and in the best model.
 
-MODULES = "modules/"  # before the names of modules, before those of their tables
+MODULES = "modules/"  # prefix of module names, which are prefixes of table names
 
 
 def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables with their keys in the file.  whole: include tables that only training needs."""
+    """Yield the tables of modules with their keys in the file.  whole: include tables that only training needs."""
     for module, state in run.modules.items():
         if whole or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())
 
 
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Raise DataError if tables cannot be those of modules.  tables: named without MODULES."""
+    """Raise DataError if tables do not fit the modules.  scalars: by module; tables: named without MODULES."""
     for name in scalars:
         module_tables, tables = split(tables, f"{name}/")
-        class_of(name).check_saved(scalars[name], module_tables)
+        module_class(name).check_saved(scalars[name], module_tables)
     if tables:
         raise DataError(f"it has tables of modules that its notes do not list: {', '.join(tables)}")
 
 
-def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Restore the modules of a run from copies of another step."""
+def reload_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
+    """Load the modules of a run from copies of an earlier step."""
     for name, values in scalars.items():
         if name in run.modules and name in modules_so_far(run):
             run.modules[name].load(values, split(tables, f"{name}/")[0])
@@ -146,24 +146,24 @@ def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -
 
 
 def copy_model(run: Run) -> Tables:
-    """Copy to the host what rendering the run's model, and training it further, needs."""
+    """Copy to the host the tables that are needed to render the run's model and to train it further."""
     return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
 
 
 def restore_best(run: Run, tables: Tables, best: Best) -> None:
     """Make the copy of the best model the run's model."""
-    of_modules, of_gaussians = split(tables, MODULES)
-    put_back_modules(run, best.modules, of_modules)
-    run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), best.degree)
+    from_modules, parameters = split(tables, MODULES)
+    reload_modules(run, best.modules, from_modules)
+    run.model = run.model_settings.model(Gaussians(run.device, parameters), best.degree)
 
 
-# The tables of a run in a checkpoint: of a field; or of Gaussians, modules, and the best model.
+# The tables of a run in a checkpoint: those of a field; or those of Gaussians, modules, and the best model.
 
-UPDATES = "field"  # name of their number
+UPDATES = "field"  # key of a field's number of updates
 
 
-def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables with their keys in the file, copied to the host one at a time."""
+def run_tables(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield all tables of a run with their keys in the file, copied to the host one at a time."""
     if run.learned_field:
         yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
         return
@@ -173,7 +173,7 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
     yield from ((best_model.FOLDER + name, table) for name, table in run.best_tables.items())
 
 
-def updates_of(run: Run) -> dict[str, int]:
+def update_counts(run: Run) -> dict[str, int]:
     """Return the number of Adam updates of each parameter."""
     if run.learned_field:
         return {UPDATES: run.learned_field.updates}
@@ -185,34 +185,34 @@ def check_run_tables(state: State, tables: Arrays) -> None:
     if state.field:
         if state.updates.keys() != {UPDATES}:
             raise DataError("its update counts are not those of a field")
-        kind = field.class_of(state.field)
+        kind = field.field_class(state.field)
         kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
         return
-    best, own = split(tables, best_model.FOLDER)
-    best_model.check(state.best, _gaussians(state.best.modules if state.best else {}, best))
-    own = _gaussians(state.modules, own)
-    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
+    best, current = split(tables, best_model.FOLDER)
+    best_model.check(state.best, _check_and_remove_modules(state.best.modules if state.best else {}, best))
+    current = _check_and_remove_modules(state.modules, current)
+    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in current.items()})
 
 
-def _gaussians(modules: Mapping[str, Scalars], tables: Arrays) -> Arrays:
+def _check_and_remove_modules(modules: Mapping[str, Scalars], tables: Arrays) -> Arrays:
     """Check the tables of modules; return the others."""
-    of_modules, own = split(tables, MODULES)
-    check_modules(modules, of_modules)
-    return own
+    from_modules, others = split(tables, MODULES)
+    check_modules(modules, from_modules)
+    return others
 
 
 def restore_tables(run: Run, state: State, tables: Arrays) -> None:
     """Restore the tables of a run."""
     if state.field:
-        own, _ = split(tables, field.FOLDER)
-        kind = field.class_of(state.field)
-        run.learned_field = kind.from_tables(state.field["shape"], own, run.photographs.background)
+        tables, _ = split(tables, field.FOLDER)
+        kind = field.field_class(state.field)
+        run.learned_field = kind.from_tables(state.field["shape"], tables, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)
-    of_modules, tables = split(tables, MODULES)
-    saved = {name: (own, split(of_modules, f"{name}/")[0]) for name, own in state.modules.items()}
-    run.modules = restore_modules(run, saved)
+    from_modules, tables = split(tables, MODULES)
+    modules = {name: (scalars, split(from_modules, f"{name}/")[0]) for name, scalars in state.modules.items()}
+    run.modules = restore_modules(run, modules)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
@@ -229,27 +229,27 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
 
 
 def _key(table: str) -> str:
-    """Return the key of a table in the file; parameters are below `gaussians/`."""
+    """Return the key of a table in the file; keys of parameters start with `gaussians/`."""
     return table if "/" in table else f"gaussians/{table}"
 
 
-# What to try if values are not finite.
+# A remedy for values that are not finite.
 
-LOWER = 0.1  # factor of a rate
+RATE_FACTOR = 0.1  # by which a rate is lowered
 VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
 
 
 def lower_rate(run: Run, broken: Collection[str]) -> str:
-    """Return 'key=value' for `--set` that lowers a rate: of the broken parameter whose rate exceeds its default most.
+    """Return 'key=value' for `--set` to lower the rate that exceeds its default most, among the broken parameters.
 
     The value is a tenth of the current rate, or the default if that is smaller.  A field has one rate.
     """
     if run.learned_field:
         (stage,) = run.pipeline["stages"][run.stage_index]
-        return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
+        return f"{stage}.rate={RATE_FACTOR * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
-    trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
-    index, stage = next((train for train in reversed(trains) if train[0] <= run.stage_index), (0, "optimize"))
+    trainings = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
+    index, stage = next((train for train in reversed(trainings) if train[0] <= run.stage_index), (0, "optimize"))
     current = Rates.model_validate(stages[index].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
@@ -257,8 +257,8 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
 
     names = [VELOCITY if name == MOTION else name for name in broken or PARAMETERS]
     name = max(names, key=lambda name: rate(current, name) / rate(default, name))
-    is_only = [other for _, other in trains].count(stage) <= 1
-    value = min(LOWER * rate(current, name), rate(default, name))
+    is_only = [other for _, other in trainings].count(stage) <= 1
+    value = min(RATE_FACTOR * rate(current, name), rate(default, name))
     return f"{stage if is_only else f'stages.{index}'}.rates.{name}={value:.2g}"
 
 
@@ -267,43 +267,43 @@ LOG = logging.getLogger("clsplat")
 
 
 def save(run: Run, keep: int | None = None) -> Path:
-    """Write checkpoints/step_N.npz atomically.  keep: number of newest checkpoints to keep; others are removed.
+    """Write checkpoints/step_N.npz atomically.  keep: number of newest checkpoints to keep; older ones are removed.
 
     Raises NotFiniteError, after writing failed_N.npz, if the model is not finite; then nothing is removed.  Raises
     ClsplatError in the middle of a step or an edit.
     """
     if not run.is_consistent:
-        raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run")
+        raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
     if broken := run.not_finite():
-        raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
+        raise NotFiniteError(f"step {run.step}: {save_failed(run, broken)}")
     path = _write(run, "refit" if run.is_refit else "step")
     run.status.saved_at = time.monotonic()
     run.status.note(checkpoint=path.name)
     run.status.refresh()
     if keep is not None:
-        files = saved(run.out)
-        _remove(files[: files.index(path) + 1][:-keep])  # a later one is damaged, and could not be renamed
+        files = list_files(run.out)
+        _remove(files[: files.index(path) + 1][:-keep])  # later ones are damaged, and could not be renamed
     return path
 
 
-def set_aside(run: Run, broken: list[str]) -> str:
-    """Write a state that is not finite as failed_N.npz, replacing any other; return the end of an error message."""
+def save_failed(run: Run, broken: list[str]) -> str:
+    """Save a state that is not finite as failed_N.npz, replacing older ones; return the end of an error message."""
     try:
         path = _write(run, "failed")
         _remove(other for other in path.parent.glob("failed_*.npz") if other != path)
         state = f"the state is in {path}"
     except OutputError as error:
         state = f"the state is lost: {error}"
-    good = saved(run.out)
+    good = list_files(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
         f"`clsplat resume {shell_quote(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
-        f"{f'resumes from {good[-1].name}' if good else 'starts again'}"
+        f"{f'resumes from {good[-1].name}' if good else 'starts over'}"
     )
 
 
-def saved(out: Path) -> list[Path]:
-    """Return the checkpoints of a run folder from old to new; those of a refit come last."""
+def list_files(out: Path) -> list[Path]:
+    """List the checkpoints of a run folder from old to new; those of a refit come last."""
     by_rank = {
         (match[1] == "refit", int(match[2])): path
         for path in (out / CHECKPOINTS).glob("*.npz")
@@ -313,7 +313,7 @@ def saved(out: Path) -> list[Path]:
 
 
 def load(path: Path) -> tuple[State, Arrays]:
-    """Read a checkpoint.  Raises DataError, with only the reason, if damaged; ConfigError for another format."""
+    """Read a checkpoint.  Raises DataError, with only the reason, if it is damaged; ConfigError for another format."""
     notes, tables = archive.read(path)
     if type(notes.get("format")) is int and notes["format"] != FORMAT:
         raise ConfigError(
@@ -325,43 +325,43 @@ def load(path: Path) -> tuple[State, Arrays]:
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    if state.stage_index > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
+    if state.stage_index > len(state.pipeline.get("stages", ())):  # equal if all stages have ended
         raise DataError(f"it has no stage {state.stage_index}")
     check_run_tables(state, tables)
     return state, tables
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:
-    """Restore the newest valid checkpoint; return its file, or None if there is none, and remarks to log.
+    """Restore the newest valid checkpoint; return its file (None if there is none) and remarks to log.
 
-    The remarks report changes of settings and of the device.  Raises ConfigError if settings changed that cannot change
-    on resume, or for another format; OutputError if all checkpoints are damaged or missing.
+    The remarks report changes of settings and of the device.  Raises ConfigError for a change of a setting that cannot
+    change on resume, or for another format; OutputError if all checkpoints are damaged or missing.
     """
-    paths = saved(run.out)
-    again = f"`clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart` starts over"
+    paths = list_files(run.out)
+    restart = f"`clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart` starts over"
     for path in reversed(paths):
         try:
             state, tables = load(path)
         except DataError as error:
             if path == paths[0]:
-                raise OutputError(f"{path} is damaged ({error}), and so are all others; {again}") from error
+                raise OutputError(f"{path} is damaged ({error}), and so are all others; {restart}") from error
             LOG.warning("%s is damaged (%s); using an earlier one", path, error)
             continue
-        changed = _take_changes(run, path, state)
-        remarks = [f"{text}; from here on, bits differ from a run without this change" for text in changed]
+        changes = _record_changes(run, path, state)
+        remarks = [f"{text}; from here on, bits differ from a run without this change" for text in changes]
         if state.device != run.device.text:
             remarks.append(f"the run was started on {state.device}; from here on, bits may differ")
         _restore(run, state, tables)
         return path, remarks
     if last := run.status.now.checkpoint:
-        raise OutputError(f"{run.out / CHECKPOINTS}: {last} is missing; put it back, or {again}")
+        raise OutputError(f"{run.out / CHECKPOINTS}: {last} is missing; put it back, or {restart}")
     return None, []
 
 
-def drop_later(out: Path, taken: Path | None) -> None:
-    """Rename the damaged checkpoints after the restored one, so that they do not count as kept ones."""
-    files = saved(out)
-    for damaged in files[files.index(taken) + 1 :] if taken else ():
+def rename_damaged(out: Path, restored: Path | None) -> None:
+    """Rename the damaged checkpoints after the restored one, so that they do not count as checkpoints to keep."""
+    files = list_files(out)
+    for damaged in files[files.index(restored) + 1 :] if restored else ():
         try:
             damaged.rename(damaged.with_name(re.sub("^(step|refit)", "damaged", damaged.name)))
         except OSError as error:
@@ -393,17 +393,17 @@ def _write(run: Run, kind: str) -> Path:
         stage_step=run.stage_step,
         during_index=run.during_index,
         edited=run.edited,
-        field=_field_of(run),
+        field=_field_entry(run),
         degree=0 if run.learned_field else run.model.degree,
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
-        updates=updates_of(run),
+        updates=update_counts(run),
         scalars=run.scalars,
-        modules={name: one.scalars for name, one in run.modules.items()},
+        modules={name: module.scalars for name, module in run.modules.items()},
         best=run.best,
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
-        records=run.records.lines if run.stage_step else run.records.settled,
+        records=run.records.lines if run.stage_step else run.records.lines_at_stage,
         model_hashes=run.model_hashes,
         changes=run.changes,
         device=run.device.text,
@@ -413,37 +413,37 @@ def _write(run: Run, kind: str) -> Path:
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
     with open_atomic(path) as file:
-        archive.write(file, state.model_dump(), tables_of(run))
+        archive.write(file, state.model_dump(), run_tables(run))
     return path
 
 
-def _field_of(run: Run) -> dict[str, Any] | None:
+def _field_entry(run: Run) -> dict[str, Any] | None:
     field = run.learned_field
     return {"kind": field.kind, "shape": field.shape_as_data(), "parameters": field.parameters} if field else None
 
 
-def _take_changes(run: Run, path: Path, state: State) -> list[str]:
+def _record_changes(run: Run, path: Path, state: State) -> list[str]:
     """Record and return the changed settings.  Raises ConfigError for one that cannot change on resume."""
-    changed, remedy = [], "restore it, or start again with `clsplat run --restart` or another --out"
-    before = state.pipeline
+    changes, remedy = [], "restore it, or start over with `clsplat run --restart` or another --out"
+    old = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved
-        before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
-    for difference in differences(before, run.pipeline, run.settings):
+        old = {**old, "scene": {**old["scene"], "path": run.pipeline["scene"]["path"]}}
+    for difference in differences(old, run.pipeline, run.settings):
         if difference.kind == "output" or difference.is_moved_file(state.file_hashes, run.file_hashes):
             continue
         if difference.kind is None:
-            raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
+            raise ConfigError(f"{path} was saved with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         if state.best and state.best.refit == "begun" and difference.key_path.endswith((".steps", ".patience")):
-            raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
+            raise ConfigError(f"{path} is of a refit, whose steps were chosen by validation: {difference}; {remedy}")
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
-            more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
-            raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
-        changed.append(f"step {state.step}: {difference}")
-    run.changes = [*state.changes, *changed]
-    return changed
+            more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"
+            raise ConfigError(f"{path}: no steps are left after step {state.step}: {difference}; {more}")
+        changes.append(f"step {state.step}: {difference}")
+    run.changes = [*state.changes, *changes]
+    return changes
 
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
@@ -454,22 +454,22 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
         run.use_split(run.original.merge_validation())
     restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
-    run.records.lines, run.inputs_before, run.model_hashes = state.records, state.inputs, state.model_hashes
+    run.records.lines, run.resumed_inputs, run.model_hashes = state.records, state.inputs, state.model_hashes
 
 
-# Save the state of a run that fails.
+# Saving the state of a run that fails.
 
 
 @contextmanager
 def saved_on_failure(run: Run) -> Iterator[None]:
-    """If the block fails, save the last complete step and log where it is; the error is raised again."""
+    """If the block fails, save the last complete step, log where it is, and raise the error again."""
     try:
         yield
-    except (Interrupted, NotFiniteError):  # saved already, or set aside
+    except (Interrupted, NotFiniteError):  # already saved
         raise
-    except (Exception, SystemExit, GeneratorExit):  # what a plug-in may raise; a second Ctrl-C stops at once
+    except (Exception, SystemExit, GeneratorExit):  # plug-ins may raise any; a second Ctrl-C stops at once
         if run.step > 0 and not run.status.lost:
-            LOG.warning(_rescue(run))
+            LOG.warning(_save_if_consistent(run))
         raise
 
 
@@ -480,17 +480,17 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
     """
     broken, loss = run.not_finite(), losses.loss
     if broken or not math.isfinite(loss):
-        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {set_aside(run, broken)}")
+        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {save_failed(run, broken)}")
     return loss, psnr(losses.comparison)
 
 
-def _rescue(run: Run) -> str:
-    """Save the state if it is consistent; return a sentence about it."""
+def _save_if_consistent(run: Run) -> str:
+    """Save the state if it is consistent and finite; return a sentence about it."""
     try:
         if run.is_consistent and not run.not_finite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"
-        why = "the failed step was half done" if not run.is_consistent else "the model is not finite"
-    except Exception as error:  # the failure itself is what the user must see
-        why = f"the state could not be saved ({one_line(error)})"
-    files = saved(run.out)
-    return f"{why}; {f'the last good state is {files[-1]}' if files else 'no earlier state was saved'}"
+        reason = "the failed step was incomplete" if not run.is_consistent else "the model is not finite"
+    except Exception as error:  # must not hide the failure itself
+        reason = f"the state could not be saved ({one_line(error)})"
+    files = list_files(run.out)
+    return f"{reason}; {f'the last good state is {files[-1]}' if files else 'no earlier state was saved'}"

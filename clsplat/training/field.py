@@ -1,4 +1,4 @@
-"""Define the interface of a trained field, a model without Gaussians, for runs and checkpoints."""
+"""Define the interface of a trained field (a model without Gaussians) for runs and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ Tables = dict[str, NDArray[np.float32]]
 
 
 class TrainedField(ABC):
-    """A field in training.  Checkpoints can name the `kind` of any subclass that is defined."""
+    """A field in training.  Checkpoints refer to subclasses by their `kind`."""
 
     kinds: ClassVar[dict[str, type["TrainedField"]]] = {}
     kind: ClassVar[str]
@@ -51,7 +51,7 @@ class TrainedField(ABC):
     @classmethod
     @abstractmethod
     def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
-        """Raise DataError if tables cannot be those of a field of this shape."""
+        """Raise DataError if tables do not fit a field of this shape, or if there are `others`."""
 
     @classmethod
     @abstractmethod
@@ -61,9 +61,9 @@ class TrainedField(ABC):
         """Return the field of a checkpoint from its tables."""
 
 
-def class_of(written: Mapping[str, Any]) -> type[TrainedField]:
+def field_class(entry: Mapping[str, Any]) -> type[TrainedField]:
     """Return the class of a field in a checkpoint.  Raises DataError for an unknown kind."""
-    kind = TrainedField.kinds.get(str(written.get("kind")))
-    if kind is None or not isinstance(written.get("shape"), dict):
+    kind = TrainedField.kinds.get(str(entry.get("kind")))
+    if kind is None or not isinstance(entry.get("shape"), dict):
         raise DataError(f"it holds a field of an unknown kind; expected {', '.join(TrainedField.kinds)}")
     return kind

@@ -1,6 +1,6 @@
 """Plan the device memory of training before it is allocated.
 
-Bytes are counted per Gaussian for tables, and per Gaussian, pair and pixel for a frame.
+Bytes are counted per Gaussian for tables, and per Gaussian, pair, and pixel for a frame.
 """
 
 import math
@@ -15,13 +15,13 @@ from clsplat.gaussians.structs import HARMONICS, moment_tables
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 from clsplat.scene.view import View
 
-SEEN_SHARE = 0.5  # of the Gaussians in one view, an estimate; only their harmonics are on the device
+SEEN_SHARE = 0.5  # fraction of Gaussians visible in one view, an estimate; only their harmonics are on the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
-MOVED = 4 * (3 + 4 + 1)  # means, quaternions and logits of a moment
+MOVED = 4 * (3 + 4 + 1)  # means, quaternions, and logits at the view's time
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
 FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
-# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; the sums of a blur; the
+# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur; the
 # entropy of weights and its gradient
 
 Where = Literal["device", "host"]
@@ -41,7 +41,7 @@ class MemoryPlan:
     host: int = 0  # for each Gaussian, in the memory of the host
 
     def needed(self, gaussians: int) -> int:
-        """Return the bytes for a number of Gaussians, with room to grow and to move one table."""
+        """Return the bytes for a number of Gaussians, with room for growth and for moving one table."""
         return self.fixed + int(gaussians * self._per_gaussian)
 
     @property
@@ -59,10 +59,10 @@ class MemoryPlan:
     def text(self, gaussians: int) -> str:
         """Return a line with the memory needed and the number of Gaussians that fit."""
         mib = 2**20
-        on_host = f"; harmonics on the host, in {gaussians * self.host / mib:,.0f} MiB of it" if self.host else ""
+        on_host = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
         return (
             f"memory: {self.needed(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} bytes each "
-            f"and {self.pair} a pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} fit in "
+            f"and {self.pair} per pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} fit in "
             f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 
@@ -70,7 +70,7 @@ class MemoryPlan:
         """Raise MemoryLimitError if the Gaussians do not fit.  more: another remedy for the message."""
         if gaussians > self.limit:
             raise MemoryLimitError(
-                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
+                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale), or keep fewer "
                 f"of them on the device (scene.image_budget){more}"
             )
 
@@ -88,7 +88,7 @@ class DeviceLimits(Protocol):
 
     @property
     def unified(self) -> bool:
-        """Whether it is the memory of the host."""
+        """Whether the device shares the memory of the host."""
 
 
 def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
@@ -97,18 +97,18 @@ def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
 
 
 def most_pixels(views: Sequence[View], tile: int) -> int:
-    """Return the pixels of the largest view in whole tiles.  tile: px."""
+    """Return the number of pixels of the largest view, rounded up to whole tiles.  tile: side, px."""
     return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
 
 
-def bytes_of_modules(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
-    """Return the device bytes of modules in the training that needs most."""
+def module_bytes(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
+    """Return the device bytes of the modules in the training that needs the most memory."""
     lists = [getattr(stage, "modules", ()) for stage in stages]
     return max((sum(module.device_bytes(views, tile) for module in modules) for modules in lists), default=0)
 
 
 def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the number of components of each parameter and moment.  motion: columns of the motion; 0 if static."""
+    """Return the number of components of each parameter and moment.  motion: its columns; 0 for static models."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
@@ -121,20 +121,20 @@ def plan(
     pixels: int,
     pixel_sums: int = PIXEL_SUMS,
     harmonics: Where = "device",
-    seen: float = SEEN_SHARE,
+    visible: float = SEEN_SHARE,
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
     photographs: their bytes on the device; pixels: of the largest view, in whole tiles; pixel_sums: sums over pixels
-    per Gaussian in the backward pass; harmonics: the memory of the bands above 0; seen: share of the Gaussians whose
-    harmonics a view brings to the device.
+    per Gaussian in the backward pass; harmonics: the memory of the bands above 0; visible: the fraction of Gaussians
+    whose harmonics are on the device for a view.
     """
-    shares = dict.fromkeys(HARMONICS, seen) if harmonics == "host" else {}
-    held = {name: math.ceil(4 * width * shares.get(name, 1)) for name, width in components.items()}
-    sizes = list(held.values())
-    gradients = sum(held[name] for name in PARAMETERS) + 8  # for penalties and edits
+    fractions = dict.fromkeys(HARMONICS, visible) if harmonics == "host" else {}
+    bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}
+    sizes = list(bytes_by_table.values())
+    gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # for penalties and edits
     moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
     gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
-    host = sum(4 * components.get(name, 0) for name in shares)
+    host = sum(4 * components.get(name, 0) for name in fractions)
     return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), limits.memory, limits.allocation, host)

@@ -13,8 +13,8 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 
-LONGEST = 15.0  # log of a duration; longer ones look the same
-FAR = 3.0e38  # no bound
+MAX_LOG_DURATION = 15.0  # longer durations look the same
+UNBOUNDED = 3.0e38
 IN_EXTENTS = ("velocity", "acceleration", "jerk")
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=100.0))]
 
@@ -40,10 +40,10 @@ class MotionRates(Settings):
     turn: Rate = 1.0e-3
     """Of the time derivatives of quaternions."""
     min_duration: Annotated[float, Field(ge=0, lt=1)] = 0.02
-    """Shortest duration that an update leaves; what is shorter than a moment shows nothing between two of them."""
+    """Lower bound of durations; a Gaussian that is much shorter than a frame is invisible between two frames."""
 
     def times(self, factor: float) -> "MotionRates":
-        """Return the rates scaled by a factor."""
+        """Return the rates multiplied by a factor."""
         return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 
     @property
@@ -51,7 +51,7 @@ class MotionRates(Settings):
         return [name for name in type(self).model_fields if name != "min_duration"]
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step by the names of the fields, and `min_duration`."""
+        """Return the rates at a global step by field name, and `min_duration`.  extent: of the scene, scene units."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
         return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
 
@@ -66,13 +66,13 @@ def update_motion(
 ) -> None:
     """Update the motion from gradients in memory.
 
-    depth_key: [S], of the view; rates: from MotionRates.at; updates: count, including this one; every: as in
-    motion_step.
+    depth_key: [S], of the view; rates: from MotionRates.at; updates: their number, including this one; every: all bits
+    set to update all rows, 0 for visible rows only.
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)
     beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
-    min_duration = math.log(rates["min_duration"]) if rates["min_duration"] else -LONGEST
-    bounds = {"log_duration": (min_duration, LONGEST)}
+    min_duration = math.log(rates["min_duration"]) if rates["min_duration"] else -MAX_LOG_DURATION
+    bounds = {"log_duration": (min_duration, MAX_LOG_DURATION)}
     shared: dict[str, Any] = {
         "motion": table.array,
         "gradient": gradients[MOTION],
@@ -85,7 +85,7 @@ def update_motion(
         "count": gaussians.count,
     }
     for name, columns in motion_fields(table.components).items():
-        lowest, highest = bounds.get(name, (-FAR, FAR))
+        lowest, highest = bounds.get(name, (-UNBOUNDED, UNBOUNDED))
         gaussians.device.program("motion.cl").motion_step(
             items=(-(-gaussians.count // int(gaussians.device.tuning["LANES"])), columns.stop - columns.start),
             **shared,

@@ -34,11 +34,11 @@ class Records:
         self._require_held = require_held
         self.path, self.trial = out / RECORDS, out / TRIAL
         self.lines = 0  # of metrics.jsonl in the state of the run, including those held back
-        self.settled = 0  # of them, before the stages that a resumed run repeats
-        self._waiting: list[str] = []
+        self.lines_at_stage = 0  # of them at the start of the stage, which a resumed run repeats
+        self._pending: list[str] = []
 
-    def set_aside(self) -> None:
-        """Move the lines so far to trial.jsonl, for a refit.  Raises OutputError."""
+    def move_to_trial(self) -> None:
+        """Move all lines to trial.jsonl before a refit.  Raises OutputError."""
         self.write()
         self._require_held()
         with raising_output_error(self.trial):
@@ -46,63 +46,63 @@ class Records:
         self.lines = 0
 
     def start(self, is_refit: bool = False) -> None:
-        """Drop the lines after the state, which a resumed run writes again.
+        """Drop the lines after the restored state, which the resumed run writes again.
 
         If the state is from before a refit, the lines in trial.jsonl are moved back.  A line that cannot be read is
-        lost with all that follow, and a warning is logged.
+        dropped with all lines after it, and a warning is logged.
         """
         if not is_refit and self.trial.exists():
             with raising_output_error(self.trial):
                 self.trial.replace(self.path)
-        kept: list[dict[str, Any]] = []
-        fault = "it ends before"
+        lines: list[dict[str, Any]] = []
+        fault = "the file is too short"
         try:
-            for line in islice(self._each(self.path), self.lines):
-                kept.append(line)
+            for line in islice(self._parse(self.path), self.lines):
+                lines.append(line)
         except DataError as error:
             fault = str(error)
-        if len(kept) < self.lines:
-            LOG.warning("%s: only %d of %d lines can be read (%s)", self.path, len(kept), self.lines, fault)
-        self.lines = self.settled = len(kept)
-        write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
+        if len(lines) < self.lines:
+            LOG.warning("%s: only %d of %d lines can be read (%s)", self.path, len(lines), self.lines, fault)
+        self.lines = self.lines_at_stage = len(lines)
+        write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
-        """Add a line, to be written by `write` or at the end of the stage."""
-        self._waiting.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+        """Add a line, which `write` or the end of the stage appends to the file."""
+        self._pending.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
         self.lines += 1
 
     def write(self) -> None:
         """Append the lines held back, and sync the file, because a checkpoint counts them.
 
-        Raises OutputError; then the lines are still held back, and the file is unchanged.
+        If it raises OutputError, the lines are still held back, and the file is unchanged.
         """
-        if not self._waiting:
+        if not self._pending:
             return
         self._require_held()
-        append(self.path, "".join(self._waiting).encode())
-        self._waiting.clear()
+        append(self.path, "".join(self._pending).encode())
+        self._pending.clear()
 
     @contextmanager
-    def of_a_stage(self) -> Iterator[None]:
+    def stage(self) -> Iterator[None]:
         """Write the lines of the block at its end; if it fails, drop them."""
-        lines, waiting = self.lines, len(self._waiting)
+        lines, pending = self.lines, len(self._pending)
         try:
             yield
             self.write()
         except BaseException:
-            del self._waiting[waiting:]
+            del self._pending[pending:]
             self.lines = lines
             raise
 
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
-        """Return the lines, of one kind or all, without a last line cut short by a crash.
+        """Return the lines, of one kind or all, without an incomplete last line from a crash.
 
-        trial: return those before a refit.  Raises DataError, with file and line, for any other damage.
+        trial: return the lines from before a refit.  Raises DataError, with file and line, for any other damage.
         """
-        lines = self._each(self.trial if trial else self.path)
+        lines = self._parse(self.trial if trial else self.path)
         return [line for line in lines if kind in (None, line["kind"])]
 
-    def _each(self, path: Path) -> Iterator[dict[str, Any]]:
+    def _parse(self, path: Path) -> Iterator[dict[str, Any]]:
         if not path.exists():
             return
         texts = read_file(path).decode(errors="replace").split("\n")
@@ -110,7 +110,7 @@ class Records:
             try:
                 line = json.loads(text)
             except (ValueError, RecursionError):
-                if number == len(texts):  # empty, or cut short by a crash
+                if number == len(texts):  # empty, or incomplete after a crash
                     break
                 line = None
             if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):
@@ -149,7 +149,7 @@ KERNELS = {
     "network backward": "dense_backward",
     "network, weights": "dense_weights dense_biases dense_sums",
     "grid backward": "grid_backward",
-}  # of each stage, in the order of a step
+}  # by stage, in the order of a step
 STAGES = {kernel: stage for stage, kernels in KERNELS.items() for kernel in kernels.split()}
 
 
@@ -166,44 +166,44 @@ def clocks() -> tuple[float, float]:
     return time.perf_counter(), time.process_time()
 
 
-# The course of a training: PSNR averaged over reports, and the remaining time.
+# The progress of a training: PSNR averaged over reports, and the remaining time.
 
 VIEWS = 5  # reports over which PSNR is averaged
 LATEST = 3  # reports over which step time is averaged
 TREND = 4  # reports from which growth is extrapolated
-WIDE = 2.0  # ratio of Gaussian counts from which their cost can be fitted
-USUAL = 0.6  # cost of one more Gaussian, as a share of the mean time per Gaussian, if it cannot be fitted
-MIN_COST = 0.4  # smallest share; on a busy machine fits are unreliable
+MIN_RATIO = 2.0  # of Gaussian counts, so that their cost can be fitted
+DEFAULT_COST = 0.6  # of one more Gaussian, relative to the mean time per Gaussian, if it cannot be fitted
+MIN_COST = 0.4  # likewise; on a busy machine fits are unreliable
 
 
-def over_views(psnrs: Sequence[float]) -> list[float]:
-    """Return moving averages of PSNR, since each report is of one view and views differ by many dB."""
+def moving_average(psnrs: Sequence[float]) -> list[float]:
+    """Average PSNR over the last VIEWS reports, since each report is of one view and views differ by many dB."""
     return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
 class Forecast:
-    """Estimate the remaining time of a training that ends at `last_step`.  Density rules act until `growth_end`."""
+    """Estimate the remaining time of a training that ends at `last_step`, with growth until `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end
         self._psnrs: list[float] = []  # dB
-        self._reports: list[tuple[int, int, float]] = []  # step, Gaussians, s a step
+        self._reports: list[tuple[int, int, float]] = []  # step, Gaussians, s per step
 
     @classmethod
-    def of(cls, step: int, last_step: int, due: Sequence[Callable[[int], bool]]) -> "Forecast":
-        """Return the forecast of a training after `step`.  due: for each rule, whether it acts at a step."""
-        later = range(last_step - 1, step, -1)  # none follows the last step
+    def from_rules(cls, step: int, last_step: int, due: Sequence[Callable[[int], bool]]) -> "Forecast":
+        """Create the forecast of a training after `step`.  due: for each density rule, whether it acts at a step."""
+        later = range(last_step - 1, step, -1)  # no rule acts after the last step
         return cls(last_step, next((later_step for later_step in later if any(rule(later_step) for rule in due)), step))
 
     def add(self, step: int, psnr: float, gaussians: int, seconds: float) -> None:
-        """Add a report.  seconds: mean time of a step since the last one."""
+        """Add a report.  seconds: mean time of a step since the last report."""
         self._psnrs.append(psnr)
         self._reports.append((step, gaussians, seconds))
 
     @property
     def psnr(self) -> float:
-        """The mean PSNR of the last reports, dB."""
-        return over_views(self._psnrs[-VIEWS:])[-1]
+        """The PSNR of the last reports, averaged, dB."""
+        return moving_average(self._psnrs[-VIEWS:])[-1]
 
     @property
     def growth_known(self) -> bool:
@@ -230,9 +230,9 @@ class Forecast:
 
     @staticmethod
     def _cost(counts: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
-        """Return the time that a Gaussian adds to a step, s."""
-        most = float(seconds[-LATEST:].mean() / max(1.0, counts[-LATEST:].mean()))
-        if counts.max() < WIDE * counts.min():
-            return USUAL * most
-        spread = counts - counts.mean()
-        return min(max(float(spread @ seconds / (spread @ spread)), MIN_COST * most), most)
+        """Return the time that one more Gaussian adds to a step, s."""
+        mean_time = float(seconds[-LATEST:].mean() / max(1.0, counts[-LATEST:].mean()))
+        if counts.max() < MIN_RATIO * counts.min():
+            return DEFAULT_COST * mean_time
+        deviation = counts - counts.mean()
+        return min(max(float(deviation @ seconds / (deviation @ deviation)), MIN_COST * mean_time), mean_time)

@@ -28,7 +28,7 @@ from clsplat.scene.scene import Scene, scene_name
 from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
-from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, bytes_of_modules, most_pixels, plan
+from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, module_bytes, most_pixels, plan
 from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
@@ -41,12 +41,12 @@ class Run:
 
     device: Device
     scene: Scene  # as trained on, at one size or several
-    original: Scene  # as read, at full size
+    original: Scene  # as read from the dataset, at full size
     out: Path
     name: str
     seed: int
-    settings: Settings  # of the pipeline
-    pipeline: dict[str, Any]  # its resolved keys, as written to pipeline.yaml
+    settings: Settings  # the pipeline
+    pipeline: dict[str, Any]  # the resolved keys of `settings`, as written to pipeline.yaml
     rasterizer: Rasterizer
     photographs: Photographs
     status: StatusFile
@@ -56,31 +56,33 @@ class Run:
     file_hashes: dict[str, str] = field(default_factory=dict)  # of the files that settings name, by path
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     preparation: dict[str, dict[str, Any]] = field(default_factory=dict)  # results of the steps of `prepare:`
-    losses: list[Loss] = field(default_factory=list)  # added from Python to those of the pipeline
+    losses: list[Loss] = field(default_factory=list)  # from Python, in addition to those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
     modules: dict[str, Any] = field(default_factory=dict)  # states of training modules, by type
     learned_field: TrainedField | None = None  # instead of a model
-    step: int = 0  # global: updates done, or in progress
+    step: int = 0  # global step that is done or in progress
     stage_index: int = 0  # current stage
     stage_step: int = 0  # steps done in that stage
-    during_index: int = 0  # stages of its `during` done since that step
+    during_index: int = 0  # stages of its `during` done after that step
     edited: bool = False  # whether the edits due at that step are done
     is_consistent: bool = True  # False after a failure in the middle of an edit of the tables
-    changes: list[str] = field(default_factory=list)  # of settings, made on resume
-    image_downscale: float = 1.0  # of the photographs at the step before an edit
-    inputs_before: str = ""  # `inputs` of the checkpoint that the run resumed from
+    changes: list[str] = field(default_factory=list)  # of settings, on resume
+    image_downscale: float = 1.0  # of the photographs in the step before an edit
+    resumed_inputs: str = ""  # `inputs` of the checkpoint that the run resumed from
     scalars: dict[str, float] = field(default_factory=dict)  # state of rules and budgets, by name
     best: Best | None = None  # the best model by validation
-    best_tables: Tables = field(default_factory=dict)  # of that model, on the host, during the training
-    cache: dict[Any, Any] = field(default_factory=dict)  # measurements of modules, by keys of their choice
+    best_tables: Tables = field(default_factory=dict)  # of the best model, on the host, during the training
+    cache: dict[Any, Any] = field(default_factory=dict)  # measurements of modules, by keys that they choose
     train_seconds: float = 0.0
     cpu_seconds: float = 0.0  # of all threads of the process, in the same time
     model_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of model files, by path in the run folder
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     on_progress: Callable[[Progress], None] = lambda progress: None
-    on_step: Callable[[], None] = lambda: None  # called between steps, or items of a long stage; reads, and may wait
+    on_step: Callable[[], None] = lambda: (
+        None
+    )  # called between steps, or items of a long stage; must not change the run
 
     def __post_init__(self) -> None:
         self.records = Records(self.out, self.status.require_held)
@@ -90,7 +92,7 @@ class Run:
 
     @property
     def model(self) -> DeviceModel:
-        """The model.  Raises ConfigError when no stage has made one."""
+        """The model.  Raises ConfigError if no stage has created one."""
         if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
         for state in self.modules.values():
@@ -102,7 +104,7 @@ class Run:
         self._model, self.learned_field = model, None
 
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
-        """Return what renders views.  rasterizer: None for that of training.  Raises ConfigError like `model`."""
+        """Return the renderer of views.  rasterizer: None for that of training.  Raises ConfigError like `model`."""
         if self.learned_field:
             return self.learned_field.painter
         return SplatPainter(rasterizer or self.rasterizer, self.model, self.photographs.background)
@@ -119,24 +121,24 @@ class Run:
     def next_stage(self, index: int) -> None:
         """Go to the start of a stage."""
         self.stage_index, self.stage_step, self.during_index, self.edited = index, 0, 0, False
-        self.records.settled = self.records.lines
+        self.records.lines_at_stage = self.records.lines
         self.modules = {name: state for name, state in self.modules.items() if state.after_training != "dropped"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # valid only within one training
 
     @property
     def model_step(self) -> int:
-        """The global step after which the model was last trained; before `step` if an earlier model was the best."""
-        is_kept = self.best is not None and self.best.ended == self.step and self.best.refit != "begun"
-        return self.best.measured.step if self.best and is_kept else self.step
+        """The global step of the model's last update; less than `step` if an earlier, best model was restored."""
+        is_best = self.best is not None and self.best.ended == self.step and self.best.refit != "begun"
+        return self.best.measured.step if self.best and is_best else self.step
 
     @property
     def is_refit(self) -> bool:
-        """Whether the run trains again, on validation views too, for the number of steps that was best."""
+        """Whether the run trains again, including the validation views, for the best number of steps."""
         return self.best is not None and self.best.refit == "begun"
 
     def restart_for_refit(self, best: Best) -> None:
-        """Return to the start of the pipeline, to train again for as many steps as the best model had."""
+        """Return to the start of the pipeline, to train again for the number of steps of the best model."""
         self._model = None
         self.adam = self.stats = None
         self.modules = {}
@@ -152,23 +154,23 @@ class Run:
         self.use_split(self.original.merge_validation())
 
     def use_split(self, original: Scene) -> None:
-        """Replace the original scene by one with another split of its views."""
+        """Replace the original scene by one whose views are split differently."""
         self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager
     def editing_tables(self) -> Iterator[None]:
-        """Mark the run as inconsistent while the block edits its tables, and after it if it fails."""
+        """Mark the run as inconsistent while the block edits its tables; the mark stays if the block fails."""
         before, self.is_consistent = self.is_consistent, False
         yield
         self.is_consistent = before
 
     def add_training_time(self, start: tuple[float, float]) -> float:
         """Add the time since `start` to the training time; return the wall-clock seconds."""
-        spent, cpu = (now - then for now, then in zip(clocks(), start, strict=True))
-        self.train_seconds += spent
+        seconds, cpu = (end - begin for end, begin in zip(clocks(), start, strict=True))
+        self.train_seconds += seconds
         self.cpu_seconds += cpu
-        return spent
+        return seconds
 
     @property
     def scene_name(self) -> str:
@@ -177,7 +179,7 @@ class Run:
 
     @property
     def inputs(self) -> str:
-        """A hash of the photographs, cameras and points; "" if they were not hashed."""
+        """A hash of the photographs, cameras, and points; "" if they were not hashed."""
         return self.identity.digest if self.identity else ""
 
     @property
@@ -202,21 +204,21 @@ class Run:
         self,
         components: Mapping[str, int] | None = None,
         harmonics: Where | None = None,
-        seen: float = SEEN_SHARE,
+        visible: float = SEEN_SHARE,
     ) -> MemoryPlan:
         """Plan the device memory for training with the current tables, or those in `components`.
 
-        harmonics: the memory of the bands above 0; None: where they are now; seen: as in `plan`.
+        harmonics: the memory of the bands above 0; None for their current one; visible: as in `plan`.
         """
         if harmonics is None:
             harmonics = "host" if self.model.gaussians.on_host else "device"
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
-        bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        bytes_held += bytes_of_modules(getattr(self.settings, "stages", ()), views, tile)
+        image_bytes = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
+        image_bytes += module_bytes(getattr(self.settings, "stages", ()), views, tile)
         pixels = most_pixels(views, tile)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)
+        return plan(self.device.info, components, image_bytes, pixels, pixel_sums, harmonics, visible)
 
     def refresh_filter(self) -> None:
         """Recompute the world filter and the sampling intervals for the current Gaussians."""
@@ -228,30 +230,30 @@ class Run:
             measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
 
     def survey(self) -> Survey:
-        """Return the training views for the rules of an edit."""
+        """Return a survey of the training views, for the rules of an edit."""
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
-    def texture_quantile(self, share: float) -> float:
-        """Return the quantile `share` of the gradient magnitude, per px, over all training photographs."""
-        if share not in self._texture_quantiles:
+    def texture_quantile(self, q: float) -> float:
+        """Return the quantile `q` of the gradient magnitude, per px, over all training photographs."""
+        if q not in self._texture_quantiles:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
-            self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
-        return self._texture_quantiles[share]
+            self._texture_quantiles[q] = texture_quantile(self.rasterizer.workspace, photographs, q)
+        return self._texture_quantiles[q]
 
     def training_images(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield the photographs of the training views, each [height, width, 3]."""
+        """Yield the photographs of the training views, each [height, width, 3], and count them as progress."""
         views = self.scene.split("train")
         for view in self.status.counted(views, "photographs", len(views)):
             yield self.photographs.get(view).image()
 
 
-# The model of a run for files: its tables on the host, and how it was rendered in training.
+# The model of a run for files: its tables on the host, and its rendering settings in training.
 
 
 def host_model(run: Run) -> Model:
-    """Copy the model to the host, with its world filter as a separate table, not in the scales.
+    """Copy the model to the host, with its world filter as a separate table, not baked into the scales.
 
-    Raises ConfigError if no stage has made one.
+    Raises ConfigError if no stage has created one.
     """
     model, gaussians = run.model, run.model.gaussians
     tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}

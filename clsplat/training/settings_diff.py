@@ -1,4 +1,4 @@
-"""Compare two resolved pipelines, and tell which differences a resumed run allows."""
+"""Compare two resolved pipelines, and classify which differences a resumed run allows."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -14,21 +14,21 @@ class Difference(NamedTuple):
     """A setting that differs between two resolved pipelines."""
 
     key_path: str  # such as stages[1].optimize.rates.quats
-    was: Any
-    now: Any
+    old: Any
+    new: Any
     kind: Kind  # from its class; None: the setting cannot change on resume
 
     def __str__(self) -> str:
-        return f"{self.key_path} was {shorten(repr(self.was), 80)}, is {shorten(repr(self.now), 80)}"
+        return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"
 
     def is_moved_file(self, old_hashes: Mapping[str, str], new_hashes: Mapping[str, str]) -> bool:
         """Return whether a file was only moved.  old_hashes, new_hashes: of the files that settings name, by path."""
-        is_text = isinstance(self.was, str) and isinstance(self.now, str)
-        return is_text and self.was in old_hashes and old_hashes[self.was] == new_hashes.get(self.now)
+        is_text = isinstance(self.old, str) and isinstance(self.new, str)
+        return is_text and self.old in old_hashes and old_hashes[self.old] == new_hashes.get(self.new)
 
     @property
     def stage(self) -> int | None:
-        """The index of its stage in the pipeline; None outside of stages."""
+        """The index of the setting's stage in the pipeline; None outside of stages."""
         match = re.match(r"stages\[(\d+)\]", self.key_path)
         return int(match[1]) if match else None
 
@@ -42,17 +42,17 @@ def differences(
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
-            inner, inner_kind = _inside(settings, key)
+            inner, inner_kind = _child(settings, key)
             path = f"{key_path}.{key}" if key_path else str(key)
             yield from differences(old.get(key), new.get(key), inner, path, kind or inner_kind)
     elif isinstance(old, list) and isinstance(new, list) and (kinds := _kinds([*old, *new])):
-        before, after = ({item["type"]: item for item in items} for items in (old, new))
-        now = {item.type: item for item in settings or ()}
+        before, after = ({item["type"]: item for item in part} for part in (old, new))
+        items = {item.type: item for item in settings or ()}
         for name in dict.fromkeys([*before, *after]):
             item_kind = kind or (
                 "training" if kinds[name].optional_on_resume and not {name} <= before.keys() & after.keys() else None
             )
-            yield from differences(before.get(name), after.get(name), now.get(name), f"{key_path}.{name}", item_kind)
+            yield from differences(before.get(name), after.get(name), items.get(name), f"{key_path}.{name}", item_kind)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
             inner = settings[i] if isinstance(settings, list) else None
@@ -63,9 +63,9 @@ def differences(
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
     """Return the classes of a list's items by type, if the items are addressed by type."""
-    known = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := tag_of(kind))}
-    named = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
-    return {name: known[name] for name in named} if all(name in known for name in named) else {}
+    classes = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := tag_of(kind))}
+    types = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
+    return {name: classes[name] for name in types} if all(name in classes for name in types) else {}
 
 
 def first_difference(old: Any, new: Any) -> Difference | None:
@@ -73,11 +73,11 @@ def first_difference(old: Any, new: Any) -> Difference | None:
     return next(differences(old, new), None)
 
 
-def _inside(settings: Any, key: str) -> tuple[Any, Kind]:
-    """Return the settings below a key, and what a change of the key means on resume."""
+def _child(settings: Any, key: str) -> tuple[Any, Kind]:
+    """Return the settings below a key, and the kind of a change of the key."""
     if not isinstance(settings, Settings):
         return None, None
     if key in type(settings).model_fields:
         return getattr(settings, key), resume_effect(type(settings), key)
-    named = any(getattr(settings, tag, None) == key for tag in TAGS)  # a stage is written as {name: fields}
-    return settings if named else None, None
+    is_tag = any(getattr(settings, tag, None) == key for tag in TAGS)  # a stage is written as {name: fields}
+    return settings if is_tag else None, None

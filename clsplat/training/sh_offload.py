@@ -9,14 +9,14 @@ from clsplat.training.memory import SEEN_SHARE, MemoryPlan, Where, last_place
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-NEAR = 2  # factor of the number of Gaussians; an edit seldom adds more
+FACTOR = 2  # of the number of Gaussians; an edit seldom adds more
 VIEWS = 16  # rendered to measure how many Gaussians a view sees
 
 
 def place_harmonics(run: Run) -> None:
     """Move the harmonics to the host before a training, if the settings require it or the device is too small.
 
-    It must happen before Adam allocates their moments, which are larger.
+    Must be called before Adam allocates their moments, which are larger.
     """
     gaussians = run.model.gaussians
     if gaussians.on_host is None and gaussians.count <= most_gaussians(run, gaussians.count):
@@ -28,47 +28,47 @@ def make_room(run: Run, count: int) -> None:
     gaussians = run.model.gaussians
     if gaussians.on_host or last_place(run.harmonics, run.device.info) == "device":
         return
-    why = ""
+    reason = ""
     if run.harmonics == "auto":
         if count <= (capacity := _plan(run, "device").limit):
             return
-        why = f", since the device can hold only {capacity:,} Gaussians with harmonics"
+        reason = f", since the device can hold only {capacity:,} Gaussians with harmonics"
     gaussians.move_to_host()
-    LOG.info("step %d: harmonics move to the host%s: the same bits, but slower", run.step, why)
+    LOG.info("step %d: harmonics move to the host%s; training slows down, with the same bits", run.step, reason)
 
 
-def most_gaussians(run: Run, asked: float = math.inf) -> int:
+def most_gaussians(run: Run, needed: float = math.inf) -> int:
     """Return how many Gaussians the device can hold, with harmonics offloaded if that is allowed and helps.
 
-    With `auto`, the result depends only on the Gaussians, not on where their harmonics are now.  asked: the search may
-    stop at this number.
+    With `auto`, the result depends only on the Gaussians, not on where their harmonics are now.  needed: the number of
+    Gaussians that suffices, so that the search may stop.
     """
     location = last_place(run.harmonics, run.device.info)
     capacity = _plan(run, location if run.harmonics == "host" else "device").limit
-    if run.harmonics != "auto" or location == "device" or min(asked, NEAR * run.model.gaussians.count) <= capacity:
+    if run.harmonics != "auto" or location == "device" or min(needed, FACTOR * run.model.gaussians.count) <= capacity:
         return capacity
-    there = run.model.gaussians.count if run.stage_step else 0
-    return max(capacity, there, _plan(run, "host", _seen(run)).limit)
+    current = run.model.gaussians.count if run.stage_step else 0
+    return max(capacity, current, _plan(run, "host", _visible_fraction(run)).limit)
 
 
 def more_room(run: Run) -> str:
-    """Return a further remedy for an error message, if the settings keep the harmonics on the device."""
+    """Return one more remedy for an error message if the settings keep the harmonics on the device, else ""."""
     helps = run.pipeline["rasterizer"]["harmonics"] == "device" and not run.device.info.unified
     return ", or rasterizer.harmonics=auto" if helps else ""
 
 
-def _plan(run: Run, harmonics: Where, seen: float = SEEN_SHARE) -> MemoryPlan:
+def _plan(run: Run, harmonics: Where, visible: float = SEEN_SHARE) -> MemoryPlan:
     """Return the memory plan including Adam moments, even if they are not allocated yet."""
     widths, trained = run.model.gaussians.components, run.model.gaussians.trained
     moments = {moment: widths[name] for name in trained for moment in moment_tables(name)}
-    return run.memory_plan({**widths, **moments}, harmonics, seen)
+    return run.memory_plan({**widths, **moments}, harmonics, visible)
 
 
-def _seen(run: Run) -> float:
-    """Return the largest share of row blocks that one of some training views sees, with a margin."""
+def _visible_fraction(run: Run) -> float:
+    """Return the largest fraction of row blocks visible in one of VIEWS training views, with a margin."""
     survey, gaussians = run.survey(), run.model.gaussians
-    lanes, most = int(run.device.tuning["LANES"]), 0.0
+    lanes, largest = int(run.device.tuning["LANES"]), 0.0
     for look in survey.render(survey.sample_views(VIEWS)):
         keys = look.frame.depth_key.get()[: gaussians.count // lanes * lanes]
-        most = max(most, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
-    return GROWTH * most
+        largest = max(largest, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
+    return GROWTH * largest

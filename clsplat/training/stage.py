@@ -1,4 +1,4 @@
-"""Define the base classes of stages: settings, the parts of a run that they need and make, and `run`."""
+"""Define the base classes of stages: settings, the parts of a run that they need and create, and `run`."""
 
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Sequence
@@ -30,7 +30,7 @@ class PathInRun(AfterValidator):
 def path_in_run(*suffixes: str) -> PathInRun:
     """Mark a field that holds a file in the run folder, with one of `suffixes`, or a folder."""
 
-    def checked(text: str) -> str:
+    def check(text: str) -> str:
         fault = invalid_output_reason(text)
         if fault is None and suffixes and not PurePosixPath(text).name.lower().endswith(suffixes):
             fault = f"it does not end in {', '.join(suffixes)}"
@@ -38,7 +38,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
             raise ValueError(f"expected a path inside the run folder: {fault}")
         return text
 
-    return PathInRun(checked, suffixes)
+    return PathInRun(check, suffixes)
 
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
@@ -48,13 +48,13 @@ def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
 
 
 class Stage(Settings):
-    """One stage of a pipeline.  It changes the run and returns nothing."""
+    """One stage of a pipeline, which changes the run and returns nothing."""
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
-    takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
+    removes: ClassVar[frozenset[str]] = frozenset()  # parts that no longer exist afterwards
     edits: ClassVar[bool] = False  # changes the model; in `during`, it runs between two steps
-    edits_last: ClassVar[bool] = False  # marks its edit by run.editing_tables(); else all of the stage is an edit
+    marks_edit: ClassVar[bool] = False  # calls run.editing_tables() itself; else the whole stage is an edit
 
     stage: str
     """Name of the stage."""
@@ -81,12 +81,12 @@ class Stage(Settings):
         return {name: files[0].suffixes for name, files in marks.items() if files}
 
     def act(self, run: Run) -> None:
-        """Run the stage under its name in status.json.  A failure inside an edit leaves an inconsistent run.
+        """Run the stage under its name in status.json.  A failure during an edit leaves the run inconsistent.
 
         A failed stage is repeated from its start on resume, so its records are dropped.
         """
-        changing = run.editing_tables() if self.edits and not self.edits_last else nullcontext()
-        with run.status.stage(self.stage), changing, run.records.of_a_stage():
+        edit = run.editing_tables() if self.edits and not self.marks_edit else nullcontext()
+        with run.status.stage(self.stage), edit, run.records.stage():
             self.run(run)
 
 
@@ -107,7 +107,7 @@ class Scheduled(Stage):
     ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
 
     every: EverySteps | None = None
-    """Steps from one run of the stage to the next, which may be fractional; only in `during`."""
+    """Steps from one run of the stage to the next, may be fractional; only in `during`."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
@@ -126,7 +126,7 @@ class Scheduled(Stage):
         return step > self.start and (self.stop is None or step < self.stop)
 
     def is_overdue(self, run: Run) -> bool:
-        """Return whether the stage runs now although its cadence does not say so; only if it changes no bits."""
+        """Return whether the stage runs now in addition to its cadence; only for stages that change no results."""
         return False
 
     def stale(self, run: Run) -> Collection[str]:
@@ -134,25 +134,25 @@ class Scheduled(Stage):
         return ()
 
 
-def written_twice(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write as a file, or as file and folder; None if there is none.
+def find_output_conflict(stages: Sequence[Stage]) -> str | None:
+    """Return a path that two stages would write as a file, or one as a file and one as a folder; None without one.
 
     Stages may share a folder.  Names are compared without case, since some file systems ignore it.
     """
     written: list[tuple[tuple[str, ...], bool]] = []  # the parts of a path, and whether it is a file
     for stage in stages:
-        if not (named := stage.named_outputs()):  # other stages write its files
+        if not (outputs := stage.named_outputs()):  # other stages write its files
             continue
-        suffixes = tuple(suffix for of_field in named.values() for suffix in of_field)
-        own = [
+        suffixes = tuple(suffix for endings in outputs.values() for suffix in endings)
+        paths = [
             (tuple(part.casefold() for part in path.parts), path.name.lower().endswith(suffixes))
             for path in stage.outputs(Path())
         ]
-        for parts, is_file in own:
+        for parts, is_file in paths:
             for other, other_is_file in written:
                 if (is_file and other[: len(parts)] == parts) or (other_is_file and parts[: len(other)] == other):
                     return "/".join(parts)
-        written += own
+        written += paths
     return None
 
 
@@ -165,7 +165,7 @@ class Training(Stage):
     training_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    rehearsed: ClassVar[int] = 200  # steps timed for `--minutes`, and the smallest number trained
+    rehearsal_steps: ClassVar[int] = 200  # timed for `--minutes`; also the minimum number of steps trained
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
@@ -175,7 +175,7 @@ class Training(Stage):
 
     @field_validator("during", check_fields=False)
     @classmethod
-    def _on_a_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
+    def _require_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
         for stage in during:
             if stage.every is None:
                 raise ValueError(f"'{stage.stage}' needs 'every' inside 'during'")
@@ -187,43 +187,43 @@ class Training(Stage):
 
     def check_run(self, run: Run) -> None:
         for stage in self.during:
-            if stage.stop is None or stage.stop > run.step + 1:  # else it will not run again
+            if stage.stop is None or stage.stop > run.step + 1:  # otherwise it will not run again
                 stage.check_run(run)
 
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]
 
-    def acting(self, step: int) -> list[Scheduled]:
+    def active_stages(self, step: int) -> list[Scheduled]:
         """Return the stages of `during` that will run in a training that starts after a global step."""
         last = step + self.steps
-        before = range(step + 1, last)  # no edit follows the last
+        before = range(step + 1, last)  # no edit runs after the last step
         return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
 
     @property
     def inner(self) -> list[Scheduled]:
         """The stages that run between steps, in order."""
-        return self.in_turn(self.during)
+        return self.in_order(self.during)
 
-    def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+    def in_order(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return the stages of `during` in the order in which they run."""
         return list(during)
 
     def has_ended(self, run: Run) -> bool:
-        """Whether no step of the training is left."""
+        """Return whether all steps of the training are done."""
         return run.stage_step >= self.steps
 
-    def judge(self, run: Run, stage: Scheduled) -> None:
+    def after_stage(self, run: Run, stage: Scheduled) -> None:
         """React to a stage of `during` that has run."""
 
-    def leave(self, run: Run) -> None:
-        """Finish the training."""
+    def finish(self, run: Run) -> None:
+        """Finish the training after its last step."""
 
     def act(self, run: Run) -> None:
         with run.status.stage(self.stage):  # no records are dropped: it resumes in the middle
             self.run(run)
 
     def act_between(self, run: Run) -> None:
-        """Run the stages that are due and do not edit; a failed one runs again on resume."""
+        """Run the due stages that do not edit; a failed stage runs again on resume."""
         for index, stage in enumerate(self.inner):
             due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
             if index < run.during_index or stage.edits or not due:
@@ -231,18 +231,18 @@ class Training(Stage):
             run.during_index = index + 1  # before it runs, for the checkpoint that it may write
             try:
                 stage.act(run)
-                self.judge(run, stage)
+                self.after_stage(run, stage)
             except BaseException:
                 run.during_index = index
                 raise
 
     def end_step(self, run: Run) -> None:
-        """Run what follows a step; if the run is interrupted, save the state and raise Interrupted."""
+        """Run the stages due after a step; if the run is interrupted, save the state and raise Interrupted."""
         with suppress(Stopped):
             self.act_between(run)
         run.on_step()
         if run.interrupted:
-            saved = f"saved in {checkpoint.save(run)}; `clsplat resume {shell_quote(run.out)}` continues from it"
-            raise Interrupted(f"stopped at step {run.step}, {saved}")
+            remedy = f"`clsplat resume {shell_quote(run.out)}` continues from it"
+            raise Interrupted(f"stopped at step {run.step}, saved in {checkpoint.save(run)}; {remedy}")
         if self.has_ended(run):
-            self.leave(run)
+            self.finish(run)

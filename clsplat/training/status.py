@@ -23,7 +23,7 @@ from clsplat.core.resources import full_version
 # The schema of status.json, against which `clsplat check` and `clsplat status` validate a file.
 
 FORMAT: Literal[1] = 1
-Whole = Annotated[int, Field(ge=0, lt=1 << 63)]
+Count = Annotated[int, Field(ge=0, lt=1 << 63)]
 Seconds = Annotated[float, Field(gt=-1e15, lt=1e15)]
 
 
@@ -32,9 +32,9 @@ class Amount(BaseModel):
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
-    done: Whole
+    done: Count
     """Number of units done."""
-    total: Whole
+    total: Count
     """Total number of units."""
     unit: str
     """What is counted, in words: steps, views, cells, photographs decoded, …"""
@@ -50,24 +50,24 @@ class Status(BaseModel):
     format: Literal[1]
     """Version of this schema; it changes if a key is removed or changes its meaning, not if one is added."""
     state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"]
-    """starting: opens the device; preparing: makes and reads the scene; running: runs the stages; others are final."""
+    """starting: opens the device; preparing: prepares and reads the scene; running: runs stages; others are final."""
     stage: str | None = None
     """Current or last stage, or step of `prepare`; of a matrix, the cell."""
     progress: Amount | None = None
     """Progress of that stage, if it can be counted."""
-    step: Whole | None = None
+    step: Count | None = None
     """Training steps done, of all stages; not of a matrix."""
-    steps: Whole | None = None
+    steps: Count | None = None
     """Step at which the training in progress ends."""
-    gaussians: Whole | None = None
+    gaussians: Count | None = None
     """Number of Gaussians at the last report."""
     seconds_left: Seconds | None = None
     """Estimated remaining time of the training at the last report; in a preparation, only of reading the scene."""
     checkpoint: str | None = None
-    """Newest checkpoint, a file in the folder `checkpoints`."""
-    cells: Whole | None = None
+    """Newest checkpoint, the name of a file in the folder `checkpoints`."""
+    cells: Count | None = None
     """Number of cells of a matrix."""
-    done: Whole | None = None
+    done: Count | None = None
     """Number of finished cells of a matrix."""
     failed: dict[str, str] | None = None
     """Failed cells of a matrix, with reasons."""
@@ -83,7 +83,7 @@ class Status(BaseModel):
     """Version of clsplat."""
     host: str
     """Name of the machine, or of the container."""
-    process: Whole
+    process: Count
     """Process ID on that machine."""
     pid_namespace: str | None = None
     """Linux: the namespace of that ID; each container has its own."""
@@ -135,11 +135,11 @@ class StatusFile:
         self.lost: OutputError | None = None  # the error that `require_held` raised
         self._require_held = require_held
         now = time.time()
-        before = read_status(out)
-        checkpoint = before.get("checkpoint")
-        self.was_done = before.get("state") == "done"  # whether an earlier run in the folder was done
+        old = read_status(out)
+        checkpoint = old.get("checkpoint")
+        self.was_done = old.get("state") == "done"  # whether an earlier run in the folder was done
         self.saved_at = time.monotonic()  # s, time of the newest checkpoint, or of the start
-        self.has_run = False  # whether a stage has run since
+        self.has_run = False  # whether a stage has run
         self.now = Status(
             format=FORMAT,
             state="starting",
@@ -155,7 +155,7 @@ class StatusFile:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.seconds: dict[str, float] = {}  # by stage, without nested stages
-        self._inside = 0.0  # seconds of finished stages nested in the current one
+        self._nested_seconds = 0.0  # of finished stages nested in the current one
         self._depth = 0  # of nested stages
         self._warned = False
 
@@ -174,14 +174,14 @@ class StatusFile:
             raise self.lost
 
     def note(self, **values: Any) -> None:
-        """Set fields, which the next heartbeat writes.  Raises OutputError if the folder is lost."""
+        """Set fields, which the next heartbeat writes.  Raises OutputError if another run has taken over the folder."""
         if self.lost:
             raise self.lost
         with self._changing:
             self.now = self.now.model_copy(update={"changed": time.time(), **values})
 
     def enter(self, state: Literal["preparing", "running"], **values: Any) -> None:
-        """Change the state, and write it at once."""
+        """Change the state, and write it immediately."""
         self.note(state=state, stage=None, progress=None, seconds_left=None, **values)
         self.has_run |= state == "running"
         self.refresh()
@@ -204,7 +204,7 @@ class StatusFile:
         self.note(progress=Amount(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
-        """Yield the items and count them as progress; an item is done when the next is requested."""
+        """Yield the items and count them as progress; an item is done when the next one is requested."""
         for number, item in enumerate(items):
             self.count(unit, number, total)
             yield item
@@ -212,23 +212,23 @@ class StatusFile:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Set the current stage; after a nested stage, the outer one is current again, unless it fails.
+        """Set the current stage; when a nested stage ends without a failure, the outer one becomes current again.
 
-        Raises OutputError if the folder is lost.
+        Raises OutputError if another run has taken over the folder.
         """
         self.require_held()
-        around = {"stage": self.now.stage, "progress": self.now.progress}
-        start, before = time.perf_counter(), self._inside
-        self._inside = 0.0
+        outer = {"stage": self.now.stage, "progress": self.now.progress}
+        start, nested_before = time.perf_counter(), self._nested_seconds
+        self._nested_seconds = 0.0
         self._depth += 1
         self.note(stage=name, progress=None)
         yield
         self._depth -= 1
-        spent = time.perf_counter() - start
-        self.seconds[name] = self.seconds.get(name, 0.0) + spent - self._inside
-        self._inside = before + spent
+        seconds = time.perf_counter() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds - self._nested_seconds
+        self._nested_seconds = nested_before + seconds
         if self._depth:
-            self.note(**around)
+            self.note(**outer)
 
     def refresh(self) -> None:
         """Write the status of a run in progress; failures are logged once."""

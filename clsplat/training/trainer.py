@@ -28,7 +28,7 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 @dataclass
 class StepTrainer:
-    """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`.
+    """The objects of a training step; pipelines, benchmarks, and notebooks call the same `step`.
 
     A custom loop over the training views of a scene, from a model of `clsplat.load`:
 
@@ -48,8 +48,8 @@ class StepTrainer:
             gradients = trainer.step(photographs.get(view), step)
             print(gradients.loss)
 
-    Between two steps the Gaussians may be changed (`model.gaussians.set`) or moved (`clsplat.density.edit`).  A loop
-    with its own optimizer calls `differentiate`, the step without Adam, or its two parts, `compare` and `backward`.
+    Between steps, Gaussians may be changed (`model.gaussians.set`) or rearranged (`clsplat.density.edit`).  A loop with
+    its own optimizer calls `differentiate`, the step without Adam, or its two parts, `compare` and `backward`.
     """
 
     rasterizer: Rasterizer
@@ -72,7 +72,7 @@ class StepTrainer:
     ) -> ViewLosses:
         """Train on one view at a global step.  stale: parameters that are not updated.
 
-        Returns the losses and, unless a module skips the step, the gradients; valid until the next step.
+        Returns the losses and, unless a module skips the step, the gradients; both are valid until the next step.
         """
         view = self.differentiate(photograph, step, transforms)
         self.update(view, stale)
@@ -81,7 +81,7 @@ class StepTrainer:
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
     ) -> ViewLosses:
-        """Return the gradient of the losses at one view, as sums over pixels, without an update.
+        """Return the losses at one view and their gradient, as sums over pixels, without an update.
 
         Raises ConfigError like `compare`.
         """
@@ -91,64 +91,64 @@ class StepTrainer:
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
         """Render one view and compare it with its photograph, without an update.
 
-        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two that read different fourth
-        planes, and for one that a module does not support.
+        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two losses that read different
+        fourth planes, and for a loss that a module does not support.
         """
         content = required_content(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
-        now = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
-        now.modules = self.modules
-        for module in now.modules:
-            module.before_render(now)
-        camera = now.camera
-        now.frame = self.rasterizer.forward(now.model, camera, now.background, content)
+        data = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
+        data.modules = self.modules
+        for module in data.modules:
+            module.before_render(data)
+        camera = data.camera
+        data.frame = self.rasterizer.forward(data.model, camera, data.background, content)
         timings.section = "loss"
-        backgrounds = self.background, now.background
-        now.planes = now.photograph.planes(workspace, transforms, step, backgrounds)
-        now.image, now.gradient = now.frame.image, workspace.array("grad_image", now.frame.image.shape)
-        for module in now.modules:
-            module.after_render(now)
-        target, mask = now.planes.colors, now.planes.mask
-        now.comparison = comparison = Comparison(workspace, camera, now.image, target, now.gradient, mask, step)
+        backgrounds = self.background, data.background
+        data.planes = data.photograph.planes(workspace, transforms, step, backgrounds)
+        data.image, data.gradient = data.frame.image, workspace.array("grad_image", data.frame.image.shape)
+        for module in data.modules:
+            module.after_render(data)
+        target, mask = data.planes.colors, data.planes.mask
+        data.comparison = comparison = Comparison(workspace, camera, data.image, target, data.gradient, mask, step)
         if content != "color":  # color losses overwrite only the first three planes
-            now.gradient.fill(0)
+            data.gradient.fill(0)
             comparison.accumulate = True
-        if mask is not None:  # pixels that do not count are black in both images and have no gradient
-            apply_mask(workspace, camera, now.image, mask)
+        if mask is not None:  # masked pixels are black in both images and have no gradient
+            apply_mask(workspace, camera, data.image, mask)
             apply_mask(workspace, camera, target, mask)
-        for module in now.modules:
-            module.before_losses(now)
-        now.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        now.losses += now.module_losses
-        for module in now.modules:
-            module.after_losses(now)
-        return ViewLosses(now.frame, comparison, now.losses, step=now)
+        for module in data.modules:
+            module.before_losses(data)
+        data.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
+        data.losses += data.module_losses
+        for module in data.modules:
+            module.after_losses(data)
+        return ViewLosses(data.frame, comparison, data.losses, step=data)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
-        """Return the gradient of the losses from `compare`, as sums over pixels."""
-        now, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
-        mask = now.planes.mask
+        """Return the result of `compare` with the gradient of its losses, as sums over pixels."""
+        data, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
+        mask = data.planes.mask
         if mask is not None:
-            apply_mask(workspace, now.camera, now.gradient, mask)
-        for module in reversed(now.modules):
-            module.backward(now)
+            apply_mask(workspace, data.camera, data.gradient, mask)
+        for module in reversed(data.modules):
+            module.backward(data)
         self.rasterizer.device.timings.section = "statistics"
-        texture = known_gradient(workspace, now.camera, now.planes.colors, mask) if count > TEXTURE else None
-        now.pixel_sums = self.rasterizer.pixel_sums(
-            now.model, now.frame, now.gradient, count, texture, now.transmittance_gradient
+        texture = known_gradient(workspace, data.camera, data.planes.colors, mask) if count > TEXTURE else None
+        data.pixel_sums = self.rasterizer.pixel_sums(
+            data.model, data.frame, data.gradient, count, texture, data.transmittance_gradient
         )
-        for module in reversed(now.modules):
-            module.after_backward(now)
-        return ViewGradients(now.frame, now.comparison, now.losses, now.pixel_sums, step=now)
+        for module in reversed(data.modules):
+            module.after_backward(data)
+        return ViewGradients(data.frame, data.comparison, data.losses, data.pixel_sums, step=data)
 
     def update(self, view: ViewLosses, stale: Collection[str] = ()) -> None:
-        """Apply the result of `differentiate`: update parameters, moments, statistics and modules."""
+        """Apply the result of `differentiate`: update parameters, moments, statistics, and modules."""
         if not isinstance(view, ViewGradients):
             for module in view.step.modules:
                 module.update_skipped(view.step)
             return
         grad_mean2d = self._update(view, stale)
-        for module in reversed(view.step.modules):  # first wait for what the device finished first
+        for module in reversed(view.step.modules):  # in the order in which the device finished their gradients
             module.update(view.step)
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)
@@ -156,8 +156,8 @@ class StepTrainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion
-        and depths, a fused kernel never writes gradients to memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion,
+        and depths, a fused kernel is used, which writes no gradients to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
@@ -165,8 +165,8 @@ class StepTrainer:
         if not (penalties or stale or self.model.gaussians.is_moving or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
-        waits = self.rows == "deferred" or self.model.gaussians.on_host
-        current = gradients.without_deferred() if waits else gradients
+        is_deferred = self.rows == "deferred" or self.model.gaussians.on_host
+        current = gradients.without_deferred() if is_deferred else gradients
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, current, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)

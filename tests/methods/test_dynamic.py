@@ -76,7 +76,7 @@ def test_single_threaded_run_has_the_same_bits(finished, scene, tmp_path):
 
 
 def test_motion_and_its_adam_moments_are_trained_and_saved(finished):
-    state, tables = checkpoint.load(checkpoint.saved(finished)[-1])
+    state, tables = checkpoint.load(checkpoint.list_files(finished)[-1])
     motion = tables[f"gaussians/{MOTION}"]
     assert state.updates[MOTION] > STEPS / 2
     assert np.abs(motion[:, :3]).max() > 0

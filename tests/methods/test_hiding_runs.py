@@ -48,14 +48,14 @@ def bits(path) -> np.ndarray:
 
 def test_resumed_run_has_the_same_bits(tiny_scene, tmp_path, pipeline, finished):
     whole = finished.out
-    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(whole)}
+    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.list_files(whole)}
     assert not bits(of_step[5]).any(), "an edit follows its step"
     assert bits(of_step[6]).any()
     assert (bits(of_step[11]) != bits(of_step[10])).any(), "a second look"
     expected = (whole / "point_cloud.ply").read_bytes()
     again = tmp_path / "again"
     shutil.copytree(whole, again)
-    for path in checkpoint.saved(again):
+    for path in checkpoint.list_files(again):
         if int(path.stem.removeprefix("step_")) > 8:
             path.unlink()
     (again / "point_cloud.ply").unlink()
@@ -64,7 +64,7 @@ def test_resumed_run_has_the_same_bits(tiny_scene, tmp_path, pipeline, finished)
 
 
 def test_children_inherit_hidden_views(finished):
-    of_step = checkpoint.saved(finished.out)
+    of_step = checkpoint.list_files(finished.out)
     before, after = (next(path for path in of_step if path.stem.endswith(f"_{step:06d}")) for step in (14, 15))
     assert len(bits(after)) > len(bits(before))
     assert set(bits(after)) == set(bits(before))
@@ -74,7 +74,7 @@ def test_children_inherit_hidden_views(finished):
 def test_hidden_gaussians_do_not_change(tiny_scene, tmp_path, pipeline):
     """With `update: seen`; what other views leave out changes with the rest."""
     out = train(tiny_scene, tmp_path / "run", "optimize.densify.every=999", pipeline=pipeline).out
-    saved = {int(path.stem.removeprefix("step_")): checkpoint.load(path)[1] for path in checkpoint.saved(out)}
+    saved = {int(path.stem.removeprefix("step_")): checkpoint.load(path)[1] for path in checkpoint.list_files(out)}
     always = ~saved[11][f"gaussians/{HIDDEN}"][:, 0].astype(int)
     views = int(saved[11][f"gaussians/{HIDDEN}"].max()).bit_length()
     everywhere = (always & (2**views - 1)) == 0

@@ -235,7 +235,7 @@ def test_nonfinite_field_stops_the_run_and_is_quarantined(tiny_scene, tmp_path, 
 
 def test_a_checkpoint_of_another_shape_is_refused(finished):
     """What a file says of its shape, and the tables that it holds, belong together."""
-    state, tables = checkpoint.load(checkpoint.saved(finished)[-1])
+    state, tables = checkpoint.load(checkpoint.list_files(finished)[-1])
     assert state.field is not None
     other = state.model_copy(update={"field": state.field | {"shape": state.field["shape"] | {"width": 64}}})
     with pytest.raises(DataError, match="parameters of its field is not"):
@@ -346,5 +346,5 @@ def test_continued_training_keeps_adam_moments(tiny_scene, tmp_path, pipeline):
     run = train(tiny_scene, tmp_path / "other", "stages.0.steps=4", "stages.1.steps=4", pipeline=str(two))
     assert isinstance(run.learned_field, LearnedField)
     assert (run.learned_field.updates, run.learned_field.field.shape.width) == (4, 16)
-    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "other")[-1])
+    state, _ = checkpoint.load(checkpoint.list_files(tmp_path / "other")[-1])
     assert (state.step, state.updates) == (8, {"field": 4})

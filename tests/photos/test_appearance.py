@@ -47,16 +47,16 @@ def test_fit_recovers_the_matrix_of_an_image(rng, model):
     image, made = rng.uniform(0, 0.6, (500, 3)), model.from_gains(np.array([0.2, -0.1, 0.3]))
     matrix = model.matrix(made)
     photograph = image @ matrix[:, :3].T + matrix[:, 3]
-    assert model.fitted(image, photograph) == pytest.approx(matrix)
-    assert np.isfinite(model.fitted(image[:0], photograph[:0])).all()
-    assert model.fitted(np.zeros((9, 3)), np.zeros((9, 3))).shape == (3, 4)
+    assert model.fit_matrix(image, photograph) == pytest.approx(matrix)
+    assert np.isfinite(model.fit_matrix(image[:0], photograph[:0])).all()
+    assert model.fit_matrix(np.zeros((9, 3)), np.zeros((9, 3))).shape == (3, 4)
 
 
 def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
     table, scalars = ViewTable("t", ("a", "b/c", "d"), ("x", "y")), {"other": 1.0}
-    assert not table.begun(scalars)
+    assert not table.is_in(scalars)
     table.begin(scalars, {"a": np.array([0.3, 0.0]), "d": np.array([0.0, 0.6])})
-    assert table.begun(scalars)
+    assert table.is_in(scalars)
     assert table.row(scalars, "a") == pytest.approx([0.2, -0.2])
     before = {view: table.row(scalars, view) for view in table.views}
     table.update(scalars, "b/c", np.array([2.0, -5.0]), rate=0.03)

@@ -142,7 +142,7 @@ def test_grids_recover_known_exposures(rng, info):
     found = []
     for number, photograph in enumerate(capture.photographs):
         own, image = capture.rendered(photograph.camera), capture.shown(trainer, number)
-        found.append(np.log(np.diag(Gain().fitted(own.reshape(-1, 3), image.reshape(-1, 3)))))
+        found.append(np.log(np.diag(Gain().fit_matrix(own.reshape(-1, 3), image.reshape(-1, 3)))))
     assert rms(np.array(found) - truth) < 0.02
 
 

@@ -95,17 +95,17 @@ def test_settings_that_follow_detail_are_resolved_before_use():
 
 def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
     rates = Rates(means={"initial": 1e-2, "final": 1e-4, "start": "full_size", "until": 1000})
-    assert rates.settled(601).means == Decay(initial=1e-2, final=1e-4, start=601, over=399)
-    means = [rates.settled(600).at(step, 2.0)["means"] for step in (1, 600, 800, 1000, 2000)]
+    assert rates.resolve(601).means == Decay(initial=1e-2, final=1e-4, start=601, over=399)
+    means = [rates.resolve(600).at(step, 2.0)["means"] for step in (1, 600, 800, 1000, 2000)]
     assert means == pytest.approx([2e-2, 2e-2, 2e-3, 2e-4, 2e-4], rel=1e-9)
-    assert rates.settled(5000).means.over == 1
+    assert rates.resolve(5000).means.over == 1
 
 
 def test_rates_waiting_for_full_size_are_resolved_before_use():
     rates = load("dash").settings.training.rates
-    with pytest.raises(ConfigError, match=r"start: full_size.* the rates that `settled\(step\)` returns"):
+    with pytest.raises(ConfigError, match=r"start: full_size.* the rates that `resolve\(step\)` returns"):
         rates.at(1, 1.0)
-    assert rates.settled(1).at(1, 1.0)["means"] == pytest.approx(rates.means.initial, rel=1e-3)
+    assert rates.resolve(1).at(1, 1.0)["means"] == pytest.approx(rates.means.initial, rel=1e-3)
 
 
 def edit_of(count: int, eager: int, step: int = 100) -> SimpleNamespace:

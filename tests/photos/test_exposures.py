@@ -6,7 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
+from clsplat.photos.exposure_estimate import (
+    UNKNOWN,
+    Exposures,
+    _fit,
+    complete_exposures,
+    measure_exposures,
+    samples,
+)
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.colmap import read_images, read_point_table, tracks_of
 from clsplat.scene.colmap_writer import write_model
@@ -14,7 +21,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
-from clsplat.training.modules.exposure import exposures_of
+from clsplat.training.modules.exposure import estimate_exposures
 from tests.support.exposed_wall import POINTS, SIZE, Wall
 
 
@@ -40,7 +47,7 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
     assert shown.log_gains.keys() == {f"{i}.png" for i in (0, 1, 3, 4, 6, 7)}
     truth = dict(zip(seen, wall.log_gains, strict=True))
     told = Exposures({name: truth[name] + 0.7 for name in ("0.png", "2.png", "3.png", "5.png")}, "as noted")
-    found = with_noted(shown, told)
+    found = complete_exposures(shown, told)
     assert found.log_gains.keys() == truth.keys()
     for name, gains in truth.items():
         assert found.log_gains[name] == pytest.approx(gains, abs=3e-3)
@@ -76,7 +83,7 @@ def test_run_starts_from_tracks_and_exif(rng, tmp_path):
         photographs=SimpleNamespace(get=lambda view: Photograph(load_image(view)[..., :3])),
         status=SimpleNamespace(counted=lambda views, *_: views),
     )
-    found = exposures_of(run)
+    found = estimate_exposures(run)
     assert found.text.endswith("those of 1 by EXIF")
     assert found.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
 
@@ -85,8 +92,8 @@ def test_unusable_exif_leaves_the_gains_of_tracks(rng):
     shown = Wall(rng).measured()
     apart = Exposures({"other.png": np.zeros(3)}, "as noted")
     for told in (UNKNOWN, Exposures(dict(shown.log_gains), "as noted"), apart):
-        assert with_noted(shown, told) is shown
-    assert with_noted(Exposures({}, "at 0 points"), apart) is apart
+        assert complete_exposures(shown, told) is shown
+    assert complete_exposures(Exposures({}, "at 0 points"), apart) is apart
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.25])
@@ -96,7 +103,7 @@ def test_images_that_differ_only_by_gains_are_accepted(rng, spread):
     log_gains = wall.log_gains[:, 0] * (spread / 0.25)
     photograph, point = (part.ravel() for part in np.indices((8, POINTS)))
     values = wall.colors[point, 0] * np.exp(log_gains[photograph])
-    assert _fitted(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
+    assert _fit(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
 
 
 def test_images_linked_by_a_chain_of_points_are_compared(rng):
@@ -128,7 +135,7 @@ def test_view_dependent_light_is_not_exposure(rng):
         wall.colors = glossy[view.name]
         return Wall.photograph(wall, view)
 
-    found = measured(wall.tracks, wall.views, lambda view: (photograph(view), None))
+    found = measure_exposures(wall.tracks, wall.views, lambda view: (photograph(view), None))
     assert found.explained < 0.1
     assert found.spread < 0.05
 
@@ -138,7 +145,7 @@ def test_undetermined_gains_are_omitted(rng):
     seen = {**wall.tracks.seen, "3.png": np.empty(0, np.int64)}
     wall.tracks = replace(wall.tracks, seen=seen)
     assert wall.measured().log_gains.keys() == {view.name for view in wall.views} - {"3.png"}
-    nothing = measured(replace(wall.tracks, seen={}), wall.views, lambda view: (wall.photograph(view), None))
+    nothing = measure_exposures(replace(wall.tracks, seen={}), wall.views, lambda view: (wall.photograph(view), None))
     assert nothing.log_gains == {}
     assert nothing.spread == 0
 
@@ -182,6 +189,6 @@ def test_undistorted_scenes_keep_tracks(rng, tmp_path):
     wall.write(tmp_path / "scene")
     assert undistort_scene(tmp_path / "scene", tmp_path / "out", long_side=32) == 3
     scene = read_scene(tmp_path / "out", holdout=0)
-    found = measured(scene.tracks, scene.views, lambda view: (load_image(view), None))
+    found = measure_exposures(scene.tracks, scene.views, lambda view: (load_image(view), None))
     assert scene.views[0].camera.width == 32
     assert table(found) == pytest.approx(wall.log_gains, abs=0.1), "squares of 1.5 px"

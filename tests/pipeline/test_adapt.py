@@ -160,7 +160,7 @@ def test_impossible_decision_is_refused_in_one_sentence(adapt, complaint):
 def test_run_detects_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
-        monkeypatch.setattr("clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky"))
+        monkeypatch.setattr("clsplat.runs.opening.sky_fraction", lambda run: pytest.fail("looked for a sky"))
     text = describe(
         load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), RunState.read(tmp_path / "run"), None, "new"
     )

@@ -45,7 +45,7 @@ for name in sys.argv[3:]:
 
 
 def newest(out: Path) -> State:
-    return checkpoint.load(checkpoint.saved(out)[-1])[0]
+    return checkpoint.load(checkpoint.list_files(out)[-1])[0]
 
 
 @pytest.fixture(scope="module")

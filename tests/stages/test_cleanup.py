@@ -150,7 +150,7 @@ def test_training_continues_after_a_cleanup(finished):
     assert line["step"] == 4
     assert min(line["causes"].values()) > 0
     assert 0 < line["after"] == 600 - sum(line["causes"].values()) == finished.model.gaussians.count
-    _, tables = checkpoint.load(checkpoint.saved(finished.out)[-1])
+    _, tables = checkpoint.load(checkpoint.list_files(finished.out)[-1])
     assert {len(table) for table in tables.values()} == {line["after"]}
 
 
@@ -174,7 +174,7 @@ def test_refused_cleanup_saves_the_trained_state(finished, tiny_scene, tmp_path,
     with pytest.raises(NumericError, match="would remove all Gaussians"):
         train(tiny_scene, out, "cleanup.rules.0.opacity_below=1", pipeline=str(path))
     assert "the state of step 4 is saved in" in caplog.text
-    assert [path.name for path in checkpoint.saved(out)] == ["step_000004.npz"]
+    assert [path.name for path in checkpoint.list_files(out)] == ["step_000004.npz"]
     train(tiny_scene, out, pipeline=str(path), resume=True)
     assert (out / "point_cloud.ply").read_bytes() == (finished.out / "point_cloud.ply").read_bytes()
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.photos.exposure_estimate import Exposures, measured
+from clsplat.photos.exposure_estimate import Exposures, measure_exposures
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
@@ -47,4 +47,4 @@ class Wall:
             write_image(folder / "images" / view.name, self.photograph(view))
 
     def measured(self) -> Exposures:
-        return measured(self.tracks, self.views, lambda view: (self.photograph(view), None))
+        return measure_exposures(self.tracks, self.views, lambda view: (self.photograph(view), None))

@@ -46,7 +46,7 @@ train(Path(sys.argv[1]), Path(sys.argv[2]), pipeline=sys.argv[3])
 
 def bits(out: Path) -> str:
     """A hash of the field and its moments after the last step, of all renders and of the metrics of all sizes."""
-    _, tables = checkpoint.load(checkpoint.saved(out)[-1])
+    _, tables = checkpoint.load(checkpoint.list_files(out)[-1])
     parts = [tables[name].tobytes() for name in sorted(tables)]
     parts += [path.read_bytes() for path in sorted((out / "renders").rglob("*.png"))]
     parts += [json.dumps(json.loads((out / "metrics.json").read_text())["test"]).encode()]

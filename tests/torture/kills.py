@@ -55,12 +55,12 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
         out = folder / f"{recipe}-{tally['finished']}"
         for _ in range(ATTEMPTS):
             left = partials(out)  # by earlier kills: the next one may come before they are swept
-            before = checkpoint.saved(out)[-1:]
+            before = checkpoint.list_files(out)[-1:]
             attempt = Attempt(scene, out, recipe)
             if attempt.killed_after(chance.uniform(0.05, 1.0) * seconds[recipe]):
                 tally["killed"] += 1
                 tally["in a write"] += bool(partials(out) - left)
-                if checkpoint.saved(out)[-1:] == before:  # the machine has become slower
+                if checkpoint.list_files(out)[-1:] == before:  # the machine has become slower
                     seconds[recipe] *= MORE
                 yield tally
             else:
@@ -84,7 +84,7 @@ def identity(out: Path) -> tuple[str, str, list[str]]:
     """
     model = hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
     lines = [{key: value for key, value in line.items() if key not in TIMES} for line in Records(out).read()]
-    older = checkpoint.saved(out)[:-1]
+    older = checkpoint.list_files(out)[:-1]
     files = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and path not in older)
     return model, repr(lines), files
 

@@ -241,8 +241,8 @@ def test_average_of_three_steps(device, rng, count):
 def test_rows_without_an_average_keep_their_values(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
-    average.attach(gaussians)
-    average.take(gaussians)
+    average.attach_average(gaussians)
+    average.take_average(gaussians)
     assert gaussians.tables.keys() == before.keys()
     for name in PARAMETERS:
         np.testing.assert_array_equal(gaussians.get(name), before[name])
@@ -251,9 +251,9 @@ def test_rows_without_an_average_keep_their_values(device, rng):
 @on_one_setting
 def test_empty_model(device, rng):
     gaussians = random_case(rng, 0).model(device).gaussians
-    average.attach(gaussians)
-    average.add(gaussians)
-    average.take(gaussians)
+    average.attach_average(gaussians)
+    average.add_to_average(gaussians)
+    average.take_average(gaussians)
     assert gaussians.count == 0
 
 
@@ -262,10 +262,10 @@ def test_an_average_of_equal_values_is_the_value(device, rng):
     """To the bit, as a table of the parameters that no step changes."""
     gaussians = random_case(rng, 65).model(device).gaussians
     before = {name: gaussians.get(name) for name in PARAMETERS}
-    average.attach(gaussians)
+    average.attach_average(gaussians)
     for _ in range(7):
-        average.add(gaussians)
-    average.take(gaussians)
+        average.add_to_average(gaussians)
+    average.take_average(gaussians)
     for name in PARAMETERS:
         np.testing.assert_array_equal(gaussians.get(name), before[name])
 
@@ -275,9 +275,9 @@ def test_nan_stays_in_its_row(device, rng):
     means = gaussians.get("means")
     means[3] = np.nan
     gaussians.set("means", means)
-    average.attach(gaussians)
-    average.add(gaussians)
-    average.take(gaussians)
+    average.attach_average(gaussians)
+    average.add_to_average(gaussians)
+    average.take_average(gaussians)
     found = gaussians.get("means")
     assert np.isnan(found[3]).all()
     assert np.isfinite(np.delete(found, 3, axis=0)).all()

@@ -94,7 +94,7 @@ def test_color_start_step_is_saved(rng, tmp_path):
     for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
         (tmp_path / "run" / name).unlink()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("clsplat.training.modules.exposure.exposures_of", lambda run: UNKNOWN)
+        patch.setattr("clsplat.training.modules.exposure.estimate_exposures", lambda run: UNKNOWN)
         again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
     assert again.modules["exposure"].scalars == run.modules["exposure"].scalars
 

@@ -51,7 +51,7 @@ def averaged(tiny_scene, tmp_path_factory, pipeline) -> Run:
 def test_run_ends_with_the_average_of_the_added_steps(averaged):
     """Those at 18, 20, ... 28: no edit follows the last step."""
     run = averaged
-    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(run.out)}
+    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.list_files(run.out)}
     found = read_ply(run.out / "point_cloud.ply").parameters
     for name in PARAMETERS:
         steps = [checkpoint.load(of_step[step])[1][f"gaussians/{name}"].astype(float) for step in range(18, 30, 2)]
@@ -69,7 +69,7 @@ def test_resumed_run_has_the_same_bits(tiny_scene, tmp_path, pipeline, averaged)
     (again / "point_cloud.ply").unlink()
     train(tiny_scene, again, pipeline=pipeline, resume=True)
     assert (again / "point_cloud.ply").read_bytes() == expected
-    for path in checkpoint.saved(again):
+    for path in checkpoint.list_files(again):
         if int(path.stem.removeprefix("step_")) > 21:
             path.unlink()
     (again / "point_cloud.ply").unlink()
@@ -87,7 +87,7 @@ def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, a
 def test_training_without_an_average_keeps_the_last_step(tiny_scene, tmp_path, pipeline, caplog):
     caplog.set_level("INFO", "clsplat")
     run = train(tiny_scene, tmp_path / "run", "optimize.average.start=30", pipeline=pipeline)
-    last = checkpoint.load(checkpoint.saved(run.out)[-1])[1]["gaussians/means"]
+    last = checkpoint.load(checkpoint.list_files(run.out)[-1])[1]["gaussians/means"]
     np.testing.assert_array_equal(read_ply(run.out / "point_cloud.ply").parameters["means"], last)
     assert "average: the training ended before its first step" in caplog.text
 

@@ -20,7 +20,7 @@ from clsplat.stages.report import NAMES, is_overfit, overfitting_note
 from clsplat.sweeps.experiment import Job
 from clsplat.training import best_model, checkpoint
 from clsplat.training.archive import split
-from clsplat.training.best_model import Best, Measured
+from clsplat.training.best_model import Best, Scores
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow
@@ -132,7 +132,7 @@ def test_report_shows_three_splits_and_the_best_step(best_run):
 @pytest.mark.parametrize("last", [2, BEST, STEPS])
 def test_run_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, best_run, last):
     out = shutil.copytree(best_run, tmp_path / "run")
-    for path in checkpoint.saved(out):
+    for path in checkpoint.list_files(out):
         if int(path.stem.removeprefix("step_")) > last:
             path.unlink()
     for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
@@ -146,7 +146,7 @@ def test_patience_ends_a_training(tiny_scene, tmp_path, pipeline, best_run):
     assert run.step == BEST + 2 * 4
     assert metrics(run.out)["kept"]["ended"] == run.step
     assert digest(run.out) == digest(best_run)
-    assert checkpoint.saved(run.out)[-1].name == f"step_{run.step:06d}.npz", "of the end, to train longer"
+    assert checkpoint.list_files(run.out)[-1].name == f"step_{run.step:06d}.npz", "of the end, to train longer"
     longer = train(tiny_scene, run.out, "optimize.patience=99", pipeline=pipeline, resume=True)
     assert longer.step == STEPS
     assert digest(run.out) == digest(best_run)
@@ -166,7 +166,7 @@ def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeli
     until = train(tiny_scene, tmp_path / "until", "densify.grow_until=12", pipeline=pipeline).out
     assert growth_by_step(until) == growth_by_step(out)
     again = shutil.copytree(tmp_path / "1", tmp_path / "again")
-    for path in checkpoint.saved(again):
+    for path in checkpoint.list_files(again):
         if int(path.stem.removeprefix("step_")) > 14:
             path.unlink()
     for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
@@ -177,7 +177,7 @@ def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeli
 
 def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
-    found = Measured(step=30, train=20, validation=20)
+    found = Scores(step=30, train=20, validation=20)
     best_run = Best(
         measured=found,
         degree=0,
@@ -233,7 +233,7 @@ def test_training_ended_by_patience_has_a_final_checkpoint(tiny_scene, tmp_path,
     during = "optimize.during=[checkpoint: {every: 20}, evaluate: {every: 4, split: validation}]"
     run = train(tiny_scene, tmp_path / "run", during, *PATIENT, pipeline=pipeline)
     assert run.step < STEPS
-    assert checkpoint.saved(tmp_path / "run")[-1].name == f"step_{run.step:06d}.npz"
+    assert checkpoint.list_files(tmp_path / "run")[-1].name == f"step_{run.step:06d}.npz"
 
 
 def test_twenty_measurements_are_added_by_default(pipeline):
@@ -270,7 +270,7 @@ def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pi
 @pytest.mark.parametrize("names", ["step_000016", "refit_000002", "refit_000008"])
 def test_refit_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, pipeline, refit, names):
     out = shutil.copytree(refit, tmp_path / "run")
-    files = checkpoint.saved(out)
+    files = checkpoint.list_files(out)
     assert [file.stem for file in files] == [f"step_{s:06d}" for s in range(2, 17, 2)] + [
         f"refit_{s:06d}" for s in range(2, BEST + 1, 2)
     ]
@@ -367,7 +367,7 @@ def test_a_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
         trainer.step()
 
 
-NOW = Measured(step=8, train=30.0, validation=20.0)
+NOW = Scores(step=8, train=30.0, validation=20.0)
 FOUND = Best(measured=NOW, degree=0, metrics={}, evaluations=1, since_best=0, first_overfit=None, last=NOW)
 
 
@@ -400,7 +400,7 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best_run):
     ],
 )
 def test_six_decibels_apart_is_overfit(train_, validation, expected):
-    assert expected in Measured(step=8, train=train_, validation=validation).text("validation")
+    assert expected in Scores(step=8, train=train_, validation=validation).text("validation")
 
 
 def test_run_without_validation_reports_overfitting(tiny_scene, tmp_path, pipeline):

@@ -43,7 +43,7 @@ def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     grids = GridState(BilateralGrid(), ("a",), device)
-    found = grids.changed(workspace, camera, planes_of(device, camera, image), 0)
+    found = grids.transform(workspace, camera, planes_of(device, camera, image), 0)
     assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
     assert not grids.smoothness(workspace, 0).get().any()
 
@@ -56,7 +56,7 @@ def test_constant_luminance_reads_the_adjacent_levels(device):
     grids.load({}, {"values": values.reshape(grids.shape)})
     for gray, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
         planes = planes_of(device, camera, np.full((3, 5, 20), gray, np.float32))
-        found = grids.changed(Workspace(device), camera, planes, 1).get()[:, :5, :20]
+        found = grids.transform(Workspace(device), camera, planes, 1).get()[:, :5, :20]
         assert found == pytest.approx(gray + expected, abs=1e-6), gray
 
 
@@ -124,10 +124,10 @@ def test_single_cell_equals_the_affine_kind(device, rng):
     affine.scalars.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
-    found = grids.changed(workspace, camera, image, 1).get()
+    found = grids.transform(workspace, camera, image, 1).get()
     expected = transform_colors(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)
-    passed, grad_grid = grids.differentiated(workspace, camera, image, gradient, 1)
+    passed, grad_grid = grids.differentiate(workspace, camera, image, gradient, 1)
     passed, grad_grid = passed.get(), grad_grid.get()
     through, grad_matrix = color_gradients(workspace, camera, image, affine.matrix(1), gradient)
     assert passed == pytest.approx(through.get(), abs=1e-5)

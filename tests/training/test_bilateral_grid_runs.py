@@ -113,8 +113,8 @@ def bits(device: Device) -> str:
     one, workspace, camera = grids_of(device, rng, (5, 4, 3)), Workspace(device), camera_of(device, 100, 70)
     planes = [planes_of(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
     for step in (1, 2):
-        image, _ = one.changed(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
-        gradient, grad_grid = one.differentiated(workspace, camera, *planes, 1)
+        image, _ = one.transform(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
+        gradient, grad_grid = one.differentiate(workspace, camera, *planes, 1)
         one.learn(workspace, 1, grad_grid, step)
         for array in (image, gradient, *one.arrays.values()):
             found.update(array.get().tobytes())

@@ -65,7 +65,7 @@ def test_unrenamable_damaged_checkpoint_does_not_count(run, locked_names, caplog
     later = run.out / "checkpoints" / "step_000009.npz"
     later.touch()
     locked_names.add(later.name)
-    checkpoint.drop_later(run.out, run.out / "checkpoints" / "step_000001.npz")
+    checkpoint.rename_damaged(run.out, run.out / "checkpoints" / "step_000001.npz")
     assert "step_000009.npz: cannot be renamed (in use)" in caplog.text
     checkpoint.save(run, keep=1)
     assert names_of(run) == ["step_000002.npz", "step_000009.npz"]

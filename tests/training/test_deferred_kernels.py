@@ -97,7 +97,7 @@ def write_rows(model: DeviceModel, adam: Adam, step: int) -> None:
     if step == 5:
         model.gaussians.zero_rows(["adam/sh_rest/moment1"], rows)
     if step == 7:
-        adam.forget("sh_rest")
+        adam.reset_moments("sh_rest")
 
 
 def drop_bands(model: DeviceModel, adam: Adam, step: int) -> None:

@@ -17,7 +17,7 @@ from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.modules.base import TrainingStep
-from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, first_tables
+from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, initial_tables
 from tests.support.runs import FEW, ONE_CORE, digest, train
 
 ON = (*FEW, "optimize.modules.distractors={count: 30, start: 4}")
@@ -31,7 +31,7 @@ class Pair:
         self.case, self.device, self.rng = random_case(rng, 40, 50, 36, degree=0), device, rng
         self.views = [self.case.view, replace(self.case.view, name="other")]
         pixels = rng.integers(0, 256, (36, 50, 3), np.uint8)
-        self.tables = first_tables(20, [(view, pixels) for view in self.views])
+        self.tables = initial_tables(20, [(view, pixels) for view in self.views])
         self.tables["logit_opacity"] = rng.normal(0, 1, (40, 1)).astype(np.float32)
         self.tables["sh_base"] = rng.normal(0, 0.7, (40, 3)).astype(np.float32)
         self.tables["log_scales"] += rng.normal(0, 0.3, (40, 3)).astype(np.float32)
@@ -140,7 +140,7 @@ def test_distractors_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_
     command += [word for one in ON for word in ("--set", one)] + ["--out", str(tmp_path / "one")]
     subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, capture_output=True)
     assert digest(tmp_path / "one") == expected
-    (one, two) = (checkpoint.load(checkpoint.saved(tmp_path / name)[-1])[1] for name in ("one", "run"))
+    (one, two) = (checkpoint.load(checkpoint.list_files(tmp_path / name)[-1])[1] for name in ("one", "run"))
     own = split(one, "modules/distractors/")[0]
     assert own["means"].shape == (8 * 30, 3)
     assert own["updates"].sum() == 12 - 4
@@ -165,7 +165,7 @@ def test_distractors_combine_with_other_modules(tiny_scene, tmp_path, others):
     run = train(tiny_scene, tmp_path / "run", *ON, *others)
     assert "distractors" not in run.modules
     assert not run.not_finite()
-    tables = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[1]
+    tables = checkpoint.load(checkpoint.list_files(tmp_path / "run")[-1])[1]
     assert split(tables, "modules/distractors/")[0]["updates"].sum() == 12 - 4
 
 

@@ -43,16 +43,18 @@ def test_time_left_is_a_lower_bound_before_growth():
 
 
 def test_time_left_without_growth_is_proportional():
-    forecast = Forecast.of(0, 100, [])
+    forecast = Forecast.from_rules(0, 100, [])
     forecast.add(50, 20.0, 7, 0.5)
     assert forecast.growth_known
     assert forecast.seconds_left == 25
 
 
 def test_growth_ends_with_the_last_edit():
-    assert Forecast.of(0, 1000, [lambda step: step % 100 == 0 and step < 700]).growth_end == 600
-    assert Forecast.of(0, 1000, [lambda step: step % 100 == 0]).growth_end == 900, "no edit follows the last step"
-    assert Forecast.of(950, 1000, [lambda step: step % 100 == 0]).growth_end == 950
+    assert Forecast.from_rules(0, 1000, [lambda step: step % 100 == 0 and step < 700]).growth_end == 600
+    assert Forecast.from_rules(0, 1000, [lambda step: step % 100 == 0]).growth_end == 900, (
+        "no edit follows the last step"
+    )
+    assert Forecast.from_rules(950, 1000, [lambda step: step % 100 == 0]).growth_end == 950
 
 
 def test_psnr_is_the_mean_over_the_last_views():

@@ -86,9 +86,9 @@ def test_images_of_one_camera_share_a_parameter():
     state.zoom("c", 5.0, 0.01)
     assert state.factor("a") == state.factor("c") == pytest.approx(np.exp(-0.01))
     assert [state.factor(name) for name in "bd"] == [1, 1]
-    assert state.zoomed == ["a"]
+    assert state.zoomed_cameras == ["a"]
     state.zoom("b", 5.0, 0.0)
-    assert state.zoomed == ["a"]
+    assert state.zoomed_cameras == ["a"]
 
 
 def test_rates_follow_the_visits_of_a_camera():

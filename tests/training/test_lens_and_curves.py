@@ -45,7 +45,7 @@ def test_step_gradients_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
     _, row, of_weight, (wait,) = view.step.saved(case.state)
-    found, numeric = case.example.by_parameters(row, wait()) + of_weight, []
+    found, numeric = case.example.row_gradient(row, wait()) + of_weight, []
     gradients = case.trainer.rasterizer.gradients(case.trainer.model, view.frame, view.pixel_sums)["sh_base"].get()
     for key in case.keys:
         ends, value = [], case.state.scalars[key]

@@ -12,7 +12,7 @@ from clsplat.losses.base import LossValue
 from clsplat.losses.image import L1, L2
 from clsplat.pipeline.loading import load
 from clsplat.training import checkpoint
-from clsplat.training.modules.base import ModuleState, TrainingModule, check_list, class_of, implicit_modules
+from clsplat.training.modules.base import ModuleState, TrainingModule, check_list, implicit_modules, module_class
 from tests.support.device_images import trainer_of
 from tests.support.runs import FEW, killed, train
 from tests.support.sources import PATHS, own_imports, room
@@ -110,7 +110,7 @@ def test_modules_run_in_order_and_backward_in_reverse(device, rng):
 
 def test_unknown_module_is_named():
     with pytest.raises(ConfigError, match="an unknown module 'nosuch'; load its plug-in"):
-        class_of("nosuch")
+        module_class("nosuch")
 
 
 NEEDED = {  # so that each acts within seven steps
@@ -154,7 +154,7 @@ def test_killed_run_resumes_to_the_same_bits(tiny_scene, tmp_path, number):
     whole, again = tmp_path / "whole", tmp_path / "again"
     train(tiny_scene, whole, *settings)
     train(tiny_scene, killed(whole, again), *settings, resume=True)
-    (one, tables), (other, resumed) = (checkpoint.load(checkpoint.saved(out)[-1]) for out in (whole, again))
+    (one, tables), (other, resumed) = (checkpoint.load(checkpoint.list_files(out)[-1]) for out in (whole, again))
     assert one.modules == other.modules
     assert one.modules.keys() == {module["type"] for module in lists()[number]} | ({"sky"} if number else set())
     assert {name: table.tobytes() for name, table in tables.items()} == {

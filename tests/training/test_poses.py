@@ -129,7 +129,7 @@ def test_resumed_run_has_the_same_bits(with_poses, tiny_scene, tmp_path):
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_poses)
     scalars = run.modules["camera_optimizer"].scalars
-    assert scalars == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].modules["camera_optimizer"]
+    assert scalars == checkpoint.load(checkpoint.list_files(with_poses)[-1])[0].modules["camera_optimizer"]
     assert sum(value for name, value in scalars.items() if name.endswith("x/updates")) == 2 * (12 - 2)
     assert attach_modules([], run, 24)[0].pose_change(run.scene.split("train")[0].name).translation.any(), "they stay"
     for table in run.modules["camera_optimizer"].pose_tables:

@@ -136,7 +136,7 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
 
 @pytest.mark.parametrize("least", ["2", "-0.1", "much", "[1]", "null"])
 def test_invalid_fraction_is_refused(least):
-    with pytest.raises(ConfigError, match=r"skip_backward\.min_fraction=.*: expected 'auto' or a share from 0 to 1"):
+    with pytest.raises(ConfigError, match=r"skip_backward\.min_fraction=.*: expected auto, or a number from 0 to 1"):
         load(
             "smoke", ["optimize.modules.skip_backward.start=9", f"optimize.modules.skip_backward.min_fraction={least}"]
         )

@@ -47,7 +47,7 @@ def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_st
     run = train(tiny_scene, tmp_path / "run", *ON)
     assert sum(run.modules["transients"].scalars[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)
-    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
+    state, _ = checkpoint.load(checkpoint.list_files(tmp_path / "run")[-1])
     assert state.modules["transients"] == run.modules["transients"].scalars
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from clsplat.stages.report import training_charts
-from clsplat.training.records import VIEWS, Forecast, over_views
+from clsplat.training.records import VIEWS, Forecast, moving_average
 from clsplat.viewer.charts import HEIGHT, Line, curve, histogram
 
 
@@ -66,7 +66,7 @@ def test_report_and_terminal_show_the_same_psnr():
     for i, psnr in enumerate(psnrs, 1):
         forecast.add(i, psnr, 10, 0.1)
         seen.append(forecast.psnr)
-    assert over_views(psnrs) == pytest.approx(seen)
+    assert moving_average(psnrs) == pytest.approx(seen)
     train = [{"step": i, "psnr": psnr, "loss": 0.1, "gaussians": 9, "ms": 1.0} for i, psnr in enumerate(psnrs, 1)]
     records = SimpleNamespace(read=lambda kind, trial=False: [] if trial else train if kind == "train" else [
         {"step": step, "split": "test", "downscale": 1.0, "psnr": psnr} for step, psnr in ((1, 20.0), (7, 31.0))

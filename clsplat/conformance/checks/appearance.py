@@ -16,7 +16,7 @@ from clsplat.photos.appearance import IDENTITY, LUMINANCE
 from clsplat.render.camera import CAMERA
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
-from clsplat.training.modules.camera_response import by_parameters, respond
+from clsplat.training.modules.camera_response import respond, row_gradient
 from clsplat.training.modules.exposure import color_gradients, transform_colors
 
 CHECKS = Checks()
@@ -71,11 +71,11 @@ def check_grid(
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
     exact = image[:3].astype(np.float64)
-    actual = grids.changed(workspace, camera, planes, 1).get()
+    actual = grids.transform(workspace, camera, planes, 1).get()
     expected = ref.gridded(exact, grid)
     yield by_element("color_grid_forward", f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield equal("color_grid_forward", f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
-    passed, by_grid = grids.differentiated(workspace, camera, planes, uploaded, 1)
+    passed, by_grid = grids.differentiate(workspace, camera, planes, uploaded, 1)
     by_image, expected = ref.gridded_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(by_image).max()), 1.0)
     grad_image, grad_grid = passed.get(), by_grid.get()
@@ -101,10 +101,10 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
     moment1, moment2 = np.zeros((2, row_length(nodes)))
     grids.rate = rate = 0.01
     for step in range(1, 4):
-        shares = grids.smoothness(workspace, 1)
+        terms = grids.smoothness(workspace, 1)
         grad_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
-        actual, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
+        actual, wanted = np.array([terms.get().sum(dtype=np.float64)]), np.array([weight * smooth])
         kernel = "color_grid_smoothness"
         yield by_element(kernel, f"value, {label}", actual, wanted, SUM, floor=1e-2)
         actual, wanted = of_photograph(grids, grad_smoothness), weight * slope
@@ -201,7 +201,7 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     yield by_element(kernel, f"gradient, {label}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
     yield equal(kernel, f"gradient outside the image, {label}", outside(camera, passed[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield by_element(kernel, f"gradient by the numbers, {label}", by_parameters(row, sums), grad_row, SUM, floor=floor)
+    yield by_element(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
     if channels > 3:
         yield equal(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
         yield equal(kernel, f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])

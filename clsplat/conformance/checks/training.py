@@ -311,18 +311,18 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
     """Compare the average of three steps; the last of several rows is new after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
-    adam.attach(gaussians)
+    adam.attach_average(gaussians)
     for step, parameters in enumerate(steps):
         for name in PARAMETERS:
             gaussians.set(name, parameters[name])
-        adam.add(gaussians)
+        adam.add_to_average(gaussians)
         if step == 0 and count > 1:
             source, fresh = np.arange(count, dtype=np.uint32), np.zeros(count, np.uint32)
             fresh[-1] = 1
             gaussians.rearrange(device.upload(source), device.upload(fresh), count)
     for name in PARAMETERS:
         gaussians.set(name, steps[0][name])
-    adam.take(gaussians)
+    adam.take_average(gaussians)
     for name in PARAMETERS:
         values = np.stack([parameters[name].astype(np.float64) for parameters in steps])
         expected = values.mean(axis=0)

@@ -18,7 +18,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
-from clsplat.training.records import VIEWS, over_views
+from clsplat.training.records import VIEWS, moving_average
 from clsplat.viewer.charts import COLORS, Line, curve
 
 # The tables: metrics and costs, means over scenes, differing settings.
@@ -230,7 +230,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
 
     def trained(run: RunFolder) -> Points:
         points = run.points("train", "psnr")
-        return list(zip([step for step, _ in points], over_views([psnr for _, psnr in points]), strict=True))
+        return list(zip([step for step, _ in points], moving_average([psnr for _, psnr in points]), strict=True))
 
     drawings = [
         curve(f"test PSNR over steps, dB{means}", lines(tested)),

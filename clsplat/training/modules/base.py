@@ -41,9 +41,9 @@ class TrainingStep:
     loss_settings: Sequence[Loss]
     transforms: Sequence[PhotographTransform]
     frame: Frame = field(init=False)
-    planes: Planes = field(init=False)  # the photograph, and which pixels count
-    image: Array = field(init=False)  # what the losses compare with the photograph; a module may replace it
-    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by the gradient of its input
+    planes: Planes = field(init=False)  # the photograph and its mask
+    image: Array = field(init=False)  # compared with the photograph by the losses; a module may replace it
+    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by that of the module's input
     comparison: Comparison = field(init=False)
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)
@@ -59,7 +59,7 @@ class TrainingStep:
 
     @property
     def view(self) -> int | None:
-        """The index of the training view; None for any other image, which modules leave unchanged."""
+        """The index of the training view; None for other images, which modules leave unchanged."""
         return self.photograph.camera.view
 
     @property
@@ -72,7 +72,7 @@ class TrainingStep:
         return sum(loss.value() for loss in self.losses)
 
     def save(self, state: "ModuleState", value: Any) -> None:
-        """Save a value for the later hooks of the same module in this step."""
+        """Save a value for later hooks of the same module in this step."""
         self._saved[id(state)] = value
 
     def saved(self, state: "ModuleState") -> Any:
@@ -82,12 +82,12 @@ class TrainingStep:
 class ModuleState:
     """The state of a module during training.
 
-    Only `update` and `update_skipped` change scalars and tables; the other hooks change only the step.  A step that
-    fails before its update therefore leaves the run as it was.
+    Only `update` and `update_skipped` change scalars and tables; other hooks change only the step.  A step that
+    fails before its update therefore leaves the run unchanged.
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "dropped"
-    """What happens to the state when its training ends: kept for measurements, or active in later trainings too."""
+    """What happens to the state after its training: dropped, kept for evaluation, or active in later trainings too."""
     is_saved: ClassVar[bool] = True  # in checkpoints
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ class ModuleState:
         return {}
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        """Restore the state from a checkpoint, an earlier training or the best model."""
+        """Restore the state from a checkpoint, an earlier training, or the best model."""
         self.scalars = dict(scalars)
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
@@ -107,7 +107,7 @@ class ModuleState:
         return True
 
     def start(self, run: Run) -> None:
-        """Set the initial values, in a run that has none."""
+        """Set the initial values, in a run that has no earlier state."""
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
         """Prepare for a training that ends at global step `last`.  trained: whether the module learns in it."""
@@ -124,7 +124,7 @@ class ModuleState:
 
     # outside steps
     def attach_to(self, model: DeviceModel) -> None:
-        """Attach to a model what it is rendered with besides its Gaussians."""
+        """Attach objects to a model that are rendered with its Gaussians, such as a sky."""
 
     def finish(self, run: Run) -> None:
         """Act after the last step, before the best model replaces the last one."""
@@ -135,7 +135,7 @@ class ModuleState:
         return None
 
     def apply_to(self, scene: Scene) -> Scene:
-        """Return a scene, at full size, with the learned cameras."""
+        """Return a full-size scene with the learned cameras."""
         return scene
 
     def write(self, run: Run) -> None:
@@ -143,18 +143,18 @@ class ModuleState:
 
 
 class TrainingModule(Settings):
-    """Something that takes part in a training step next to the Gaussians."""
+    """A component of training steps, in addition to the Gaussians."""
 
     order: ClassVar[int] = 0
-    """Modules are listed in ascending order of this number.  Below 20 they change the camera, the model, the background
-    or the photograph; below 30, what is in front of the scene; below 40, colors; below 99, what is compared.  It is a
-    number rather than the names of other modules, so that a plug-in has its position too."""
+    """Modules are listed in ascending order of this number.  Below 20, they change the camera, model, background, or
+    photograph; below 30, layers in front of the scene; below 40, colors; below 99, the images that are compared.  It is
+    a number and not a list of other modules, so that plug-ins have a position too."""
     side_files: ClassVar[Mapping[str, str]] = {}
     """Files in the run folder, each with its title; their names start with `view_`."""
     device_planes: ClassVar[int] = 0  # float planes on the device, each of the largest view's size
-    implicit_type: ClassVar[str] = ""  # the type of a module that is in no list: the model or a loss implies it
+    implicit_type: ClassVar[str] = ""  # the type of a module that is never listed, but implied by the model or a loss
     keyed_by_type: ClassVar[bool] = True
-    optional_on_resume: ClassVar[bool] = False  # may be added or removed on resume; bits then no longer compare
+    optional_on_resume: ClassVar[bool] = False  # may be added or removed on resume; results then differ
 
     type: str
     """Name of the module."""
@@ -170,11 +170,11 @@ class TrainingModule(Settings):
         return None
 
     def resolve_auto(self, run: Run) -> "TrainingModule":
-        """Return the module with its automatic settings chosen from the photographs."""
+        """Return the module with its `auto` settings chosen from the photographs."""
         return self
 
     def is_active(self, scene: Scene | None = None) -> bool:
-        """Return whether the module does anything for a scene; without a scene, whether it does for any."""
+        """Return whether the module has an effect for a scene; without a scene, whether it has one for every scene."""
         return True
 
     def excluded(self) -> Mapping[str, str]:
@@ -184,19 +184,19 @@ class TrainingModule(Settings):
         """Raise ConfigError for losses that the module does not support."""
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        """Return an upper bound of the device memory it needs.  tile: side of a tile, px."""
+        """Return an upper bound of the device memory that the module needs, bytes.  tile: side of a tile, px."""
         return 4 * self.device_planes * most_pixels(views, tile) if self.device_planes else 0
 
     def check_run(self, run: Run) -> None:
         """Raise errors that can be detected before the first stage."""
 
     def create_state(self, run: Run) -> ModuleState:
-        """Return an empty state whose sizes follow from the run; nothing is measured yet."""
+        """Return an empty state with the sizes for a run; nothing is measured yet."""
         raise NotImplementedError
 
     @classmethod
     def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
-        """Raise DataError if a checkpoint's scalars and tables cannot be those of this module."""
+        """Raise DataError if a checkpoint's scalars and tables do not fit this module."""
         for name, table in tables.items():
             if table.dtype != np.float32 or not np.isfinite(table).all():
                 raise DataError(f"{name} of its {cls.__name__} has values that are not finite float32 numbers")
@@ -213,21 +213,22 @@ class TrainingModule(Settings):
 
 
 def check_list(modules: Sequence[TrainingModule]) -> None:
-    """Raise ValueError if modules are out of order, or two are of the same group."""
+    """Raise ValueError if modules are out of order, or if two are in the same group."""
     for before, after in itertools.pairwise(modules):
         if after.order < before.order:
-            raise ValueError(f"'{after.type}' is listed after '{before.type}'; put it before")
+            raise ValueError(f"'{after.type}' is listed after '{before.type}'; put it before '{before.type}'")
     types: dict[str, str] = {}
     for module in modules:
         if module.group in types:
-            raise ValueError(f"'{module.type}' and '{types[module.group]}' exclude each other; leave one out")
+            raise ValueError(f"'{module.type}' and '{types[module.group]}' exclude each other; remove one of them")
         types[module.group] = module.type
 
 
 def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
     """Return the module states of a training that ends at global step `last`, in order.
 
-    They are the listed ones, the ones that the model and the losses imply, and any still active from before.
+    They are those of the listed modules, of modules implied by the model and the losses, and of modules that are still
+    active from an earlier training.
     """
     trained = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
     groups = {module.group for module in trained}
@@ -249,21 +250,21 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> li
 
 
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
-    """Return the modules of a run's trainings up to its current stage, by type: the last of each."""
+    """Return the modules of a run's trainings up to its current stage, the last of each type, by type."""
     stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
     listed = (module for stage in stages for module in getattr(stage, "modules", ()))
     return {module.type: module for module in (*listed, *implied_modules(run)) if module.is_active(run.scene)}
 
 
 def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
-    """Return the modules that the model and the losses of a stage imply; None: of the current stage."""
+    """Return the modules implied by the model and the losses of a stage.  stage: None for the current one."""
     stages = getattr(run.settings, "stages", ())
     stage = stages[run.stage_index] if stage is None and run.stage_index < len(stages) else stage
     return [module for kind in implicit_modules().values() if (module := kind.implied(run, stage))]
 
 
 def implicit_modules() -> dict[str, type[TrainingModule]]:
-    """Return the classes of modules that are in no list, by type."""
+    """Return the classes of modules that are never listed, by type."""
     return {
         module.implicit_type: module
         for module in Settings.defined
@@ -282,7 +283,7 @@ def restore_modules(run: Run, saved: Mapping[str, tuple[Scalars, Tables]]) -> di
 
 
 def learned_scene(run: Run) -> Scene:
-    """Return the scene of a run, at full size, with the cameras that its modules learned."""
+    """Return the full-size scene of a run with the cameras that its modules learned."""
     scene = run.original
     for state in run.modules.values():
         scene = state.apply_to(scene)
@@ -296,8 +297,8 @@ def apply_side_files(model: Path, scene: Scene) -> Scene:
     return scene
 
 
-def class_of(name: str) -> type[TrainingModule]:
-    """Return the class of a module in a checkpoint.  Raises ConfigError if there is none of that name."""
+def module_class(name: str) -> type[TrainingModule]:
+    """Return the class of a module in a checkpoint.  Raises ConfigError for an unknown name."""
     if (kind := {**variants(TrainingModule), **implicit_modules()}.get(name)) is None:
         raise ConfigError(f"the checkpoint has an unknown module '{name}'; load its plug-in with --plugin")
     return kind

@@ -1,4 +1,4 @@
-"""Fit colors per photograph by position and luminance: bilateral grids (cl_kernels/color_grid.cl)."""
+"""Fit a bilateral grid of color transforms to each photograph (cl_kernels/color_grid.cl)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ WARM_UP = 1000  # steps (gsplat), or a tenth of a shorter training
 Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
     f"{MEANING}; [E | b] is interpolated trilinearly; file: matrices [photographs, luminance, height, width, 3, 4], "
-    "float32, the outer ones on the edges of the image, at black and at white of {} red + {} green + {} blue; "
+    "float32, the outer ones on the edges of the image, at black and white of {} red + {} green + {} blue; "
     "matrix: the mean of a photograph's matrices"
 ).format(*LUMINANCE)
 
@@ -52,8 +52,8 @@ class BilateralGrid(Appearance):
 
     type: Literal["bilateral_grid"] = "bilateral_grid"
     grid_shape: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
-    """Matrices along the width, the height and the luminance, 1 to 16 each, interpolated trilinearly; the outer ones
-    are on the edges, at black and at white.  The paper uses [16, 16, 8]."""
+    """Number of matrices along width, height, and luminance, 1 to 16 each, interpolated trilinearly; the outer ones are
+    on the edges, at black and white.  The paper uses [16, 16, 8]."""
     rate: RateOrAuto = "auto"
     """Learning rate; by step.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown, with a
     warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
@@ -78,18 +78,18 @@ class BilateralGrid(Appearance):
         super().check_saved(scalars, tables)
         shapes = {table.shape for table in tables.values()}
         if tables.keys() not in ({*TABLES}, {*TABLES[:1]}) or len(shapes) != 1 or shapes.pop()[1:2] != (ENTRIES,):
-            raise DataError(f"its grids are not [photographs, {ENTRIES}, nz, ny, nx]")
+            raise DataError(f"its grids do not have the shape [photographs, {ENTRIES}, nz, ny, nx]")
         rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if rows != list(range(count)):
-            raise DataError(f"it has color grids of {count} photographs, but scalars of other rows")
+            raise DataError(f"it has color grids for {count} photographs, but scalars for other rows")
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         if self.rate != "auto":
             return self.rate
-        from_gains = super().rate_of(steps, photographs, known)
-        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else from_gains
+        exposure_rate = super().rate_of(steps, photographs, known)
+        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else exposure_rate
         warm_up = max(1, min(WARM_UP, steps // 10))
-        later = [warm_up + round((steps - warm_up) * share) for share in np.linspace(0, 1, 11)]
+        later = [warm_up + round((steps - warm_up) * t) for t in np.linspace(0, 1, 11)]
         points = {step: [float(step), at_step(rate, step)] for step in later}
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
 
@@ -115,7 +115,7 @@ class GridState(ColorState):
         return "values" in tables and tables["values"].shape == self.shape
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        """Missing tables become 0."""
+        """Restore the state; missing tables become 0."""
         super().load(scalars, tables)
         for name, array in self.arrays.items():
             array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
@@ -130,21 +130,21 @@ class GridState(ColorState):
         self._center()
 
     def row(self, view: int) -> int:
-        """Return the row of a training view."""
+        """Return the index of a training view's grid.  view: the index of the view."""
         return self.names.index(self.views[view])
 
     def after_render(self, step: TrainingStep) -> None:
         if step.view is None:
             return
         image = step.image
-        step.image = self.changed(step.workspace, step.camera, image, step.view)
-        shares = self.smoothness(step.workspace, step.view)
-        step.module_losses.append(LossValue("colors", lambda: float(shares.get().sum(dtype=np.float64))))
+        step.image = self.transform(step.workspace, step.camera, image, step.view)
+        terms = self.smoothness(step.workspace, step.view)
+        step.module_losses.append(LossValue("colors", lambda: float(terms.get().sum(dtype=np.float64))))
         step.save(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
         if (saved := step.saved(self)) and step.view is not None:
-            step.gradient, grad_grid = self.differentiated(
+            step.gradient, grad_grid = self.differentiate(
                 step.workspace, step.camera, saved[0], step.gradient, step.view
             )
             saved[1].append(grad_grid)
@@ -169,7 +169,7 @@ class GridState(ColorState):
         }
         return ColorReport(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
-    def changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
+    def transform(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
         result = workspace.array("colored", image.shape)
         workspace.device.program("color_grid.cl").color_grid_forward(
             groups=(1, camera.rows), image=image, colored=result, **self._arguments(camera, image, view)
@@ -177,27 +177,27 @@ class GridState(ColorState):
         return result
 
     def smoothness(self, workspace: Workspace, view: int) -> Array:
-        """Write the gradient of the total variation loss; return its terms."""
+        """Write the gradient of the total variation loss into the workspace; return the terms of the loss, [row]."""
         nodes, row = dict(zip("xyz", self.settings.grid_shape, strict=True)), row_length(self.settings.grid_shape)
         sizes: dict[str, Any] = {f"n{axis}": n for axis, n in nodes.items()}
-        grad_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
+        grad_smoothness, terms = (workspace.array(f"grid {name}", row) for name in ("smoothness", "terms"))
         differences = {axis: row // n * (n - 1) for axis, n in nodes.items()}
         sizes |= {f"weight_{axis}": self.settings.weight / max(number, 1) for axis, number in differences.items()}
         workspace.device.program("color_grid_table.cl").color_grid_smoothness(
             items=row,
             values=self.arrays["values"],
             grad_smoothness=grad_smoothness,
-            shares=shares,
+            terms=terms,
             first=self.row(view) * row,
             count=row,
             **sizes,
         )
-        return shares
+        return terms
 
-    def differentiated(
+    def differentiate(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradients of the input image and of the grid, [row], from that of the image `changed` returned."""
+        """Return the gradients of the input of `transform` and of the grid, [row], from that of its result."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         result = workspace.array("grad_colored", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
@@ -209,17 +209,17 @@ class GridState(ColorState):
         program.color_grid_backward(
             groups=(1, camera.rows), image=image, gradient=gradient, grad_image=result, passed=passed, **arguments
         )
-        of_rows = ("nx", "nz", "per_column", "width", "rows", "stride")
+        row_names = ("nx", "nz", "per_column", "width", "rows", "stride")
         program.color_grid_row_sums(
             groups=(nx, camera.rows),
             image=image,
             passed=passed,
             row_sums=sums,
-            **{name: arguments[name] for name in of_rows},
+            **{name: arguments[name] for name in row_names},
         )
-        of_nodes = ("nx", "ny", "per_row", "height", "rows")
+        node_names = ("nx", "ny", "per_row", "height", "rows")
         program.color_grid_gather(
-            items=row, row_sums=sums, grad_grid=grad_grid, count=row, **{name: arguments[name] for name in of_nodes}
+            items=row, row_sums=sums, grad_grid=grad_grid, count=row, **{name: arguments[name] for name in node_names}
         )
         return result, grad_grid
 
@@ -237,7 +237,7 @@ class GridState(ColorState):
     def learn(self, workspace: Workspace, view: int, grad_grid: Array, step: int) -> None:
         """Update the grid of a view by Adam, with its own update count, then center all grids.
 
-        grad_grid: gradient of the image losses, [row]; that of the total variation is still in the workspace.
+        grad_grid: gradient of the image losses, [row]; that of the total variation is in the workspace.
         """
         key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.grid_shape)
         self.scalars[key] = updates = self.scalars.get(key, 0.0) + 1
@@ -271,6 +271,6 @@ def row_length(shape: Sequence[int]) -> int:
 
 
 def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
-    """Return the bytes of grids on the device.  rows: of the largest view, in whole tiles."""
+    """Return the bytes of grids on the device.  shape: nx, ny, nz; rows: of the largest view, in whole tiles."""
     row, columns = row_length(shape), ENTRIES * shape[0] * shape[2]
     return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows)

@@ -35,13 +35,13 @@ ROTATIONS, TRANSLATIONS, DEPTHS, FOCALS = "rotations", "translations", "depths",
 AXES = "x", "y", "z"
 SUMS, GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 RATE, MAX_RATE = 2e-4, 2e-3  # initial learning rates
-RATE_RATIO = 100  # of the first rate to the last
-ROTATION_SHARE = 0.3  # ours: a rotation about that point changes the image little, so its gradient is mostly noise
-REACH = 0.01  # shares of the depth: a translation that the rates of all visits must allow
-FOCAL_RATE, MAX_FOCAL_RATE = 1e-4, 1e-3  # the same for the logarithms of focal lengths
-FOCAL_REACH = 0.2  # noise uses up most of it; changes are a few hundredths
+RATE_RATIO = 100  # of the initial rate to the final one
+ROTATION_RATIO = 0.3  # ours; a rotation about the pivot changes the image little, so its gradient is mostly noise
+REACH = 0.01  # translation, relative to the depth, to which the rates of all visits must add up
+FOCAL_RATE, MAX_FOCAL_RATE = 1e-4, 1e-3  # likewise, for the logarithms of focal lengths
+FOCAL_REACH = 0.2  # likewise; noise uses up most of it, and changes are a few hundredths
 MIN_POINTS, MAX_POINTS = 10, 10_000  # points whose median depth is used
-MAX_ZOOM = 10.0  # largest factor of a focal length that a side file may have
+MAX_ZOOM = 10.0  # largest factor of a focal length in a side file
 LOG = logging.getLogger("clsplat")
 
 
@@ -50,9 +50,9 @@ class CameraOptimizer(TrainingModule):
 
     Each photograph has a rotation vector and a translation in world axes, trained by Adam from 0.  The camera rotates
     about the point on its optical axis at the median depth of the dataset's points, or at the extent without points.
-    A step updates its photograph and then subtracts the means over all photographs, because losses cannot see a motion
-    that all cameras share with the Gaussians.  The world filter, the extent, and rules that compare the model with
-    photographs use the dataset's cameras.
+    A step updates its photograph and then subtracts the means over all photographs, because losses cannot detect a
+    motion that all cameras share with the Gaussians.  The world filter, the extent, and rules that compare the model
+    with photographs use the dataset's cameras.
 
     With `focal`, the photographs of one camera share a factor for both of its focal lengths; the principal point is
     fixed.  Factors are not centered, so a single camera can change.  Leave `focal` out if cameras move straight ahead,
@@ -67,7 +67,7 @@ class CameraOptimizer(TrainingModule):
     conflicts: ClassVar[Mapping[str, str]] = {
         "sky": "a sky cannot be learned together with poses",
         "inverse_depth": "its gradient does not reach the poses",
-        "blocks": "those of blocks would differ",
+        "blocks": "the poses of blocks would differ",
     }
     side_files: ClassVar[Mapping[str, str]] = {VIEW_POSES: "poses"}
 
@@ -75,18 +75,18 @@ class CameraOptimizer(TrainingModule):
     rotation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of rotations, rad; by step.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
-    """Learning rate of translations, as a share of that depth; by step.  auto: 2e-4 to 2e-6; with few visits per
-    photograph, as large as a translation of 0.01 needs, up to 2e-3."""
+    """Learning rate of translations, relative to that depth; by step.  auto: 2e-4 to 2e-6; with few visits per
+    photograph, large enough for a translation of 0.01, up to 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths; by step; 0: fixed.  auto: 1e-4 to 1e-6; with few visits per
-    camera, so large that the rates of its visits add up to 0.2, up to 1e-3."""
+    camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are optimized; before it, the model is too blurry to align cameras."""
 
     def rates(self, last: int, photographs: int) -> tuple[Schedule, Schedule]:
         """Return the rate schedules of rotations and translations.  last: global step at which training ends."""
         translation = self._decay(last, photographs, REACH, (RATE, MAX_RATE))
-        rotation = translation.divide(1 / ROTATION_SHARE)
+        rotation = translation.divide(1 / ROTATION_RATIO)
         return (
             rotation if self.rotation == "auto" else self.rotation,
             translation if self.translation == "auto" else self.translation,
@@ -98,7 +98,7 @@ class CameraOptimizer(TrainingModule):
         return automatic if self.focal == "auto" else self.focal
 
     def _decay(self, last: int, rows: int, reach: float, bounds: tuple[float, float]) -> Decay:
-        """Return a decaying rate, within bounds, whose sum over the visits of one of `rows` photographs is `reach`."""
+        """Return a decaying rate, within bounds, that adds up to `reach` over the visits of one of `rows` items."""
         steps = max(last - self.start, 1)
         visits = steps / rows
         needed = reach * math.log(RATE_RATIO) * RATE_RATIO / (RATE_RATIO - 1) / visits
@@ -131,8 +131,8 @@ class CameraOptimizer(TrainingModule):
 class PoseChange:
     """A rotation vector and a translation, each [3], of a camera in world axes.
 
-    The camera rotates about a pivot, the point on its optical axis at `depth`.  About its own center, a rotation would
-    change the image almost as a translation does, and Adam, which works by coordinate, could not separate the two.
+    The camera rotates about a pivot, the point on its optical axis at `depth`.  A rotation about the camera's center
+    would change the image almost like a translation, and Adam, which works per coordinate, could not separate the two.
     """
 
     rotation: Floats  # rad
@@ -140,7 +140,7 @@ class PoseChange:
     depth: float  # scene units
 
     def apply_to(self, world_to_camera: Floats) -> Floats:
-        """Return a changed pose, [3, 4]: W' = W exp([rotation]x); the pivot moves by the translation only."""
+        """Return the changed pose, [3, 4]: W' = W exp([rotation]x); only the translation moves the pivot."""
         before = world_to_camera[:, :3]
         after = before @ scipy.spatial.transform.Rotation.from_rotvec(self.rotation).as_matrix()
         pivot = self.depth * before[2] - before.T @ world_to_camera[:, 3]
@@ -153,10 +153,10 @@ class PoseChange:
         and of a rotation of them about the camera, [3].
         """
         about_pivot = grad_rotation - np.cross(self.depth * pose[2, :3], grad_translation)
-        return _by_rotation_vector(self.rotation, about_pivot), -grad_translation
+        return _rotation_vector_gradient(self.rotation, about_pivot), -grad_translation
 
 
-def _by_rotation_vector(vector: Floats, grad_rotation: Floats) -> Floats:
+def _rotation_vector_gradient(vector: Floats, grad_rotation: Floats) -> Floats:
     """Return the gradient of a rotation vector from that of a small rotation after it (right Jacobian of SO(3))."""
     angle, x, y, z = math.hypot(*vector), *vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -168,10 +168,10 @@ def _by_rotation_vector(vector: Floats, grad_rotation: Floats) -> Floats:
 
 
 class CameraState(ModuleState):
-    """The learned changes of the poses of the training views, and of the focal lengths of their cameras.
+    """The learned changes of the training views' poses and of their cameras' focal lengths.
 
-    A view of several sizes has one row.  One factor scales both focal lengths.  Views whose lens, or pinhole camera, is
-    the same in the dataset share a camera, which has the name of the first such view.
+    A view with several sizes has one row.  One factor scales both focal lengths.  Views with the same lens, or pinhole
+    camera, in the dataset share a camera, which has the name of the first such view.
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
@@ -186,12 +186,12 @@ class CameraState(ModuleState):
         self.rates: tuple[Schedule, Schedule, Schedule] = 0.0, 0.0, 0.0
 
     def can_load(self, scalars: Scalars, tables: Any) -> bool:
-        return self.pose_tables[0].begun(scalars)
+        return self.pose_tables[0].is_in(scalars)
 
     def start(self, run: Run) -> None:
         for table in self.pose_tables:
             table.begin(self.scalars, {})
-        self.scalars |= {f"{DEPTHS}/{view.name}": depth_of(view, run.scene) for view in self.views}
+        self.scalars |= {f"{DEPTHS}/{view.name}": median_depth(view, run.scene) for view in self.views}
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
         if not trained:
@@ -212,9 +212,9 @@ class CameraState(ModuleState):
             step.save(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
 
     def update(self, step: TrainingStep) -> None:
-        if not (wait := step.saved(self)) or step.view is None:
+        if not (download := step.saved(self)) or step.view is None:
             return
-        sums, name, (rotations, translations) = wait(), self.views[step.view].name, self.pose_tables
+        sums, name, (rotations, translations) = download(), self.views[step.view].name, self.pose_tables
         change, (rotation, translation, focal) = self.pose_change(name), [at_step(r, step.number) for r in self.rates]
         grad_rotation, grad_translation = change.gradients(self.pose(step.view), sums[:3], sums[3:6])
         rotations.update(self.scalars, name, grad_rotation, rotation)
@@ -228,7 +228,7 @@ class CameraState(ModuleState):
             adam_step(self.scalars, {key: self.scalars.get(key, 0.0)}, {key: grad_log}, rate)
 
     @property
-    def zoomed(self) -> list[str]:
+    def zoomed_cameras(self) -> list[str]:
         """The cameras whose focal lengths were learned."""
         return [camera for camera in dict.fromkeys(self.cameras.values()) if self._key(camera) in self.scalars]
 
@@ -244,7 +244,7 @@ class CameraState(ModuleState):
         return change.apply_to(pose) if change.rotation.any() or change.translation.any() else pose
 
     def factor(self, view: str) -> float:
-        """Return the factor of a view's focal lengths."""
+        """Return the factor on a view's focal lengths."""
         return math.exp(self.scalars.get(self._key(view), 0.0))
 
     def _key(self, view: str) -> str:
@@ -254,7 +254,7 @@ class CameraState(ModuleState):
         """Return a scene with the learned cameras.
 
         Other views get the focal lengths of their camera, and move with the training views as a whole: their centers
-        are scaled about the mean center.  Their rotations stay, since the mean of the learned rotations is zero.
+        are scaled about the mean center.  Their rotations do not change, since learned rotations have a mean of zero.
         """
         if not self.views:
             return scene
@@ -276,12 +276,12 @@ class CameraState(ModuleState):
         return replace_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
 
     def write(self, run: Run) -> None:
-        """Write the pose of each photograph, and log how far cameras moved."""
+        """Write the pose of each photograph, and log how far the cameras moved."""
         views, names = self.apply_to(run.original).views, {view.name for view in self.views}
-        cameras = self.zoomed
+        cameras = self.zoomed_cameras
         data = {
-            "meaning": "optimized poses, rows of [R | t] from world to camera; learned: true for training photographs; "
-            "others moved with them as a whole"
+            "meaning": "optimized poses, rows of [R | t], world to camera; learned: true for training photographs; "
+            "others move with them as a whole"
             + ("; focal_lengths: in x and y, px, at the full size of the undistorted photographs" if cameras else ""),
             "photographs": {
                 view.name: {
@@ -309,17 +309,17 @@ class CameraState(ModuleState):
 
 
 def require_zoom(scene: Scene) -> None:
-    """Raise DataError if a view has a lens whose focal length cannot be changed."""
+    """Raise DataError if the focal length of a view's lens cannot be optimized."""
     for view in scene.views:
         if view.lens is not None and not can_zoom(view.lens):
             raise DataError(
                 f"{scene.path}: camera_optimizer.focal: the focal length of {quote(view.name)}'s lens, "
-                f"{view.lens.model}, cannot be optimized; run `clsplat data undistort` first, or leave out this key"
+                f"{view.lens.model}, cannot be optimized; run `clsplat data undistort` first, or remove this key"
             )
 
 
-def depth_of(view: View, scene: Scene) -> float:
-    """Return the median depth of the scene's points in a view's frustum; the extent if they are too few."""
+def median_depth(view: View, scene: Scene) -> float:
+    """Return the median depth of the scene's points in a view's frustum, or the extent if there are too few points."""
     points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
     points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
     x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
@@ -332,8 +332,8 @@ def depth_of(view: View, scene: Scene) -> float:
 def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:
     """Return a function that waits for the pose gradient of the losses, [7].
 
-    It has the gradients of a translation of all Gaussians and of their rotation about the camera, in world axes, and of
-    the logarithm of a factor of the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
+    The gradients are those of a translation of all Gaussians, of their rotation about the camera, in world axes, and of
+    the logarithm of a factor on the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
     """
     device = workspace.device
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
@@ -341,8 +341,8 @@ def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_
     device.program("poses.cl", **model.defines).pose_gradient(
         items=items, **shape_arguments(frame.drawn, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
     )
-    copied = sums.get_later()
-    return lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1]
+    group_sums = sums.get_later()
+    return lambda: np.cumsum(group_sums(), axis=1, dtype=np.float64)[:, -1]
 
 
 def _center(pose: Floats) -> Floats:
@@ -354,7 +354,7 @@ def _range(low: float, high: float) -> str:
 
 
 def _with_pose(path: Path, view: View, row: Any, origin: NDArray[np.floating]) -> View:
-    """Return a view with the camera in its row of a side file, in world coordinates; without a row, the view itself."""
+    """Return a view with the camera from its row of a side file, in world coordinates; unchanged without a row."""
     if row is None:
         return view
     try:

@@ -1,4 +1,4 @@
-"""Learn how each camera records light: the falloff of its lens, and a response curve per channel."""
+"""Learn the light response of each camera: the falloff of its lens, and a response curve per channel."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,35 +20,35 @@ from clsplat.training.run import Run
 
 KERNEL, FILE = "camera_response.cl", "view_responses.json"
 CURVES = [f"{channel}_{node}" for channel in ("red", "green", "blue") for node in (0, 1, 3, 4)]
-AREAS = np.array([0.5, 1, 1, 1, 0.5]) / 4  # what a slope of 1 at a node adds to f(1)
+AREAS = np.array([0.5, 1, 1, 1, 0.5]) / 4  # contribution of a slope of 1 at each node to f(1)
 TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURVES), is_centered=False)
 
 
 class CameraResponse(TrainingModule):
-    """Learn vignetting and response curves with the Gaussians, one set per camera.
+    """Learn vignetting and response curves together with the Gaussians, one set per camera.
 
     A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
-    center_y lead to it from the principal point.  f is a monotone spline of each channel (Ramsay 1988), f(0) = 0 and
-    f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3 and 4 are its logarithms at 0, 1/4, 3/4 and 1, less that at
-    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All parameters start at 0, the
-    identity.
+    center_y are its offset from the principal point.  f is a monotone spline for each channel (Ramsay 1988), f(0) = 0
+    and f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3, and 4 are the logarithms of the slope at 0, 1/4, 3/4, and
+    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and curves of powers.  All
+    parameters start at 0, the identity.
 
-    Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are measured through
-    their camera's set; a camera without training photos has the identity.  The model and its renders do not change.
+    Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are evaluated with the
+    set of their camera, or the identity if it has no training photos.  The model and its renders do not change.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     order: ClassVar[int] = 25  # before modules for colors, which clip white
     device_planes: ClassVar[int] = 8  # the image after the response, and its gradient, four channels each
-    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
+    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "the responses of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["camera_response"] = "camera_response"
     rate: NonNegative = 1e-3
     """Learning rate (Adam) of the parameters; number by step. Trainings of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; number by step. It leaves to the Gaussians
+    """Weight of the sum of the squared parameters of the step's camera; number by step. It makes the Gaussians learn
     what all photos have in common."""
 
     def create_state(self, run: Run) -> ModuleState:
@@ -87,7 +87,7 @@ class CameraResponseState(ModuleState):
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved(self)) and step.view is not None:
-            gradient, rate = by_parameters(saved[1], saved[3][0]()) + saved[2], at_step(self.settings.rate, step.number)
+            gradient, rate = row_gradient(saved[1], saved[3][0]()) + saved[2], at_step(self.settings.rate, step.number)
             TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 
     def apply_to(self, scene: Scene) -> Scene:
@@ -98,35 +98,36 @@ class CameraResponseState(ModuleState):
 
 
 def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
-    """Return a scene whose views are measured through their cameras' responses.  rows: parameters by view, [17]."""
+    """Return a scene whose views are evaluated with their cameras' responses.  rows: parameters by view, [17]."""
     responses = {view: partial(respond, row=row) for view, row in rows.items()}
     return replace(scene, views=tuple(replace(view, response=responses.get(view.name)) for view in scene.views))
 
 
-def slopes_of(row: Floats) -> Floats:
-    """Return the slopes of the curves at the nodes, [3, 5]."""
+def curve_slopes(row: Floats) -> Floats:
+    """Return the slopes of the three curves at their nodes, [3, 5], from a camera's parameters, [17]."""
     slopes = np.exp(np.insert(row[5:].reshape(3, 4), 2, 0, axis=1))
     return np.asarray(slopes / (slopes @ AREAS)[:, None])
 
 
-def by_parameters(row: Floats, sums: Floats) -> Floats:
-    """Return the gradient of a camera's parameters, [17], from the sums of rows of pixels, [20, rows]."""
-    totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
+def row_gradient(row: Floats, sums: Floats) -> Floats:
+    """Return the gradient of a camera's parameters, [17], from sums over pixel rows, [20, rows]."""
+    totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], curve_slopes(row)
     grad_logs = slopes * totals[5:].reshape(3, 5)
     grad_logs -= slopes * AREAS * grad_logs.sum(axis=1, keepdims=True)
     return np.concatenate([totals[:5], np.delete(grad_logs, 2, axis=1).ravel()])
 
 
 def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
-    """Return an image, [3 or 4, rows, stride], after a camera's response.
+    """Apply a camera's response to an image, [3 or 4, rows, stride].
 
-    back: the gradient of that; then return the gradient of the image, and leave the sums of rows in the workspace.
+    back: the gradient of the result; if given, return the gradient of the image, and leave the sums over pixel rows in
+    the workspace.
     """
     result = workspace.array("grad_response" if back else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
+    numbers = workspace.device.upload(np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
-    arguments: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
+    arguments: dict[str, Any] = {"image": image, "gradient": back or image, "out": result, "row_sums": sums, **center}
     arguments |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
     workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **arguments, **camera.plane_arguments())
     return result

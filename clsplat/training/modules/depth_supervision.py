@@ -1,4 +1,4 @@
-"""Supply known depths to the loss that reads them."""
+"""Supply known depths to the loss `inverse_depth`."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ from clsplat.training.run import Run
 
 
 class DepthSupervision(TrainingModule):
-    """The depths that the loss `inverse_depth` reads, which implies this module."""
+    """The known depths for the loss `inverse_depth`, which implies this module."""
 
     implicit_type: ClassVar[str] = "depth_supervision"
     order: ClassVar[int] = -10
@@ -25,9 +25,9 @@ class DepthSupervision(TrainingModule):
         return cls(type=cls.implicit_type, losses=losses) if losses else None
 
     def check_run(self, run: Run) -> None:
-        """Raise DataError if the scene has no tracks or a depth map is missing; ConfigError for two folders."""
+        """Raise DataError if the scene has no tracks, or a depth map is missing; ConfigError for two folders."""
         if len({loss.folder for loss in self.losses}) > 1:
-            raise ConfigError("the loss 'inverse_depth' is listed with two folders; keep one of them")
+            raise ConfigError("the loss 'inverse_depth' is listed with two folders; keep only one of them")
         if run.scene.tracks is None:
             raise DataError(
                 f"{run.scene.path}: the loss 'inverse_depth' needs points with tracks, as in a COLMAP model; "

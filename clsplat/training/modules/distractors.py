@@ -1,6 +1,6 @@
-"""Model what only one photograph shows, such as people and cars, by Gaussians in front of its camera.
+"""Model objects that only one photograph shows, such as people and cars, by Gaussians in front of its camera.
 
-These Gaussians are not rows of the model, so growth, metrics and files ignore them.  Their unit of length is their
+These Gaussians are not rows of the model, so growth, metrics, and files ignore them.  Their unit of length is their
 initial depth, so that rates do not depend on the scene.
 """
 
@@ -30,7 +30,7 @@ from clsplat.training.run import Run
 UPDATES = "updates"
 WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of trained tables
 NEAR = 0.2  # near plane, in initial depths
-SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, as a share of their spacing; initial opacity
+SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to their spacing; initial opacity
 GOLDEN = (5**0.5 - 1) / 2
 # A short training visits each photograph only a few dozen times, so rates are larger than those of the scene (ours)
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
@@ -39,8 +39,8 @@ RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_bas
 class Distractors(TrainingModule):
     """Give each photograph its own Gaussians just in front of its camera (DeSplat, Wang et al. 2024).
 
-    They absorb what is not part of the scene, and appear in no other image, metric or file.  Their number is fixed.  A
-    loss on the area that they cover fades the ones that explain little.
+    They absorb what is not part of the scene, and appear in no other image, metric, or file.  Their number is fixed.  A
+    loss on the area that they cover fades out Gaussians that explain little.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
@@ -58,8 +58,8 @@ class Distractors(TrainingModule):
 
     def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
-        own = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
-        return DistractorsState(self, run.scene.split("train"), own)
+        rasterizer = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
+        return DistractorsState(self, run.scene.split("train"), rasterizer)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         rows = len({view.name for view in views}) * (self.count + 64)  # whole groups
@@ -68,7 +68,7 @@ class Distractors(TrainingModule):
     @classmethod
     def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
         super().check_saved(scalars, tables)
-        widths = {name: width for one, width in WIDTHS.items() for name in (one, *moment_tables(one))} | {UPDATES: 1}
+        widths = {name: width for key, width in WIDTHS.items() for name in (key, *moment_tables(key))} | {UPDATES: 1}
         photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
         shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
         if not photographs or not rows or rows % photographs or {n: t.shape for n, t in tables.items()} != shapes:
@@ -76,10 +76,10 @@ class Distractors(TrainingModule):
 
 
 class DistractorsState(ModuleState):
-    """The Gaussians of each photograph on the device, with an Adam for each photograph."""
+    """The Gaussians of each photograph on the device, each set with its own Adam."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        """views: training views; rasterizer: for these Gaussians only, since frames share its buffers."""
+        """views: training views; rasterizer: used only for these Gaussians, since frames share its buffers."""
         super().__init__()
         self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
         self._names = list(dict.fromkeys(view.name for view in views))
@@ -90,7 +90,7 @@ class DistractorsState(ModuleState):
         views = run.scene.split("train")
         photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
         counted = run.status.counted(photographs, "photographs", len(photographs))
-        self.load({}, first_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in counted]))
+        self.load({}, initial_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in counted]))
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
         return len(tables[UPDATES]) == len(self._names)
@@ -99,7 +99,7 @@ class DistractorsState(ModuleState):
         self.adams = [_adam(self.rasterizer.device, tables, row) for row in range(len(tables[UPDATES]))]
 
     def tables(self, whole: bool = True) -> Tables:
-        names = [name for one in WIDTHS for name in (one, *moment_tables(one))]
+        names = [name for key in WIDTHS for name in (key, *moment_tables(key))]
         tables = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
         return {**tables, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
 
@@ -107,8 +107,8 @@ class DistractorsState(ModuleState):
         if step.view is None or step.number <= self.settings.start:
             return
         camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
-        own = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
-        frame = self.rasterizer.forward(own, moved_camera(camera, np.eye(3, 4)), self._black)
+        model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
+        frame = self.rasterizer.forward(model, moved_camera(camera, np.eye(3, 4)), self._black)
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
         layer = lay_over(step.workspace, frame, step.image, scale)
         step.image = layer.image
@@ -116,21 +116,21 @@ class DistractorsState(ModuleState):
         step.save(self, (layer, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if not (kept := step.saved(self)):
+        if not (saved := step.saved(self)):
             return
-        layer, sums = kept
-        frame = replace(layer.frame, image=layer.image)  # blending is differentiated from the colors of all
+        layer, sums = saved
+        frame = replace(layer.frame, image=layer.image)  # the gradient of blending needs the combined colors
         sums += [frame, self.rasterizer.pixel_sums(frame.drawn, frame, step.gradient, behind=layer.behind)]
         look_behind(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.saved(self)) and step.view is not None:
-            frame, pixel_sums = kept[1]
+        if (saved := step.saved(self)) and step.view is not None:
+            frame, pixel_sums = saved[1]
             self.adams[self._rows[step.view]].update(frame.drawn, frame, pixel_sums, RATES)
 
 
-def first_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
-    """Return the initial Gaussians of photographs: spread evenly, with the photographs' colors, almost transparent.
+def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
+    """Return the initial Gaussians of photographs: evenly spread, almost transparent, with the photographs' colors.
 
     photographs: views and pixels, [height, width, 3].
     """

@@ -10,7 +10,7 @@ from clsplat.training.run import Run
 
 
 class Dropout(TrainingModule):
-    """Drop each Gaussian in a step with a probability, to regularize scenes with few photographs.
+    """Drop each Gaussian from a step with a given probability, to regularize scenes with few photographs.
 
     The opacities of the others are divided by 1 - probability (DropGaussian, Park et al. 2025).  Renders and metrics
     drop none.
@@ -21,7 +21,7 @@ class Dropout(TrainingModule):
 
     type: Literal["dropout"] = "dropout"
     probability: Probability
-    """Probability to drop a Gaussian; by step, at most 0.9."""
+    """Probability of dropping a Gaussian; by step, at most 0.9."""
 
     def create_state(self, run: Run) -> ModuleState:
         return DropoutState(self, run.seed)

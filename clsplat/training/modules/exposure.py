@@ -1,6 +1,6 @@
-"""Fit the exposure of each photograph: a color transform between render and losses.
+"""Fit the exposure of each photograph: a color transform of the render before the losses.
 
-A photograph has a few parameters, all 0 for the identity.  They make a matrix [E | b], and a pixel c of the render
+A photograph has a few parameters, all 0 for the identity.  They define a matrix [E | b], and a pixel c of the render
 becomes min(1, E c + b) before the losses (cl_kernels/colors.cl).
 """
 
@@ -27,7 +27,7 @@ from clsplat.losses.base import LossValue
 from clsplat.metrics.views import Gains
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
-from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, measured, noted, with_noted
+from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, complete_exposures, measure_exposures, read_exposures
 from clsplat.photos.photographs import Mask
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -38,15 +38,15 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 VIEW_COLORS = "view_colors.json"
-TABLE, KNOWN = "colors", "known exposures"  # KNOWN: whether parameters were initialized from measured exposures
+TABLE, KNOWN = "colors", "known exposures"  # scalars; KNOWN: whether parameters start from measured exposures
 SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 MIN_VISITS = 400  # per photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
 MAX_RATE = 5e-2
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
-SPREAD = 0.03  # the accuracy of measurements on tracks
-# In three captures exposure explains 17 to 31% of the variance; with exposures changed by 25%, 40 to 71%.
+SPREAD = 0.03  # accuracy of measurements on tracks
+# In three captures, exposure explains 17 to 31% of the variance; with exposures changed by 25%, 40 to 71%.
 EXPLAINED = 1 / 3
 
 
@@ -54,44 +54,44 @@ EXPLAINED = 1 / 3
 class ColorReport:
     """The learned colors of the photographs, for side files."""
 
-    matrices: dict[str, Floats]  # by photograph; the mean of several, [3, 4]
+    matrices: dict[str, Floats]  # by photograph, [3, 4]; the mean for a grid
     facts: dict[str, Any]  # for JSON, with `meaning` and `type`
-    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by name of a .npy file
+    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the name of their .npy file
 
 
 class Appearance(TrainingModule):
     """Color parameters of each photograph, learned with the Gaussians; their mean over the photographs stays 0.
 
-    Otherwise no loss would notice a common change of all photographs that the Gaussians undo, and the colors of the
-    model would drift.
+    Without this constraint, the colors of the model would drift, because the Gaussians can undo a change that all
+    photographs share, which no loss notices.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
-    order: ClassVar[int] = 30  # after what is in front of the scene
+    order: ClassVar[int] = 30  # after layers in front of the scene
     family: ClassVar[str] = "appearance"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "the colors of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors"}
     device_planes: ClassVar[int] = 6  # the transformed image, and its gradient
 
     rate: RateOrAuto = "auto"
-    """Learning rate; by step.  auto: 2e-3 to 2e-5, with fewer than 400 visits per photograph 1e-2 to 1e-3; if exposures
-    are unknown, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
+    """Learning rate; by step.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photograph; if
+    exposures are unknown, large enough for a gain of 2.7, up to 5e-2.  At most 0.5."""
 
     when: Literal["always", "auto"] = "always"
     """`auto`: only if exposures differ.
 
     Before training, log exposures are measured on the tracks of the dataset's points.  The module is active if both
-    their standard deviation and the variance that they explain are large enough; view-dependent light is the rest of
-    the variance.  If it is not active, the model is bit-identical to one without the module."""
+    their standard deviation and the fraction of variance that they explain are large enough; view-dependent light
+    explains the remainder.  If it is not active, the model is bit-identical to one without the module."""
     min_spread: Annotated[float, Field(ge=0)] = SPREAD
     """With `when: auto`, the smallest standard deviation of log exposures; 0.03 is 3%."""
     min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
-    """With `when: auto`, the smallest share of the color variance of points that exposures explain."""
+    """With `when: auto`, the smallest fraction of the color variance of points that exposures explain."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: the choice of `auto`."""
     reason: str = ""
-    """Written by a run: why."""
+    """Written by a run: the reason for the choice."""
 
     @property
     @abstractmethod
@@ -105,7 +105,7 @@ class Appearance(TrainingModule):
         return 0 if self.chosen == "off" else super().device_bytes(views, tile)
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
-        """Return the learning rate schedule.  known: whether parameters start near their final values."""
+        """Return the learning rate schedule of a training.  known: whether parameters start near their final values."""
         if self.rate != "auto":
             return self.rate
         visits = steps / photographs
@@ -116,21 +116,21 @@ class Appearance(TrainingModule):
         return Decay(initial=initial, final=final, over=steps)
 
     def resolve_auto(self, run: Run) -> "Appearance":
-        """Return the module with the choice of `when: auto`, unless it is made already."""
+        """Return the module with the choice of `when: auto`, unless it was made before."""
         if self.when == "always" or self.chosen is not None:
             return self
-        exposures = exposures_of(run)
+        exposures = estimate_exposures(run)
         if not exposures.log_gains:
             return self._choose("off", exposures.text)
-        small = exposures.spread <= self.min_spread, exposures.explained <= self.min_explained_variance
-        bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of what differs"
-        if not any(small):
-            return self._choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
-        missed = " nor ".join(itertools.compress(bounds, small))
+        is_small = exposures.spread <= self.min_spread, exposures.explained <= self.min_explained_variance
+        bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of the variance"
+        if not any(is_small):
+            return self._choose("on", f"{exposures.text}; more than {bounds[0]} and {bounds[1]}")
+        missed = " or ".join(itertools.compress(bounds, is_small))
         return self._choose("off", f"{exposures.text}; not more than {missed}")
 
     def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
-        level = logging.INFO if chosen == "on" else logging.DEBUG  # off changes nothing
+        level = logging.INFO if chosen == "on" else logging.DEBUG  # "off" changes nothing
         LOG.log(level, "optimize.modules.%s: %s, since %s", self.type, chosen, reason)
         return self.model_copy(update={"chosen": chosen, "reason": reason})
 
@@ -139,29 +139,29 @@ class Appearance(TrainingModule):
         path = model.with_name(VIEW_COLORS)
         if not path.is_file():
             return None
-        data, known = read_json(path, "colors of photographs"), variants(Appearance)
+        data, classes = read_json(path, "colors of photographs"), variants(Appearance)
         name = data.get("type") if isinstance(data, dict) else None
-        if not isinstance(name, str) or name not in known:
-            names = ", ".join(known)
+        if not isinstance(name, str) or name not in classes:
+            names = ", ".join(classes)
             raise DataError(
                 f"{path}: unknown type of colors {quote(name)}, expected {names}; train again, or remove the file"
             )
         facts = {key: data[key] for key in ("model",) if key in data}
-        return known[name].model_validate(facts).fit if known[name] is cls else None
+        return classes[name].model_validate(facts).fit if classes[name] is cls else None
 
 
 class ColorModel(Settings):
-    """A color transform of a photograph: one matrix for all its pixels, from a few parameters."""
+    """A color transform of a photograph: one matrix for all pixels, defined by a few parameters."""
 
     columns: ClassVar[tuple[str, ...]] = ()  # names of the parameters of a photograph
-    fitted_to_a_channel: ClassVar[int] = 1  # numbers per channel that `fitted` fits
+    numbers_per_channel: ClassVar[int] = 1  # fitted by `fit_matrix`
 
     type: str
     """Name of the model."""
 
     @abstractmethod
-    def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        """Return the matrix, [3, 4], that fits an image to a photograph by least squares, pixels [M, 3]."""
+    def fit_matrix(self, image: Floats, photograph: Floats) -> Floats:
+        """Return the matrix, [3, 4], that fits an image to a photograph by least squares.  Both: pixels, [M, 3]."""
 
     @abstractmethod
     def matrix(self, row: Floats) -> Floats:
@@ -173,7 +173,7 @@ class ColorModel(Settings):
 
     @abstractmethod
     def from_gains(self, log_gains: Floats) -> Floats:
-        """Return the parameters, [columns], closest to gains of red, green and blue, given by their logarithms, [3]."""
+        """Return the parameters, [columns], closest to the gains of red, green, and blue with these logarithms, [3]."""
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
         """Return a regularization loss on the parameters, and its gradient."""
@@ -198,8 +198,8 @@ class Gain(Gains, ColorModel):
 
     def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
         red, green, blue = np.diag(grad_matrix) * np.diag(self.matrix(row))
-        tied = green * LUMINANCE / LUMINANCE[1]
-        return np.array([red + green + blue, red - tied[0], blue - tied[2]])
+        by_green = green * LUMINANCE / LUMINANCE[1]
+        return np.array([red + green + blue, red - by_green[0], blue - by_green[2]])
 
     def from_gains(self, log_gains: Floats) -> Floats:
         exposure = LUMINANCE @ log_gains
@@ -207,19 +207,19 @@ class Gain(Gains, ColorModel):
 
 
 class Affine(ColorModel):
-    """An affine color transform of each photograph, twelve parameters (Kerbl et al. 2024).
+    """An affine color transform of each photograph with twelve parameters (Kerbl et al. 2024).
 
-    It follows white balance, contrast and haze, but also absorbs view-dependent color that belongs to the Gaussians;
+    It follows white balance, contrast, and haze, but also absorbs view-dependent color that belongs to the Gaussians;
     `weight` limits that.  `gain` generalizes better.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
     columns: ClassVar[tuple[str, ...]] = tuple(f"{y}_{c}" for y in ("red", "green", "blue") for c in "rgb1")
-    fitted_to_a_channel: ClassVar[int] = 4
+    numbers_per_channel: ClassVar[int] = 4
 
     type: Literal["affine"] = "affine"
     weight: Annotated[float, Field(ge=0)] = 1e-2
-    """Weight of a loss that pulls the matrix to the identity: the sum of squared differences, without the offsets."""
+    """Weight of a loss that pulls the matrix to the identity: the sum of squared differences, excluding offsets."""
 
     def matrix(self, row: Floats) -> Floats:
         return IDENTITY + row.reshape(3, 4)
@@ -231,14 +231,14 @@ class Affine(ColorModel):
         return (np.column_stack([np.diag(np.exp(log_gains)), np.zeros(3)]) - IDENTITY).ravel()
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
-        away = row.reshape(3, 4) * [1, 1, 1, 0]
-        return self.weight * float((away**2).sum()), 2 * self.weight * away.ravel()
+        difference = row.reshape(3, 4) * [1, 1, 1, 0]
+        return self.weight * float((difference**2).sum()), 2 * self.weight * difference.ravel()
 
-    def fitted(self, image: Floats, photograph: Floats) -> Floats:
+    def fit_matrix(self, image: Floats, photograph: Floats) -> Floats:
         if len(image) == 0:
             return IDENTITY
         with_one = np.column_stack([image, np.ones(len(image))])
-        squares = np.einsum("mi,mj->ij", with_one, with_one)  # no sum depends on threads
+        squares = np.einsum("mi,mj->ij", with_one, with_one)  # unlike @, sums do not depend on threads
         products = np.einsum("mi,mj->ij", with_one, photograph)
         return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
 
@@ -259,7 +259,7 @@ class Exposure(Appearance):
 
 
 class ColorState(ModuleState):
-    """The learned colors of the photographs; base of all kinds."""
+    """The learned colors of the photographs; base class of all kinds."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
@@ -270,7 +270,7 @@ class ColorState(ModuleState):
         self.rate: Schedule = 0.0
 
     def start(self, run: Run) -> None:
-        exposures = exposures_of(run)
+        exposures = estimate_exposures(run)
         self.start_from(exposures.log_gains)
         self.scalars[KNOWN] = float(bool(exposures.log_gains))
         LOG.info("colors of photographs: %s", exposures.text)
@@ -279,7 +279,7 @@ class ColorState(ModuleState):
         self.rate = self.settings.rate_of(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
-        """Initialize the parameters.  log_gains: of red, green and blue, by view, if known, [3]."""
+        """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, if known."""
 
     @property
     def color_model(self) -> ColorModel:
@@ -292,9 +292,9 @@ class ColorState(ModuleState):
     def write(self, run: Run) -> None:
         """Write the colors of each training photograph.  Raises NumericError if they are not finite."""
         report = self.report()
-        if wrong := next((view for view, matrix in report.matrices.items() if not np.isfinite(matrix).all()), None):
+        if invalid := next((view for view, matrix in report.matrices.items() if not np.isfinite(matrix).all()), None):
             raise NumericError(
-                f"the colors of {quote(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
+                f"the colors of {quote(invalid)} are not finite; lower optimize.modules.{self.settings.type}.rate"
             )
         write_text(run.out / VIEW_COLORS, json.dumps(report.facts, indent=1) + "\n")
         for name, array in report.arrays.items():
@@ -308,7 +308,7 @@ class ColorState(ModuleState):
 
 
 class ExposureState(ColorState):
-    """The parameters of one matrix for each photograph."""
+    """The parameters of one color matrix for each photograph."""
 
     settings: Exposure
 
@@ -317,7 +317,7 @@ class ExposureState(ColorState):
         return ViewTable(TABLE, self.names, self.settings.model.columns)
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
-        return self.table.begun(scalars)
+        return self.table.is_in(scalars)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         from_gains = self.settings.model.from_gains
@@ -334,9 +334,9 @@ class ExposureState(ColorState):
 
     def backward(self, step: TrainingStep) -> None:
         if saved := step.saved(self):
-            image, matrix, waits = saved
-            step.gradient, wait = color_gradients(step.workspace, step.camera, image, matrix, step.gradient)
-            waits.append(wait)
+            image, matrix, downloads = saved
+            step.gradient, download = color_gradients(step.workspace, step.camera, image, matrix, step.gradient)
+            downloads.append(download)
 
     def update(self, step: TrainingStep) -> None:
         if not (saved := step.saved(self)) or step.view is None:
@@ -366,8 +366,8 @@ class ExposureState(ColorState):
         return ColorReport(matrices, facts)
 
 
-def exposures_of(run: Run) -> Exposures:
-    """Return the exposures of the training photographs, measured on tracks, or else from EXIF; cached in the run."""
+def estimate_exposures(run: Run) -> Exposures:
+    """Estimate the exposures of the training photographs from tracks, or else from EXIF; cached in the run."""
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
     key = TABLE, names
@@ -378,9 +378,9 @@ def exposures_of(run: Run) -> Exposures:
             return photograph.image(), photograph.counted()
 
         counted = run.status.counted(views, "photographs", len(views))
-        shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
-        is_complete = len(shown.log_gains) == len(set(names))
-        run.cache[key] = shown if is_complete else with_noted(shown, noted(views))
+        measured = measure_exposures(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
+        is_complete = len(measured.log_gains) == len(set(names))
+        run.cache[key] = measured if is_complete else complete_exposures(measured, read_exposures(views))
     exposures: Exposures = run.cache[key]
     return exposures
 
@@ -397,9 +397,9 @@ def transform_colors(workspace: Workspace, camera: DeviceCamera, image: Array, m
 def color_gradients(
     workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
 ) -> tuple[Array, Callable[[], Floats]]:
-    """Return the gradient of the input of `transform_colors`, and a function that waits for that of the matrix.
+    """Return the gradient of `image`, and a function that waits for that of the matrix and returns it, [3, 4].
 
-    gradient: of the output.  Sums of rows are added in double precision, in order.
+    gradient: of the result of `transform_colors`.  Row sums are added in double precision, in order.
     """
     grad_image, sums = workspace.array("grad_colored", image.shape), workspace.array("color sums", (SUMS, camera.rows))
     workspace.device.program("colors.cl").colors_backward(
@@ -410,8 +410,8 @@ def color_gradients(
         row_sums=sums,
         **_arguments(camera, image, matrix),
     )
-    copied = sums.get_later()
-    return grad_image, lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
+    row_sums = sums.get_later()
+    return grad_image, lambda: np.cumsum(row_sums(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
 
 
 def _arguments(camera: DeviceCamera, image: Array, matrix: Floats) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingS
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-COUNTS = ("steps", "whole", "warm_up", "above")  # names of scalars, after `skip/`
+COUNTS = ("steps", "whole", "warm_up", "above")  # names of scalars after `skip/`; whole: full steps
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class SkipBackward(TrainingModule):
     """Skip the backward pass and the update of views that have converged (SkipGS, Li et al. 2026).
 
     Every step after `start` renders its view and adds the loss to a moving average for that view.  If the loss is not
-    above the average, the rest of the step is skipped.  During a warm-up nothing is skipped; it determines the smallest
-    fraction of full steps.  Where the paper is silent, we chose: the fraction counts all steps after `start`, including
-    the warm-up; the first visit of a view is never skipped; each size of a view has its own average; penalties are not
-    part of the loss.
+    above the average, the remainder of the step is skipped.  During a warm-up nothing is skipped; it determines the
+    smallest fraction of full steps.  The paper does not specify the following, so we chose: the fraction counts all
+    steps after `start`, including the warm-up; the first visit of a view is never skipped; each size of a view has its
+    own average; penalties are not part of the loss.
 
     A skipped step updates nothing: no parameter, no moment or update count of Adam, no statistic, and no other module.
     Its penalties are not computed, and are missing from the recorded loss.  It still counts as a step for schedules,
@@ -52,7 +52,7 @@ class SkipBackward(TrainingModule):
     warm_up: Annotated[int, Field(gt=0)] = 500
     """Number of steps after `start` that are never skipped; `auto` needs several per photograph."""
     min_fraction: Annotated[
-        Literal["auto"] | Annotated[float, Field(ge=0, le=1)], in_one_sentence("expected 'auto' or a share from 0 to 1")
+        Literal["auto"] | Annotated[float, Field(ge=0, le=1)], in_one_sentence("expected auto, or a number from 0 to 1")
     ] = "auto"
     """Smallest fraction of full steps; `auto`: the fraction of the warm-up that would not have been skipped."""
 
@@ -60,21 +60,21 @@ class SkipBackward(TrainingModule):
         return SkipBackwardState(self, run.scene.split("train"))
 
     def decide(self, name: str, loss: float, scalars: Mapping[str, float]) -> Visit:
-        """Decide whether to skip a step after `start`.  name: scalar with the view's average."""
+        """Decide whether to skip a step after `start`.  name: of the scalar that holds the view's average."""
         if not math.isfinite(loss):
             return Visit()
-        steps, whole, warm_up, above = (scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
+        steps, full, warm_up, above = (scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
         average, steps = scalars.get(name), steps + 1
-        converged = average is not None and loss <= average
-        if warming := warm_up < self.warm_up:
-            warm_up, above = warm_up + 1, above + (not converged)
-        skipped = converged and not warming and whole >= self.fraction(above, warm_up) * steps
-        counts = steps, whole + (not skipped), warm_up, above
-        after = loss if average is None else self.decay * average + (1 - self.decay) * loss
-        return Visit(skipped, {name: after, **dict(zip((f"skip/{count}" for count in COUNTS), counts, strict=True))})
+        has_converged = average is not None and loss <= average
+        if is_warm_up := warm_up < self.warm_up:
+            warm_up, above = warm_up + 1, above + (not has_converged)
+        skipped = has_converged and not is_warm_up and full >= self.fraction(above, warm_up) * steps
+        counts = steps, full + (not skipped), warm_up, above
+        average = loss if average is None else self.decay * average + (1 - self.decay) * loss
+        return Visit(skipped, {name: average, **dict(zip((f"skip/{key}" for key in COUNTS), counts, strict=True))})
 
     def fraction(self, above: float, warm_up: float) -> float:
-        """Return the smallest fraction of full steps.  above: steps of the warm-up with a loss above the average."""
+        """Return the smallest fraction of full steps.  above: number of warm-up steps with a loss above the average."""
         return above / max(warm_up, 1) if self.min_fraction == "auto" else self.min_fraction
 
 
@@ -101,8 +101,8 @@ class SkipBackwardState(ModuleState):
 
     def finish(self, run: Run) -> None:
         """Log and record how many steps were skipped."""
-        steps, whole, warm_up, above = (self.scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
-        fraction, skipped = self.settings.fraction(above, warm_up), steps - whole
+        steps, full, warm_up, above = (self.scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
+        fraction, skipped = self.settings.fraction(above, warm_up), steps - full
         run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), min_fraction=fraction)
         after = f"after step {self.settings.start:,}"
         LOG.info(f"skipped {skipped:,.0f} of {steps:,.0f} steps {after}; at least {fraction:.1%} had to be full steps")

@@ -1,4 +1,4 @@
-"""Train the sky of a model: its loss, its Adam, its tables in a checkpoint."""
+"""Train the sky of a model: its loss, its Adam updates, and its tables in checkpoints."""
 
 from typing import Any, ClassVar, Literal
 
@@ -32,7 +32,7 @@ class SkyModule(TrainingModule):
         return cls(type=SKY) if has_sky else None
 
     def create_state(self, run: Run) -> "LearnedSky":
-        """Return the sky that the init stage made, or an empty one to load a saved state into."""
+        """Return the sky that the init stage created, or an empty one into which a saved state is loaded."""
         settings = run.model_settings.sky
         assert settings
         blank = Sky(np.zeros((settings.side**2, 3), np.float32))
@@ -42,27 +42,27 @@ class SkyModule(TrainingModule):
     def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
         super().check_saved(scalars, tables)
         if tables.keys() not in (WIDTHS.keys(), {TEXELS}):
-            raise DataError(f"its sky has the tables {', '.join(tables)}; expected {', '.join(WIDTHS)}")
+            raise DataError(f"its sky has tables {', '.join(tables)}; expected {', '.join(WIDTHS)}")
         texels = len(tables[TEXELS])
         side = int(np.sqrt(texels))
         for name, table in tables.items():
             if side * side != texels or not SIDES[0] <= side <= SIDES[1] or table.shape != (texels, WIDTHS[name]):
-                raise DataError(f"{name} of its sky is not [side * side, {WIDTHS[name]}]")
+                raise DataError(f"{name} of its sky does not have the shape [side * side, {WIDTHS[name]}]")
 
 
 class LearnedSky(ModuleState):
-    """The sky of a model, with Adam's moments, their bias correction by texel, and which texels are learned."""
+    """The sky of a model, with Adam's moments, their bias correction per texel, and a mask of learned texels."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
 
     def __init__(self, settings: EnvironmentMap, sky: DeviceSky, free: NDArray[np.bool_] | None = None) -> None:
-        """Updates change `sky` in place.  free: the texels that are learned, [side * side]; None: all."""
+        """Updates change `sky` in place.  free: mask of the texels that are learned, [side * side]; None for all."""
         super().__init__()
         self.settings, self.sky = settings, sky
         zeros, texels = sky.texels.device.zeros, sky.side**2
         self._arrays = {name: zeros((width, texels)) for name, width in WIDTHS.items() if name != TEXELS}
-        chosen = np.ones(texels, bool) if free is None else free
-        self._arrays[FREE].set(chosen[None].astype(np.float32))
+        mask = np.ones(texels, bool) if free is None else free
+        self._arrays[FREE].set(mask[None].astype(np.float32))
 
     def attach_to(self, model: DeviceModel) -> None:
         model.sky = self.sky
@@ -93,7 +93,7 @@ class LearnedSky(ModuleState):
         step.module_losses.append(value)
 
     def backward(self, step: TrainingStep) -> None:
-        """Compute the gradient of the texels that the view shows, [3, shown]."""
+        """Compute the gradient of the texels that the view shows, [3, texels in the view]."""
         frame = step.frame
         step.save(self, step.rasterizer.skies.grad_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 

@@ -1,4 +1,4 @@
-"""Choose whether a model has a sky, from the photographs, and initialize it."""
+"""Decide from the photographs whether a model has a sky, and initialize it."""
 
 import logging
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-def sky_share(run: Run) -> float | None:
-    """Return the share of the training and validation photographs that show a sky; None if it is unknown."""
+def sky_fraction(run: Run) -> float | None:
+    """Return the fraction of training and validation photographs that show a sky; None if it is unknown."""
     if _reason_unknown(run):
         return None
     background = run.model_settings.background
@@ -32,38 +32,38 @@ def sky_share(run: Run) -> float | None:
 
 
 def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
-    """Return model settings in which `background: auto` is decided: no sky if a module excludes one.
+    """Return model settings in which `background: auto` is resolved; no sky is chosen if a module excludes it.
 
     Raises ConfigError if a module excludes a sky that the settings require.
     """
     background = settings.background
-    rival = next((module for module in modules if SKY in module.conflicts and module.is_active(run.scene)), None)
-    conflict = rival and f"'{rival.type}' cannot be combined with sky: {rival.conflicts[SKY]}"
+    other = next((module for module in modules if SKY in module.conflicts and module.is_active(run.scene)), None)
+    conflict = other and f"'{other.type}' cannot be combined with sky: {other.conflicts[SKY]}"
     if conflict and settings.sky:
-        raise ConfigError(f"model.background: {conflict}; leave one of them out")
+        raise ConfigError(f"model.background: {conflict}; remove one of them")
     if not isinstance(background, Auto) or background.chosen is not None:
         return settings
-    chosen, reason = ("off", conflict) if conflict else _choice(background, run)
+    chosen, reason = ("off", conflict) if conflict else _choose(background, run)
     LOG.log(logging.INFO if chosen == "on" else logging.DEBUG, "model.background: %s, since %s", chosen, reason)
-    decided = background.model_copy(update={"chosen": chosen, "reason": reason})
-    return settings.model_copy(update={"background": decided})
+    resolved = background.model_copy(update={"chosen": chosen, "reason": reason})
+    return settings.model_copy(update={"background": resolved})
 
 
 def start_sky(run: Run, source: Model | None) -> None:
-    """Give the run's new model its first sky, if it has one: the sky of `source`, or colors from the photographs.
+    """Initialize the sky of the run's new model, if it has one, from `source` or from the photographs.
 
-    source: the model that the new one is made from.
+    source: the model from which the new model was created.
     """
     initial, background = source and source.sky, choose_sky(run, run.model_settings, ()).sky
     if background is None:
         run.modules.pop(SKY, None)
         if initial:
-            LOG.warning("the sky of the model is left out; set model.background: envmap to keep it")
+            LOG.warning("the sky of the model is dropped; set model.background: envmap to keep it")
         return
     if is_transparent(run.scene):
         LOG.warning(
             "model.background: the photographs are transparent, so the sky would learn the color that clsplat puts "
-            "behind them; leave model.background out"
+            "behind them; remove model.background"
         )
     texels, free = _first_texels(run, background.side)
     sky = initial if initial and initial.side == background.side else Sky(texels)
@@ -76,47 +76,47 @@ def sky_advice(run: Run) -> list[str]:
     background = run.model_settings.background
     if not isinstance(background, Auto) or background.sky is None:
         return []
-    why, _, _ = background.reason.partition(";")
-    return [f"a sky was added, since {why}; other viewers show it if `export` has `sky: splats`"]
+    reason, _, _ = background.reason.partition(";")
+    return [f"a sky was added, since {reason}; other viewers show it if `export` has `sky: splats`"]
 
 
 def _reason_unknown(run: Run) -> str:
     """Return why the photographs cannot be searched for a sky; empty if they can."""
     if run.scene.points is None:
-        return "the dataset has no points, and what is far from them is not known"
+        return "the dataset has no points to tell distant regions from near ones"
     return "the photographs have transparency" if is_transparent(run.scene) else ""
 
 
 def _count(run: Run, share: float) -> tuple[int, int]:
-    """Count the photographs with at least this share of sky in their upper third, and all photographs."""
+    """Count the photographs with at least this fraction of sky in their upper third, and all photographs."""
     evidence = _evidence(run, run.scene.merge_validation())
     return sum(photo.share >= share for photo in evidence), len(evidence)
 
 
-def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
-    """Decide whether there is a sky, and say why."""
-    if why := _reason_unknown(run):
-        return "off", why
+def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
+    """Decide whether there is a sky; return the decision and its reason."""
+    if reason := _reason_unknown(run):
+        return "off", reason
     shown, count = _count(run, background.share)
     text = (
         f"{shown} of {count} photographs show bright or blue regions above the horizon, without points, in "
         f"{background.share:.0%} or more of their upper third"
     )
-    enough = shown >= background.photographs * count
-    return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
+    is_sky = shown >= background.photographs * count
+    return ("on" if is_sky else "off"), f"{text}; {'' if is_sky else 'not '}{background.photographs:.0%} of them"
 
 
 def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the first colors of the map, and which texels are learned.
+    """Return the initial colors of the map, [side * side, 3], and the mask of learned texels, [side * side].
 
-    If no photograph shows a sky, all are learned, from the mean color of the photographs' upper thirds.
+    If no photograph shows a sky, all texels are learned, from the mean color of the photographs' upper thirds.
     """
     evidence = _evidence(run, run.scene)
     if texels := panorama(evidence, side):
         return texels
     uppers = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
     if not uppers:
-        LOG.warning("masks leave out the upper thirds of all photographs: the sky starts black")
+        LOG.warning("masks exclude the upper thirds of all photographs; the sky starts black")
     mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 

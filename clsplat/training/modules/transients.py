@@ -1,4 +1,4 @@
-"""Mask transient objects, such as people and cars, by their residuals.
+"""Mask transient objects, such as people and cars, by the residuals of their pixels.
 
 After SpotLessSplats (Sabour et al. 2024), without its network, and RobustSplat (Fu et al. 2025).
 """
@@ -20,7 +20,7 @@ from clsplat.training.run import Run
 _NAMES = constants("transients.cl")
 BINS, FIRST_BIN, BIN_SHIFT = (int(_NAMES[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
 KEYS = tuple(f"{k:02d}" for k in range(BINS))
-TAIL = 0.99  # quantile that tells whether there are outliers
+TAIL = 0.99  # quantile by which outliers are detected
 
 
 class Transients(TrainingModule):
@@ -28,8 +28,8 @@ class Transients(TrainingModule):
 
     A residual is a pixel's absolute difference, averaged over channels.  A running histogram holds the residuals of all
     views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
-    `quantile` are masked, if most of the box around them is above it too: details that the model has not learned yet
-    are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are ours.
+    `quantile` are masked if most of the box around them is above it too, because details that the model has not learned
+    yet are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are ours.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset(
@@ -41,7 +41,7 @@ class Transients(TrainingModule):
 
     type: Literal["transients"] = "transients"
     start: Annotated[int, Field(ge=0)]
-    """Global step after which pixels are masked.  Choose one at which the model shows the scene without transients."""
+    """Global step after which pixels are masked, when the model already shows the scene without transients."""
     quantile: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """Quantile of the residuals that are typical of the static scene."""
     outlier_ratio: Annotated[float, Field(ge=1)] = 3.0
@@ -49,7 +49,7 @@ class Transients(TrainingModule):
     tail_ratio: Annotated[float, Field(ge=0)] = 6.0
     """Size of the 99% quantile, as a multiple of that quantile, above which pixels are masked; 0: always."""
     box_size: Annotated[float, Field(ge=0, lt=1)] = 0.04
-    """Side of the box as a share of the photograph's width, rounded to an odd number of px, at least 3."""
+    """Side of the box as a fraction of the photograph's width, rounded to an odd number of px, at least 3."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
     """Decay of the histogram, per step."""
 
@@ -58,7 +58,7 @@ class Transients(TrainingModule):
         counts = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
         if step <= self.start or counts[-1] == 0:
             return None
-        typical, tail = (_bin_end(int((counts < share * counts[-1]).sum())) for share in (self.quantile, TAIL))
+        typical, tail = (_bin_end(int((counts < q * counts[-1]).sum())) for q in (self.quantile, TAIL))
         return self.outlier_ratio * typical if tail > self.tail_ratio * typical else None
 
     def create_state(self, run: Run) -> ModuleState:
@@ -100,7 +100,7 @@ def measure_residuals(
     """Return the residuals, [1, rows, stride], of planes [3, rows, stride], and a function that waits for their counts
     by bin, [BINS].
 
-    mask: [1, rows, stride], 1 in pixels that count; None: all count.
+    mask: [1, rows, stride], 1 in pixels that count; None if all count.
     """
     residuals = workspace.array("residuals", (1, camera.rows, camera.stride))
     numbers = workspace.array("residual numbers", BINS, np.uint32)
@@ -121,7 +121,7 @@ def measure_residuals(
 def mask_transients(
     workspace: Workspace, camera: DeviceCamera, residuals: Array, threshold: float, reach: int
 ) -> Array:
-    """Return the mask of pixels that count, [1, rows, stride], from residuals, [1, rows, stride].
+    """Return a mask, [1, rows, stride], that is 0 for transients, from residuals, [1, rows, stride].
 
     reach: half the side of a pixel's box, px.
     """
