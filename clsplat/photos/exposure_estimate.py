@@ -55,7 +55,7 @@ class Exposures:
 UNKNOWN = Exposures({}, "neither tracks nor EXIF give exposures")
 
 
-def read_exposures(views: Sequence[View]) -> Exposures:
+def exif_exposures(views: Sequence[View]) -> Exposures:
     """Return exposures from EXIF, EV = log2(t ISO / N²), with a gamma of 2.2.
 
     Real tone curves differ, so this is only an initial value.

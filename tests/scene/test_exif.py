@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.photos.exposure_estimate import read_exposures
+from clsplat.photos.exposure_estimate import exif_exposures
 from clsplat.prepare.gather import gather
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import (
@@ -115,9 +115,9 @@ def test_exposures_file_takes_precedence_over_exif(tmp_path):
 def test_camera_gains_are_light_ratios_to_the_display_power(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exposure(iso=100))
     (tmp_path / "b.jpg").write_bytes(with_exposure(iso=400))
-    found = read_exposures([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
+    found = exif_exposures([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
     half = np.log(4) / 2.2 / 2
     assert found.log_gains["b.jpg"] == pytest.approx([half] * 3)
     assert found.log_gains["a.jpg"] == pytest.approx([-half] * 3)
     assert found.spread == pytest.approx(half)
-    assert read_exposures([]).log_gains == {}
+    assert exif_exposures([]).log_gains == {}

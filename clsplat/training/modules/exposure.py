@@ -27,7 +27,7 @@ from clsplat.losses.base import LossValue
 from clsplat.metrics.views import Gains
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
-from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, complete_exposures, measure_exposures, read_exposures
+from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, complete_exposures, exif_exposures, measure_exposures
 from clsplat.photos.photographs import Mask
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -380,7 +380,7 @@ def estimate_exposures(run: Run) -> Exposures:
         counted = run.status.counted(views, "photographs", len(views))
         measured = measure_exposures(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
         is_complete = len(measured.log_gains) == len(set(names))
-        run.cache[key] = measured if is_complete else complete_exposures(measured, read_exposures(views))
+        run.cache[key] = measured if is_complete else complete_exposures(measured, exif_exposures(views))
     exposures: Exposures = run.cache[key]
     return exposures
 
