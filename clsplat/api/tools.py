@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, path_of
 from clsplat.opencl.runtimes import no_device_advice as no_device_advice
+from clsplat.opencl.runtimes import no_device_error as no_device_error
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.conformance.bench.measurement import Measurement

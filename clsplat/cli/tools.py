@@ -22,7 +22,7 @@ def devices(as_json: JsonOption = False) -> None:
         for device in found:
             terminal.show(terminal.device_text(device))
     if all(device["fault"] for device in found):
-        raise DeviceError(f"no OpenCL device works; {tools.no_device_advice()}")
+        raise tools.no_device_error("no OpenCL device works", tools.no_device_advice())
 
 
 @command("doctor", "clsplat doctor", "clsplat doctor --device radeonsi --html device.html")

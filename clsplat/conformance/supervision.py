@@ -3,7 +3,6 @@
 import json
 import os
 import queue
-import signal
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import IO, Any
 
 from clsplat.conformance.check import Check, Deviation, Note
+from clsplat.core.child import signal_name
 from clsplat.core.errors import shorten
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import empty_kernel_caches
@@ -151,6 +151,5 @@ def _exit_reason(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
     written = [line.strip() for line in errors.read().splitlines() if line.strip()]
     last = f" ({shorten(written[-1], 300)})" if written else ""
     if code < 0:
-        names = {number.value: number.name for number in signal.Signals}
-        return f"the runtime crashes with {names.get(-code, f'signal {-code}')}{last}"
+        return f"the runtime crashes with {signal_name(code)}{last}"
     return f"the process exits with code {code}{last}"

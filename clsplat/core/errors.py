@@ -109,6 +109,9 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
         return Interrupted("stopped at once; to continue, run it again, with --resume if a checkpoint was saved")
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use fewer Gaussians, or fewer or smaller images (scene.downscale)")
+    if isinstance(error, ImportError) and "failed to map segment" in str(error):
+        reason = "too little memory or address space (`ulimit -v`), or a file system mounted with `noexec`"
+        return MemoryLimitError(f"{one_line(error)}: {reason}")
     if (
         isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
     ):  # for outputs, write_error has already handled it

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import platformdirs
 
@@ -24,6 +24,7 @@ from clsplat.core.reading import read_text
 
 LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # they keep caches next to ours and fail if they cannot
+MIN_SPACE = 16 << 20  # bytes; the built kernels of a device take a few MB
 
 
 @cache
@@ -32,13 +33,15 @@ def cache_folder() -> Path:
 
     If the user's cache folders are not writable, as in a container without a home, all caches, those of the libraries
     included, move to the temporary folder, with a warning.  Raises OutputError if that is not writable either.
+    So they do if little space is free, since compilers abort the process when a built kernel does not fit.
     """
     try:
         folders = [Path(platformdirs.user_cache_dir(name, name)) for name in ("clsplat", *LIBRARIES)]
     except RuntimeError:  # no HOME, and a user unknown to the system
         fault = "there is no home folder"
     else:
-        fault = next(filter(None, map(_fault, [*folders, *user_cache_folders()])), "")
+        folders += user_cache_folders()
+        fault = next(filter(None, (_fault(folder) or space_fault(folder) for folder in folders)), "")
         if not fault:
             return folders[0]
     moved = _temporary()
@@ -67,6 +70,14 @@ def _fault(folder: Path) -> str:
             file.write(b"clsplat")
     except OSError as error:
         return f"{folder}: cannot be written ({error.strerror or error})"
+    return ""
+
+
+def space_fault(folder: Path) -> str:
+    """Return why built kernels may not fit in a folder, or ''."""
+    with suppress(OSError, AttributeError):  # the system does not say
+        if (free := shutil.disk_usage(folder).free) < MIN_SPACE:
+            return f"{folder}: has only {free >> 10} KiB of free space, too little for built kernels"
     return ""
 
 
@@ -235,6 +246,17 @@ def _is_alive_on_windows(kernel: Any, process: int) -> bool:
 
 
 # Free memory.
+
+
+def process_limit(name: Literal["RLIMIT_AS", "RLIMIT_FSIZE"]) -> int | None:
+    """Return the bytes of address space (`ulimit -v`) or of a file (`ulimit -f`) that a process may use, if limited."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    limit: int = resource.getrlimit(getattr(resource, name))[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
 
 CONTAINER = Path("/sys/fs/cgroup")
 

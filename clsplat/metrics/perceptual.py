@@ -1,6 +1,7 @@
 """Compute perceptual metrics of 8-bit images on the host: MS-SSIM, FLIP and LPIPS."""
 
 import hashlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from clsplat.core.child import run_module
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file
 
 # LPIPS with a network in a local ONNX file, by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
+READ_SECONDS = 300  # a slow machine reads a network of 60 MB and runs it
+_read: set[str] = set()  # digests of the networks that OpenCV reads without a crash
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 
 
@@ -33,6 +37,13 @@ class Lpips:
         data = read_file(path, "an ONNX file of LPIPS")
         self.path, self.inputs = path, inputs
         self.digest = hashlib.sha256(data).hexdigest()
+        if self.digest not in _read:
+            child = run_module("clsplat.metrics.perceptual", seconds=READ_SECONDS, stdin=data)
+            if child.crash:
+                raise DataError(
+                    f"{path}: OpenCV {cv2.__version__} {child.crash} when it reads this file; export the network again"
+                )
+            _read.add(self.digest)
         try:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
@@ -55,8 +66,10 @@ class Lpips:
                 f"{self.path}: cannot compare images of {size} ({_short(error)}); expected the inputs "
                 f"{' and '.join(INPUTS)} of [1, 3, height, width], with free height and width"
             ) from error
-        if output.size != 1 or not np.isfinite(output).all():
-            raise ConfigError(f"{self.path}: expected one finite number for two images, got {output.size} values")
+        if output.size != 1 or output.dtype.kind != "f" or not np.isfinite(output).all():
+            raise ConfigError(
+                f"{self.path}: expected one finite number for two images, got {output.size} of type {output.dtype}"
+            )
         return float(output.ravel()[0])
 
     def origin(self) -> dict[str, str]:
@@ -207,3 +220,10 @@ def _flip_package() -> ModuleType:
     except ImportError as error:
         raise ConfigError("metric flip: its package is not installed; pip install 'clsplat[metrics]'") from error
     return flip_evaluator  # type: ignore[no-any-return]
+
+
+if __name__ == "__main__":  # a child process, which a damaged network may crash
+    network = cv2.dnn.readNetFromONNX(np.frombuffer(sys.stdin.buffer.read(), np.uint8))
+    for name in INPUTS:
+        network.setInput(np.zeros((1, 3, 64, 64), np.float32), name)
+    network.forward()

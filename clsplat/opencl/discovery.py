@@ -76,7 +76,8 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def platforms() -> list[Any]:
-    """Return the platforms of the loader; an empty list if it finds no runtime."""
+    """Return the platforms of the loader; an empty list if it finds no runtime.  Raises like `check_runtimes`."""
+    runtimes.check_runtimes(f"{cl.VERSION_TEXT} {cl.__file__}")
     with _warning("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
     return []
@@ -126,7 +127,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
     if not devices:
-        raise DeviceError(f"no OpenCL device was found; {runtimes.no_device_advice()}")
+        raise runtimes.no_device_error("no OpenCL device was found", runtimes.no_device_advice())
     if device_name:
         return _named(device_name, devices)
     faults = []
@@ -139,7 +140,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
             return info
         faults.append(f"{info.text} does not work: {fault}")
         LOG.warning("%s", faults[-1])
-    raise DeviceError("; ".join(faults))
+    raise runtimes.no_device_error("; ".join(faults))
 
 
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
@@ -160,7 +161,7 @@ def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     info = matching[int(number)]
     fault = info.fault()
     if fault is not None:
-        raise DeviceError(f"{info.text} does not work: {fault}")
+        raise runtimes.no_device_error(f"{info.text} does not work: {fault}")
     return info
 
 

@@ -3,7 +3,6 @@
 import logging
 import os
 import re
-import shutil
 import struct
 import sys
 import tempfile
@@ -16,14 +15,14 @@ import platformdirs
 
 from clsplat.core.errors import DataError, OutputError
 from clsplat.core.files import write_text
-from clsplat.core.machine import LIBRARIES, cache_folder, user_cache_folders
+from clsplat.core.machine import LIBRARIES, Owner, cache_folder, process_limit, space_fault, user_cache_folders
 from clsplat.core.reading import open_regular, read_text
 
 LOG = logging.getLogger("clsplat")
 SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes
 ELF, ELF_HEADER = b"\x7fELF", 64  # bytes, of the 64-bit format
+MIN_FILE_SIZE = 2 << 20  # bytes of the largest built kernel
 KERNEL_OF_POCL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")  # hash, kernel, group
-MIN_SPACE = 2**20  # bytes; the built kernels of a device take a few MB
 
 
 def kernel_caches() -> str:
@@ -34,9 +33,25 @@ def kernel_caches() -> str:
 
 def kernel_cache_advice() -> str:
     """Return advice for a device that works only with empty kernel caches."""
-    if full := [folder for folder in _kernel_folders() if _is_full(folder)]:
-        return f"{full[0]}: has no space for built kernels; free some, or set XDG_CACHE_HOME to another folder"
+    if fault := _full_cache():
+        return fault
     return f"its cache of built kernels is damaged: remove {kernel_caches()}"
+
+
+def require_space() -> None:
+    """Raise OutputError if built kernels may not fit, since compilers then abort the process."""
+    limit = process_limit("RLIMIT_FSIZE")
+    if limit is not None and limit < MIN_FILE_SIZE:
+        raise OutputError(
+            f"`ulimit -f` limits files to {limit >> 10} KiB; built kernels need {MIN_FILE_SIZE >> 10} KiB: raise it"
+        )
+    if fault := _full_cache():
+        raise OutputError(fault)
+
+
+def _full_cache() -> str:
+    faults = filter(None, map(space_fault, (cache_folder(), *user_cache_folders())))
+    return next((f"{fault}; free some, or set XDG_CACHE_HOME to another folder" for fault in faults), "")
 
 
 @cache
@@ -45,7 +60,7 @@ def remove_cut_kernels() -> None:
 
     This runs once per boot if the system has a boot ID, else once per process.
     """
-    now, before = f"{_boot_id()}\n{kernel_caches()}", cache_folder() / "kernels_checked"
+    now, before = f"{Owner.current().boot or ''}\n{kernel_caches()}", cache_folder() / "kernels_checked"
     with suppress(DataError):
         if not now.startswith("\n") and read_text(before) == now:
             return
@@ -59,13 +74,6 @@ def remove_cut_kernels() -> None:
         LOG.warning("removed %d truncated files of built kernels (%s); they will be built again", len(cut), cut[0])
     with suppress(OutputError):
         write_text(before, now)
-
-
-def _boot_id() -> str:
-    """Return the boot ID of Linux; '' elsewhere."""
-    with suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text("utf-8").strip()
-    return ""
 
 
 def _kernels_of_pocl(folder: Path) -> list[Path]:
@@ -113,9 +121,3 @@ def empty_kernel_caches() -> Iterator[dict[str, str]]:
 def _kernel_folders() -> list[Path]:
     pyopencl, pytools, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
     return [pyopencl, pytools, next(iter(user_cache_folders()), pocl)]
-
-
-def _is_full(folder: Path) -> bool:
-    with suppress(OSError):
-        return shutil.disk_usage(folder).free < MIN_SPACE
-    return False

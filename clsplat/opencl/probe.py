@@ -1,7 +1,11 @@
-"""Build and run two small kernels on a device, given by platform and device number; exit code 0 means success."""
+"""Build and run two small kernels on a device, given by platform and device number; exit code 0 means success.
+
+Without numbers, load all runtimes and query their devices.
+"""
 
 import os
 import sys
+from contextlib import suppress
 
 from clsplat.opencl import runtimes
 
@@ -60,7 +64,21 @@ def main(platform: int, device: int) -> None:
         raise SystemExit(f"error: the test kernel computed roots {roots.tolist()}")
 
 
+def load_runtimes() -> None:
+    """Query all devices, between a line before and a line after."""
+    print(runtimes.LOADING, flush=True)
+    with suppress(cl.Error):
+        for platform in cl.get_platforms():
+            with suppress(cl.Error):
+                for device in platform.get_devices():
+                    _ = platform.version, device.name, device.driver_version, device.native_vector_width_float
+    print(f"\n{runtimes.LOADED}", flush=True)
+
+
 if __name__ == "__main__":
+    if not sys.argv[1:]:
+        load_runtimes()
+        sys.exit()
     try:
         main(int(sys.argv[1]), int(sys.argv[2]))
     except cl.Error as error:

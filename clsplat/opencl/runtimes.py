@@ -6,20 +6,23 @@ process, because some runtimes abort the process on errors (PoCL before 7.2 with
 
 import hashlib
 import os
-import subprocess
-import sys
 import sysconfig
+import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
-from clsplat.core.errors import OutputError, quote
+from clsplat.core.child import run_module
+from clsplat.core.errors import DataError, DeviceError, MemoryLimitError, OutputError, quote
 from clsplat.core.files import write_text
-from clsplat.core.machine import cache_folder
-from clsplat.opencl.kernel_caches import empty_kernel_caches, kernel_cache_advice, remove_cut_kernels
+from clsplat.core.machine import Owner, cache_folder, process_limit
+from clsplat.core.reading import read_text
+from clsplat.opencl.kernel_caches import empty_kernel_caches, kernel_cache_advice, remove_cut_kernels, require_space
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE = Path(__file__).with_name("probe.py")
+PROBE_MODULE = "clsplat.opencl.probe"
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
 INSTALL = (
@@ -27,8 +30,13 @@ INSTALL = (
     "your GPU's driver"
 )
 VARIABLES = ("POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # any of them may hide a runtime
+LOADER_VARIABLES = (*VARIABLES, "LD_LIBRARY_PATH", "LD_PRELOAD")  # they decide which libraries are loaded
+MIN_ADDRESS_SPACE = 1800 << 20  # bytes: with two cores, a run needs about this much
+LOADING_SECONDS = 60  # drivers of large servers may take ten
+LOADING, LOADED = "clsplat loads the runtimes", "clsplat has listed the devices"  # lines of the child process
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
+OTHER_DRIVERS = "remove this file, or set OCL_ICD_VENDORS to a folder with the .icd files of the other runtimes"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
     ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
@@ -45,12 +53,91 @@ def prepare() -> None:
     _add_intel_runtime()
 
 
+def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitError:
+    """Return the error for a machine where no device works: MemoryLimitError if the address space is limited."""
+    limit = process_limit("RLIMIT_AS")
+    if limit is None:
+        return DeviceError(f"{fault}; {advice}" if advice else fault)
+    otherwise = f"; if that does not help, {advice}" if advice else ""
+    return MemoryLimitError(
+        f"{fault}; a process may use only {limit >> 20} MiB of address space (`ulimit -v`): raise this limit{otherwise}"
+    )
+
+
 def no_device_advice() -> str:
     """Return what to do if there is no device: correct the variables that the user has set, or install a runtime."""
+    named = _user_variables()
+    return f"{named} may hide the runtimes: correct or unset it; or {INSTALL}" if named else INSTALL
+
+
+def _user_variables() -> str:
+    """Return the variables that the user has set, with their values; '' without one."""
     own = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # set by `prepare`
     given = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, own[0]).startswith(own)}
-    named = ", ".join(f"{name}={quote(value)}" for name, value in given.items())
-    return f"{named} may hide the runtimes: correct or unset it; or {INSTALL}" if named else INSTALL
+    return ", ".join(f"{name}={quote(value)}" for name, value in given.items())
+
+
+@cache
+def check_runtimes(loader: str) -> None:
+    """Load all runtimes in a child process first, since a runtime may end the process that loads it.
+
+    A success is stored until the next boot, or until the runtimes change.  loader: the OpenCL loader and its version.
+    Raises DeviceError with the driver file that is to blame, MemoryLimitError, and OutputError
+    if built kernels do not fit.
+    """
+    require_space()
+    limit = process_limit("RLIMIT_AS")
+    if limit is not None and limit < MIN_ADDRESS_SPACE:  # runtimes crash or hang when they run out of it
+        raise no_device_error(f"OpenCL runtimes need {MIN_ADDRESS_SPACE >> 20} MiB of address space")
+    drivers = _drivers()
+    variables = [os.environ.get(name) for name in LOADER_VARIABLES]
+    files = [path for path in (*drivers.values(), "/etc/ld.so.cache") if os.path.exists(path)]
+    times = [os.stat(path).st_mtime_ns for path in files]
+    state = repr((loader, limit, Owner.current().boot, variables, drivers, times))
+    record = cache_folder() / "runtimes" / hashlib.sha256(state.encode()).hexdigest()[:16]
+    if os.path.exists(record):
+        return
+    fault = _loading_fault({})
+    if fault is not None:
+        raise no_device_error(f"an OpenCL runtime {fault}") if limit else _blame(drivers, fault)
+    with suppress(OutputError):
+        write_text(record, state)
+
+
+def _drivers() -> dict[Path, str]:
+    """Return the libraries of the runtimes, by what names them to the loader: an .icd file, or the library itself."""
+    place = Path(os.environ.get("OCL_ICD_VENDORS") or SYSTEM_DRIVERS)
+    files = sorted(place.glob("*.icd")) if place.is_dir() else [place]
+    drivers = {
+        path: str(path)
+        for path in (*files, *map(Path, filter(None, os.environ.get("OCL_ICD_FILENAMES", "").split(os.pathsep))))
+    }
+    for path in drivers:
+        if path.suffix == ".icd":
+            with suppress(DataError):
+                drivers[path] = read_text(path).partition("\n")[0].strip()
+    return drivers
+
+
+def _blame(drivers: Mapping[Path, str], fault: str) -> DeviceError:
+    """Return the error about the first driver that ends a process that loads no other."""
+    remedy = f"correct or unset {named}" if (named := _user_variables()) else OTHER_DRIVERS
+    for path, library in drivers.items():
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            write_text(Path(folder, "driver.icd"), f"{library}\n")
+            alone = _loading_fault({"OCL_ICD_VENDORS": folder, "OCL_ICD_FILENAMES": ""})
+        if alone is not None:
+            file = SYSTEM_DRIVERS / path.name if path.is_relative_to(cache_folder()) else path
+            return DeviceError(f"{file}: the runtime {quote(library)} {alone}; {remedy}")
+    return DeviceError(f"an OpenCL runtime {fault}; {remedy}")
+
+
+def _loading_fault(variables: Mapping[str, str]) -> str | None:
+    """Return how a child process ends that loads all runtimes, as a verb phrase, or None if it lists the devices."""
+    result = run_module(PROBE_MODULE, seconds=LOADING_SECONDS, variables=variables)
+    if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not even begin
+        return None
+    return f"{result.crash or 'ends the process'} when it is loaded"
 
 
 def _add_intel_runtime() -> None:
@@ -100,25 +187,15 @@ def probe_fault(key: str, platform: int, device: int) -> str | None:
 
 def _run_probe(platform: int, device: int, variables: Mapping[str, str]) -> str | None:
     """Test a device in a child process with additional environment variables; return the fault, or None."""
-    command = [sys.executable, "-P", "-m", "clsplat.opencl.probe", str(platform), str(device)]
-    try:
-        result = subprocess.run(
-            command,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=PROBE_SECONDS,
-            check=False,
-            env={**os.environ, **variables},
-        )
-    except subprocess.TimeoutExpired:
+    result = run_module(PROBE_MODULE, str(platform), str(device), seconds=PROBE_SECONDS, variables=variables)
+    if result.code is None:
         return _HANGS
-    if result.returncode == 0:
+    if result.code == 0:
         return None
-    output = f"{result.stdout}\n{result.stderr}"
+    output = result.output
     if "failed to map segment" in output.lower():
         return _NO_EXECUTION
-    reason = "the runtime aborts the process" if result.returncode not in range(256) else _error_line(output)
+    reason = "the runtime aborts the process" if result.crash else _error_line(output)
     for word, advice in _ADVICE:
         if word in f"{output} {reason}".lower():
             return f"{reason}; {advice}"

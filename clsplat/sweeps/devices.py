@@ -22,6 +22,7 @@ from clsplat.core.machine import Owner, cache_folder
 from clsplat.core.manifest import hash_values
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.opencl.runtimes import no_device_error
 from clsplat.pipeline.files import shipped
 from clsplat.sweeps.cell import code_digest
 from clsplat.sweeps.child import fill_command, run_command
@@ -89,7 +90,7 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
     infos = list_devices()
     chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
     if not chosen:
-        raise DeviceError("no OpenCL device works; `clsplat devices` shows why")
+        raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []
     for info, parts in zip(chosen, split_device_cores(chosen, packing), strict=True):
         bits, memory = bits_class(info, infos), info.memory // len(parts)

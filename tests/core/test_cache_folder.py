@@ -17,11 +17,12 @@ from types import SimpleNamespace
 import platformdirs
 import pytest
 
+from clsplat.core.child import ChildResult
 from clsplat.core.errors import OutputError
 from clsplat.core.machine import cache_folder
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
-from clsplat.opencl.kernel_caches import kernel_cache_advice, kernel_caches, remove_cut_kernels
+from clsplat.opencl.kernel_caches import kernel_cache_advice, kernel_caches, remove_cut_kernels, require_space
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
 
@@ -76,6 +77,20 @@ def test_caches_move_if_home_or_library_cache_is_read_only(machine, user_folder,
     assert record.levelno == logging.WARNING
     assert str(machine / place) in record.getMessage()
     assert f"caches are in {user_folder} instead" in record.getMessage()
+
+
+@linux
+def test_caches_move_where_built_kernels_do_not_fit(machine, user_folder, monkeypatch, caplog):
+    """LLVM aborts the process when the disk is full."""
+    full = machine / "kernels"
+    monkeypatch.setenv("POCL_CACHE_DIR", str(full))
+    free = {full: 2**18}
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free.get(folder, 2**30)))
+    assert cache_folder() == user_folder / "clsplat"
+    assert f"{full}: has only 256 KiB of free space, too little for built kernels; caches are in {user_folder}" in caplog.text
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=2**18))
+    with pytest.raises(OutputError, match=r"has only 256 KiB of free space, .* free some, or set XDG_CACHE_HOME"):
+        require_space()
 
 
 @linux
@@ -149,7 +164,7 @@ def test_full_folder_is_not_reported_as_damaged(machine, monkeypatch, free):
     cache_folder()
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
     text = kernel_cache_advice()
-    assert ("has no space for built kernels; free some" in text) == (not free)
+    assert ("has only 0 KiB of free space, too little for built kernels; free some" in text) == (not free)
     assert ("is damaged: remove" in text) == bool(free)
 
 
@@ -209,7 +224,7 @@ def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
     """Also where another folder is used than before."""
     first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
     start = {"now": "1"}
-    monkeypatch.setattr("clsplat.opencl.kernel_caches._boot_id", lambda: start["now"])
+    monkeypatch.setattr("clsplat.core.machine._boot", lambda: start["now"])
 
     def cut(file: Path) -> bool:
         """Whether a kernel that is cut off is found by a process that starts now."""
@@ -265,9 +280,9 @@ def broken(machine: Path) -> Path:
 def test_device_is_tested_without_its_truncated_kernels(broken, monkeypatch):
     def probe(*arguments, **values):
         assert not broken.exists()
-        return subprocess.CompletedProcess([], 0, "", "")
+        return ChildResult(0, "")
 
-    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    monkeypatch.setattr(runtimes, "run_module", probe)
     assert runtimes.probe_fault("key", 0, 0) is None
     assert not broken.exists()
 

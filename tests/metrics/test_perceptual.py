@@ -8,9 +8,12 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.conformance import reference as ref
+from clsplat.core.child import ChildResult
 from clsplat.core.errors import ConfigError, DataError
+from clsplat.metrics import perceptual as perceptual_metrics
 from clsplat.metrics.perceptual import Lpips, Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
 from clsplat.stages.evaluate import Evaluate
+from tests.support.data_sets import data_set
 from tests.support.onnx_writer import distance_network
 
 
@@ -129,3 +132,22 @@ def test_files_that_are_not_lpips_are_refused(rng, network, tmp_path):
     assert "\n" not in str(error.value)
     with pytest.raises(ConfigError, match=r"distance of equal images is 0.5, expected 0"):
         Lpips(network(offset=0.5), "-1..1")
+
+
+def test_a_network_that_crashes_opencv_ends_no_process(network, monkeypatch):
+    """Children that crash in place of OpenCV, which does not crash at the same files in all versions."""
+    path = network()
+    ends = iter([ChildResult(-11, ""), ChildResult(0, "")])
+    monkeypatch.setattr(perceptual_metrics, "run_module", lambda *words, **values: next(ends))
+    monkeypatch.setattr(perceptual_metrics, "_read", set())
+    with pytest.raises(DataError, match=r"distance.onnx: OpenCV .* crashes with SIGSEGV when it reads this file"):
+        Lpips(path, "0..1")
+    for _ in range(2):
+        Lpips(path, "0..1")
+
+
+@pytest.mark.parametrize("name", ["segv.onnx", "lpips_11_1.bin"])
+def test_damaged_networks_are_refused(name):
+    file = data_set("cases") / "onnx" / name
+    with pytest.raises((DataError, ConfigError), match=f"{name}: "):
+        Lpips(file, "-1..1")

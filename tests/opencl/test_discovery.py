@@ -2,7 +2,10 @@
 
 import logging
 import os
+import re
+import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +16,8 @@ import pytest
 from pyopencl import _cl
 
 from clsplat.conformance.scenes import random_case
-from clsplat.core.errors import DeviceError, KernelError
+from clsplat.core.child import ChildResult
+from clsplat.core.errors import DeviceError, KernelError, MemoryLimitError
 from clsplat.opencl import device as program
 from clsplat.opencl import discovery, probe, runtimes
 from clsplat.opencl.device import Device
@@ -84,14 +88,14 @@ def test_damaged_cache_is_reported_as_the_cause(monkeypatch, tmp_path):
     """Its second try has an empty folder for kernels; of a device that fails there, too, the first fault is told."""
     broken, folders = False, []
 
-    def probe(*arguments, env, **values):
-        folder = env.get("POCL_CACHE_DIR") if "PYOPENCL_NO_CACHE" in env else None
+    def probe(*words, seconds, variables):
+        folder = variables.get("POCL_CACHE_DIR") if "PYOPENCL_NO_CACHE" in variables else None
         folders.append(folder)
         assert folder is None or not os.listdir(folder)
-        return subprocess.CompletedProcess([], int(broken or folder is None), "", f"error: fault {len(folders)}")
+        return ChildResult(int(broken or folder is None), f"error: fault {len(folders)}")
 
     monkeypatch.delenv("PYOPENCL_NO_CACHE", raising=False)
-    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    monkeypatch.setattr(runtimes, "run_module", probe)
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     fault = CPU.fault()
     assert fault == f"its cache of built kernels is damaged: remove {kernel_caches()}"
@@ -104,11 +108,7 @@ def test_damaged_cache_is_reported_as_the_cause(monkeypatch, tmp_path):
 def test_runtime_that_does_not_know_the_cpu_is_reported(monkeypatch, tmp_path):
     """PoCL 3.0 builds kernels for a newer processor without an error, and then has none that takes whole roots."""
     said = "error: a test kernel fails (clCreateKernel failed: INVALID_KERNEL_NAME)"
-    monkeypatch.setattr(
-        runtimes.subprocess,
-        "run",
-        lambda *_, **__: subprocess.CompletedProcess([], 1, "", f"{said}\nreferences to IRs"),
-    )
+    monkeypatch.setattr(runtimes, "run_module", lambda *_, **__: ChildResult(1, f"{said}\nreferences to IRs"))
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     assert CPU.fault().startswith(f"{said}; this runtime may not support the processor: apt install pocl-opencl-icd")
 
@@ -141,7 +141,7 @@ def test_kernels_without_vector_units_are_not_built(monkeypatch, width, lanes):
 
 def test_device_works_if_the_probe_result_cannot_be_saved(monkeypatch, tmp_path):
     """As in a cache with a folder of another user."""
-    monkeypatch.setattr(runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, "", ""))
+    monkeypatch.setattr(runtimes, "run_module", lambda *_, **__: ChildResult(0, ""))
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     (tmp_path / "probes").touch()
     assert CPU.fault() is None
@@ -205,9 +205,7 @@ def test_only_a_failing_loader_is_reported(monkeypatch, caplog, code, lines):
 
 def test_probe_result_is_valid_for_its_kernels_only(monkeypatch, tmp_path):
     results = []
-    monkeypatch.setattr(
-        runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], len(results), "", "error: none")
-    )
+    monkeypatch.setattr(runtimes, "run_module", lambda *_, **__: ChildResult(len(results), "error: none"))
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     assert CPU.fault() is None
     results.append("fails from now on")
@@ -270,6 +268,75 @@ def test_wide_needs_no_kernel_with_barriers(info, rng, monkeypatch):
     image = image_of(Device(info, "wide"), np.random.default_rng(1))
     capped(monkeypatch, 1, "sort_tiles", "blend_forward", "blend_backward", "scan_offsets", "radix_count")
     np.testing.assert_array_equal(image_of(Device(info, "wide"), np.random.default_rng(1)), image)
+
+
+RUNTIME = """
+#include <stdlib.h>
+#include <string.h>
+int clIcdGetPlatformIDsKHR(unsigned n, void **platforms, unsigned *count) { ACTION; return -1001; }
+int clGetPlatformInfo(void *p, unsigned name, size_t size, void *value, size_t *written) { return -30; }
+void *clGetExtensionFunctionAddress(const char *name)
+{
+    return strcmp(name, "clIcdGetPlatformIDsKHR") ? 0 : (void *)clIcdGetPlatformIDsKHR;
+}
+"""
+
+
+@pytest.fixture
+def drivers(tmp_path, monkeypatch):
+    """Lets the test add a runtime of its own to those that the loader finds in OCL_ICD_VENDORS."""
+    compiler, folder = shutil.which("cc"), tmp_path / "vendors"
+    if compiler is None or not sys.platform.startswith("linux"):
+        pytest.skip("no C compiler for the runtime")
+    folder.mkdir()
+
+    def add(name: str, action: str) -> Path:
+        (tmp_path / "runtime.c").write_text(RUNTIME)
+        library = tmp_path / f"{name}.so"
+        command = [compiler, "-shared", "-fPIC", f"-DACTION={action}", "-o", library, tmp_path / "runtime.c"]
+        subprocess.run(command, check=True)
+        (folder / f"{name}.icd").write_text(f"{library}\n")
+        return folder / f"{name}.icd"
+
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(folder))
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path / "cache")
+    runtimes.check_runtimes.cache_clear()
+    yield add
+    runtimes.check_runtimes.cache_clear()
+
+
+@pytest.mark.parametrize(("action", "end"), [("raise(11)", "crashes with SIGSEGV"), ("exit(0)", "ends the process")])
+def test_a_runtime_that_ends_the_process_is_named(drivers, action, end):
+    drivers("a_good", "(void)0")
+    bad = drivers("bad", f"extern int raise(int); {action}")
+    with pytest.raises(DeviceError) as error:
+        discovery.list_devices()
+    assert re.fullmatch(
+        rf"{re.escape(str(bad))}: the runtime '.*bad.so' {end} when it is loaded; correct or unset OCL_ICD_VENDORS=.*",
+        str(error.value),
+    )
+
+
+def test_runtimes_that_load_are_not_loaded_in_a_child_again(drivers, monkeypatch):
+    drivers("good", "(void)0")
+    runtimes.check_runtimes("loader")
+    loaded = []
+    monkeypatch.setattr(runtimes, "_loading_fault", lambda variables: loaded.append(variables))
+    for change in (lambda: None, lambda: drivers("other", "(void)0")):
+        change()
+        runtimes.check_runtimes.cache_clear()
+        runtimes.check_runtimes("loader")
+    assert len(loaded) == 1, "only after a change"
+
+
+def test_a_limit_on_memory_is_named_where_no_device_works(monkeypatch):
+    monkeypatch.setattr(runtimes, "process_limit", lambda name: 700_000 << 10)
+    runtimes.check_runtimes.cache_clear()
+    with pytest.raises(MemoryLimitError, match=r"may use only 683 MiB of address space \(`ulimit -v`\): raise"):
+        discovery.list_devices()
+    monkeypatch.setattr(discovery, "list_devices", list)
+    with pytest.raises(MemoryLimitError, match="no OpenCL device was found; a process may use only 683 MiB"):
+        discovery.choose()
 
 
 @pytest.mark.parametrize("name", ["POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES"])

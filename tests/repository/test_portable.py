@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.core import files
+from clsplat.core.child import ChildResult
 from clsplat.core.errors import OutputError
 from clsplat.opencl import runtimes
 from tests.support.sources import FILES, ROOT
@@ -244,7 +245,6 @@ def test_intel_runtime_on_windows_is_passed_to_the_loader(tmp_path, monkeypatch)
 def test_noexec_cache_is_named(monkeypatch, tmp_path):
     """What PoCL says in a container whose cache is a tmpfs with noexec, as docker mounts it by default."""
     said = "dlopen(\"/cache/pocl/a.so\") failed with '/cache/pocl/a.so: failed to map segment from shared object'."
-    ended = subprocess.CompletedProcess([], -6, "", said)
-    monkeypatch.setattr(runtimes.subprocess, "run", lambda *arguments, **values: ended)
+    monkeypatch.setattr(runtimes, "run_module", lambda *words, **values: ChildResult(-6, said))
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     assert "mount it with `exec`, or set POCL_CACHE_DIR" in runtimes.probe_fault("key", 0, 0)

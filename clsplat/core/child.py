@@ -1,0 +1,45 @@
+"""Run a module in a child process, for code of others that may crash or hang."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ChildResult:
+    """How a child process ended, and what it wrote."""
+
+    code: int | None  # exit code; None: stopped after the time limit
+    output: str  # standard output, then standard error
+
+    @property
+    def crash(self) -> str | None:
+        """Which signal or time limit ended it, as a verb phrase; None if it exited."""
+        if self.code is None:
+            return "hangs"
+        return None if self.code in range(256) else f"crashes with {signal_name(self.code)}"
+
+
+def run_module(
+    module: str, *words: str, seconds: float, stdin: bytes = b"", variables: Mapping[str, str] | None = None
+) -> ChildResult:
+    """Run a module with arguments, standard input, and additional environment variables, for at most `seconds`."""
+    command = [sys.executable, "-P", "-m", module, *words]  # -P: import nothing from the working folder
+    environment = {**os.environ, **(variables or {})}
+    try:
+        done = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
+    except subprocess.TimeoutExpired as error:
+        return ChildResult(None, _text(error.stdout, error.stderr))
+    return ChildResult(done.returncode, _text(done.stdout, done.stderr))
+
+
+def signal_name(code: int) -> str:
+    """Return the name of the signal in the exit code of a child process."""
+    return {number.value: number.name for number in signal.Signals}.get(-code, f"signal {-code}")
+
+
+def _text(*streams: bytes | None) -> str:
+    return "\n".join((stream or b"").decode("utf-8", "replace") for stream in streams)
