@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import write_text
+from clsplat.core.files import PIPELINE, remove_partial_files, write_text
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.transforms_json import FrameFiles, Transforms, view_name
 
@@ -28,6 +28,7 @@ def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
     splits = {path.stem.removeprefix("transforms_"): path for path in sorted(source.glob("transforms_*.json"))}
     if "train" not in splits:
         raise DataError(f"{source}: has no transforms_train.json; expected the folder of a Blender dataset")
+    remove_partial_files(out, border=PIPELINE)
     metadata = {name: _write_split(Transforms(path), name, out, levels) for name, path in splits.items()}
     write_text(out / "metadata.json", json.dumps(metadata) + "\n")
     points = source / "points3d.ply"

@@ -1,15 +1,13 @@
 """Frames of the videos of several cameras, at the same moments of each."""
 
 import logging
-import os
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from clsplat.core.errors import DataError, first_few
-from clsplat.core.files import raising_output_error
+from clsplat.core.files import new_folder
 from clsplat.core.progress import Count
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.multicamera import VIDEO_SUFFIXES, VIDEOS
@@ -66,12 +64,7 @@ def _length(video: Path) -> int:
 
 def _write(video: Path, out: Path, places: list[int], long_side: int | None) -> None:
     """Write the frames at these places, all or none."""
-    half = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
+    with new_folder(out) as half:
         for place, image in enumerate(decoded(video)):
             for number in (i for i, wanted in enumerate(places) if wanted == place):
                 write_image(half / f"{number:04}.png", np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
-        with raising_output_error(out):
-            half.rename(out)
-    finally:
-        shutil.rmtree(half, ignore_errors=True)

@@ -2,20 +2,20 @@
 
 import json
 import os
-import shutil
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, OutputError
-from clsplat.core.files import path_exists
+from clsplat.core.errors import DataError
+from clsplat.core.files import new_folder, path_exists, raising_output_error, sync_below
 from clsplat.core.progress import counted
 from clsplat.core.reading import read_file
 from clsplat.scene.images import write_image
@@ -84,16 +84,10 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
         if is_complete(out, options):
             return f"{out} is already complete"
         raise DataError(f"{out}: exists and is another dataset; remove it or choose another folder")
-    partial_out = out.parent / f".{out.name}.{os.getpid()}.partial"
-    try:
-        partial_out.mkdir(parents=True)
+    with new_folder(out) as partial_out, raising_output_error(out):
         text = options.fill(partial_out, workers or os.cpu_count() or 1)
         (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")
-        partial_out.rename(out)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot write the dataset: {error}") from error
-    finally:
-        shutil.rmtree(partial_out, ignore_errors=True)
+        sync_below(partial_out)
     return f"wrote {out}: {text}"
 
 
@@ -134,8 +128,19 @@ def photographs(
     if workers == 1:
         yield from map(render, views)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
         yield from pool.map(render, views)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent ends: one that waits for work would wait forever."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    if (parent := parent_process()) is not None:
+        parent.join()
+        os._exit(1)
 
 
 def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> None:

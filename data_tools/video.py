@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import write_text
+from clsplat.core.files import PIPELINE, remove_partial_files, write_text
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_json, sha256
 from clsplat.scene.images import image_size, is_image, write_image
@@ -37,6 +37,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     images, which would mix with frames.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
+    remove_partial_files(out, border=PIPELINE)
     chosen = _begun(out, settings)
     if chosen is None:
         LOG.info("%s: looking for sharp frames", video)

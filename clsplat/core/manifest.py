@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import append, make_folder, write_error
+from clsplat.core.files import PIPELINE, append, make_folder, remove_partial_files, write_error
 from clsplat.core.reading import read_file, sha256
 
 RECORD = ".manifest.jsonl"
@@ -15,10 +15,12 @@ class Manifest:
     """The record of a folder: one line per written file, with a hash of its sources.
 
     A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
-    written.  So a file that exists is complete and made from the sources in its last line.
+    written.  So a file that exists is complete and made from the sources in its last line.  Temporary files of killed
+    calls are removed.
     """
 
     def __init__(self, folder: Path) -> None:
+        remove_partial_files(folder, border=PIPELINE)
         self.folder, self._sources = folder, dict[str, str]()
         for line in _lines(folder / RECORD):
             try:

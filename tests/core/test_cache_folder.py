@@ -87,7 +87,10 @@ def test_caches_move_where_built_kernels_do_not_fit(machine, user_folder, monkey
     free = {full: 2**18}
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free.get(folder, 2**30)))
     assert cache_folder() == user_folder / "clsplat"
-    assert f"{full}: has only 256 KiB of free space, too little for built kernels; caches are in {user_folder}" in caplog.text
+    assert (
+        f"{full}: has only 256 KiB of free space, too little for built kernels; caches are in {user_folder}"
+        in caplog.text
+    )
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=2**18))
     with pytest.raises(OutputError, match=r"has only 256 KiB of free space, .* free some, or set XDG_CACHE_HOME"):
         require_space()

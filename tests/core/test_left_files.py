@@ -49,6 +49,14 @@ def test_only_temporary_files_of_killed_runs_are_swept(tiny_scene, tmp_path):
     assert [name for name in mine if not (out / name).exists()] == []
 
 
+def test_temporary_files_of_killed_tools_are_removed(tmp_path):
+    left = tmp_path / "images" / f".a.png.{NO_PROCESS}-3.partial"
+    left.parent.mkdir()
+    left.write_text("x")
+    Manifest(tmp_path)
+    assert not left.exists()
+
+
 def test_files_of_a_live_process_are_not_swept(tmp_path):
     other, old = tmp_path / f".a.{os.getppid()}-0.partial", tmp_path / f".b.{os.getpid()}-99999999.partial"
     for path in (other, old):

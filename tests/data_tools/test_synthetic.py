@@ -1,7 +1,10 @@
 """The demo scene: closed forms of its shapes, exact cameras, all-or-nothing output."""
 
+import errno
 import json
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -176,9 +179,25 @@ def test_foreign_folders_are_refused_and_unchanged(
 
 def test_failure_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
-        raise OSError("No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(synthetic, "write_points_ply", full)
-    with pytest.raises(OutputError, match="No space left"):
+    with pytest.raises(OutputError, match=r"out: cannot be written \(No space left on device\); check the folder"):
         write_dataset(tmp_path / "out", SyntheticOptions(size=8, train=1, test=1), workers=1)
     assert not list(tmp_path.iterdir())
+
+
+def test_killed_call_leaves_no_workers_and_no_folder(tmp_path: Path) -> None:
+    """Its workers end with it, and the next call removes what it wrote."""
+    out = tmp_path / "s"
+    words = ["data", "synthetic", str(out), "--train", "40", "--size", "200"]
+    with subprocess.Popen([sys.executable, "-P", "-m", "clsplat", *words], stdout=subprocess.PIPE) as process:
+        while not list(tmp_path.glob(".s.*.partial/train/*.png")):
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.kill()
+        assert process.stdout is not None
+        process.stdout.read()  # until its workers, which share its output, have ended
+    assert len(list(tmp_path.iterdir())) == 1
+    write_dataset(out, TINY, workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
