@@ -62,12 +62,12 @@ FAMILIES = {  # by the name of the base; any other family gets a separate page
 }
 
 
-def below(base: type) -> Iterator[type]:
+def subclasses(base: type) -> Iterator[type]:
     """Yield all subclasses of a base in the package."""
     for kind in base.__subclasses__():
         if kind.__module__.startswith("clsplat."):
             yield kind
-            yield from below(kind)
+            yield from subclasses(kind)
 
 
 def tag(kind: Kind) -> str:
@@ -79,8 +79,8 @@ def tag(kind: Kind) -> str:
 @functools.cache
 def families() -> dict[Kind, list[Kind]]:
     """Return every base with the subclasses that a pipeline file can name."""
-    bases = [kind for kind in below(Settings) if Settings in kind.__bases__]
-    named = {base: sorted({kind for kind in below(base) if tag(kind)}, key=tag) for base in bases}
+    bases = [kind for kind in subclasses(Settings) if Settings in kind.__bases__]
+    named = {base: sorted({kind for kind in subclasses(base) if tag(kind)}, key=tag) for base in bases}
     return {base: kinds for base, kinds in named.items() if kinds}
 
 
@@ -95,12 +95,12 @@ def groups(base: Kind) -> list[Kind]:
     named = families()[base]
     return [
         base,
-        *(one for one in dict.fromkeys(below(base)) if not tag(one) and any(issubclass(k, one) for k in named)),
+        *(one for one in dict.fromkeys(subclasses(base)) if not tag(one) and any(issubclass(k, one) for k in named)),
     ]
 
 
 @functools.cache
-def unnamed() -> dict[Kind, str]:
+def unnamed_settings() -> dict[Kind, str]:
     """Return the settings without a name, each with the first key under which a pipeline file can hold it."""
     intermediate = {Curve, *(group for base in families() for group in groups(base))}
     found: dict[Kind, str] = {}
@@ -114,33 +114,39 @@ def unnamed() -> dict[Kind, str]:
         if kind not in intermediate and not tag(kind):
             found[kind] = key
         inner = [
-            (one, f"{key}.{name}".strip(".")) for name, field in kind.model_fields.items() for one in models(field)
+            (one, f"{key}.{name}".strip("."))
+            for name, field in kind.model_fields.items()
+            for one in settings_classes(field)
         ]
         waiting += [(one, name) for one, name in inner if one not in met]
         met |= {one for one, _ in inner}
     return found
 
 
-def models(field: FieldInfo) -> list[Kind]:
+def settings_classes(field: FieldInfo) -> list[Kind]:
     """Return the settings classes in the annotation of a field."""
-    return [part for part in parts(field) if isinstance(part, type) and issubclass(part, Settings)]
+    return [part for part in annotation_parts(field) if isinstance(part, type) and issubclass(part, Settings)]
 
 
-def parts(field: FieldInfo) -> list[Any]:
+def annotation_parts(field: FieldInfo) -> list[Any]:
     """Return all parts of the annotation of a field, with its metadata."""
 
-    def inside(annotation: Any) -> Iterator[Any]:
+    def nested(annotation: Any) -> Iterator[Any]:
         yield annotation
         for argument in typing.get_args(annotation):
-            yield from inside(argument)
+            yield from nested(argument)
 
-    found = [*inside(field.annotation), *field.metadata]
+    found = [*nested(field.annotation), *field.metadata]
     return [mark.func if isinstance(mark, AfterValidator) else mark for mark in found]
 
 
-def undescribed() -> list[str]:
+def undescribed_keys() -> list[str]:
     """Return the keys without a description, as Class.key."""
-    kinds = [*unnamed(), *NOTATIONS, *(kind for base, kinds in families().items() for kind in (*groups(base), *kinds))]
+    kinds = [
+        *unnamed_settings(),
+        *NOTATIONS,
+        *(kind for base, kinds in families().items() for kind in (*groups(base), *kinds)),
+    ]
     return [
         f"{kind.__name__}.{name}"
         for kind in kinds

@@ -50,17 +50,19 @@ def option_table(command: Any, name: str) -> str:
     records = [p.get_help_record(context) for p in command.params]
     escaped = "\\["  # brackets make no link
     rows = "".join(
-        f"| `{option(r[0])}` | {cell(r[1]).replace('[', escaped)} |\n" for r in records if r and r[0] != "--help"
+        f"| `{option_text(r[0])}` | {table_cell(r[1]).replace('[', escaped)} |\n"
+        for r in records
+        if r and r[0] != "--help"
     )
     return f"| option | meaning |\n|---|---|\n{rows}\n" if rows else ""
 
 
-def option(text: str) -> str:
+def option_text(text: str) -> str:
     """Return an option and its value, without names of Python types."""
     return re.sub(r" <(?:path|str|list\[\w+\])>", "", " ".join(text.split())).replace("|", "/")
 
 
-def cell(text: str) -> str:
+def table_cell(text: str) -> str:
     """Return text for a cell of a table."""
     return " ".join(text.split()).replace("|", "\\|")
 

@@ -4,9 +4,9 @@ import functools
 import math
 from typing import Any
 
-from families import NOTATIONS, Kind, families, family, groups, parts, tag, unnamed
+from families import NOTATIONS, Kind, annotation_parts, families, family, groups, tag, unnamed_settings
 from schedule_page import schedule_page
-from yaml_examples import example
+from yaml_examples import find_example
 
 from clsplat.core.schedule import Bounded
 from clsplat.core.settings import descriptions, variants
@@ -70,7 +70,7 @@ def group_section(group: Kind) -> str:
 
 def section(base: Kind, kind: Kind) -> str:
     """Return the docstring, the keys, and an example of a class that a pipeline file can name."""
-    sample, file = example(base, kind)
+    sample, file = find_example(base, kind)
     title = f' title="{file}"' if file else ""
     group = next(one for one in kind.__mro__ if one in groups(base))
     shared = f"It is a [{family(group).title}](#{group.__name__.lower()}).\n\n" if group is not base else ""
@@ -81,7 +81,7 @@ def section(base: Kind, kind: Kind) -> str:
 def settings_page() -> str:
     """Return the page about settings without a name."""
     text = "# Settings of a pipeline file\n\n"
-    for kind, key in unnamed().items():
+    for kind, key in unnamed_settings().items():
         title = f"`{key}`" if key else "The file"
         text += f"## {title} {{: #{kind.__name__.lower()} }}\n\n{manual(kind)}{key_table(kind)}"
     return text
@@ -104,9 +104,9 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
         if name in ("type", "stage") or (name in without and name not in kind.__annotations__):
             continue
         node = schema["properties"][name]
-        default = "required" if field.is_required() else shown(node.get("default"))
-        bound = next((part for part in parts(field) if isinstance(part, Bounded)), None)
-        takes = expected(node)
+        default = "required" if field.is_required() else default_text(node.get("default"))
+        bound = next((part for part in annotation_parts(field) if isinstance(part, Bounded)), None)
+        takes = accepted_values(node)
         if bound:
             limits = f"{'>' if bound.exclusive else '≥'} {bound.minimum:g}"
             limits += f" and ≤ {bound.maximum:g}" if math.isfinite(bound.maximum) else ""
@@ -119,7 +119,7 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
 BY_STEP = "[number or schedule](schedules.md)"
 
 
-def expected(node: Node) -> str:
+def accepted_values(node: Node) -> str:
     """Return in words what a key takes, from its JSON schema."""
     if "$ref" in node:
         return link(node["$ref"].rpartition("/")[2])
@@ -132,32 +132,34 @@ def expected(node: Node) -> str:
         return "one of " + ", ".join(f"`{value}`" for value in node["enum"])
     for union in ("anyOf", "oneOf", "allOf"):
         if union in node:
-            return either(node[union])
+            return union_values(node[union])
     if node.get("type") == "array":
-        return f"list of {expected(node['items'])}" if "items" in node else "list"
+        return f"list of {accepted_values(node['items'])}" if "items" in node else "list"
     if isinstance(node.get("additionalProperties"), dict):
-        return f"keys, each with a {expected(node['additionalProperties'])}"
-    bounds = " and ".join(f"{sign}{flow(node[key])}" for key, sign in BOUNDS.items() if key in node)
+        return f"keys, each with a {accepted_values(node['additionalProperties'])}"
+    bounds = " and ".join(f"{sign}{flow_yaml(node[key])}" for key, sign in BOUNDS.items() if key in node)
     return f"{WORDS.get(node.get('type', ''), node.get('type', 'any value'))} {bounds}".strip()
 
 
-def either(nodes: list[Node]) -> str:
+def union_values(nodes: list[Node]) -> str:
     """Return what a union takes: the members of a family become one link, and so do the notations of a schedule."""
     flat = [inner for node in nodes for inner in (node.get("anyOf") or [node])]
     names = [node.get("$ref", "").rpartition("/")[2] for node in flat]
     if {kind.__name__ for kind in NOTATIONS} <= set(names):
-        others = [expected(n) for n, name in zip(flat, names, strict=True) if n.get("type") not in ("number", "array")]
+        others = [
+            accepted_values(n) for n, name in zip(flat, names, strict=True) if n.get("type") not in ("number", "array")
+        ]
         return " or ".join([BY_STEP, *(text for text in others if "schedules.md" not in text)])
-    return " or ".join(dict.fromkeys(expected_of(one) for one in flat))
+    return " or ".join(dict.fromkeys(member_values(one) for one in flat))
 
 
-def expected_of(node: Node) -> str:
+def member_values(node: Node) -> str:
     """Return what one member of a union takes."""
     name = node.get("$ref", "").rpartition("/")[2]
     for base, kinds in families().items():
         if name in [kind.__name__ for kind in kinds]:
             return f"[{family(base).title}]({family(base).page}.md)"
-    return expected(node)
+    return accepted_values(node)
 
 
 def link(name: str) -> str:
@@ -168,21 +170,23 @@ def link(name: str) -> str:
                 return f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})"
     if name in [kind.__name__ for kind in NOTATIONS]:
         return f"[keys](schedules.md#{name.lower()})"
-    return f"[keys](settings.md#{name.lower()})" if name in [kind.__name__ for kind in unnamed()] else "any value"
+    return (
+        f"[keys](settings.md#{name.lower()})" if name in [kind.__name__ for kind in unnamed_settings()] else "any value"
+    )
 
 
-def shown(value: Any) -> str:
+def default_text(value: Any) -> str:
     """Return a default as a pipeline file writes it."""
-    text = flow(value)
+    text = flow_yaml(value)
     return "none" if value is None else f"`{text}`" if len(text) <= 40 else "its defaults"
 
 
-def flow(value: Any) -> str:
+def flow_yaml(value: Any) -> str:
     """Return a value on one line of YAML."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {flow(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {flow_yaml(inner)}" for key, inner in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(flow, value)) + "]"
+        return "[" + ", ".join(map(flow_yaml, value)) + "]"
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from families import NOTATIONS, Kind, families, family, models, tag, unnamed
+from families import NOTATIONS, Kind, families, family, settings_classes, tag, unnamed_settings
 
 from clsplat.core.schedule import Curve, Decay, Every, Points
 
@@ -32,17 +32,17 @@ def schedule_page(key_table: Callable[[Kind], str]) -> str:
         manual = " ".join((kind.__doc__ or "").split())
         text += f"## {TITLES[kind]} {{: #{kind.__name__.lower()} }}\n\n{manual}\n\n{key_table(kind)}"
         text += f"```yaml\n{SAMPLES[kind]}\n```\n\n"
-    return f"{text}## Keys that take a schedule\n\n{users()}"
+    return f"{text}## Keys that take a schedule\n\n{users_table()}"
 
 
-def users() -> str:
+def users_table() -> str:
     """Return a table of all keys that take a schedule."""
     named = [
         (f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})", kind) for base, ks in families().items() for kind in ks
     ]
-    others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed().items()]
+    others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed_settings().items()]
     rows = ""
     for title, kind in [*others, *named]:
-        keys = [f"`{name}`" for name, field in kind.model_fields.items() if Curve in models(field)]
+        keys = [f"`{name}`" for name, field in kind.model_fields.items() if Curve in settings_classes(field)]
         rows += f"| {title} | {', '.join(keys)} |\n" if keys else ""
     return f"| part of a pipeline | keys |\n|---|---|\n{rows}\n"

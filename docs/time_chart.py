@@ -18,7 +18,7 @@ from clsplat.viewer.charts import HEIGHT, WIDTH, Line, curve
 LONGEST = 130  # CPU seconds shown
 
 
-def line(run: Path) -> Line:
+def psnr_curve(run: Path) -> Line:
     """Return the test PSNR of a run over its CPU seconds."""
     records = Records(run).read()
     trained = [(0.0, 0.0), *((r["step"], r["cpu_seconds"]) for r in records if r["kind"] == "train")]
@@ -28,7 +28,7 @@ def line(run: Path) -> Line:
     return Line(points, read_settings(run)["name"])
 
 
-def drawing(charts: list[str]) -> str:
+def draw_charts(charts: list[str]) -> str:
     """Return charts in two columns as one SVG."""
     rows = -(-len(charts) // 2)
     places = ((WIDTH * (i % 2), HEIGHT * (i // 2)) for i in range(len(charts)))
@@ -43,8 +43,8 @@ def drawing(charts: list[str]) -> str:
 if __name__ == "__main__":
     scenes = (argument.partition("=") for argument in sys.argv[1:])
     print(
-        drawing([
-            curve(f"{name}: test PSNR over CPU seconds, dB", [line(Path(run)) for run in runs.split(",")])
+        draw_charts([
+            curve(f"{name}: test PSNR over CPU seconds, dB", [psnr_curve(Path(run)) for run in runs.split(",")])
             for name, _, runs in scenes
         ]),
         end="",

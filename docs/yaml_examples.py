@@ -14,7 +14,7 @@ MAX_EXAMPLE = 10  # lines
 MAX_WIDTH = 88  # characters that fit on a page without scrolling
 
 
-def example(base: Kind, kind: Kind) -> tuple[str, str]:
+def find_example(base: Kind, kind: Kind) -> tuple[str, str]:
     """Return an example, and the shipped file that has it, or "" if none does."""
     found = [
         (block(base, item), file)
@@ -66,11 +66,11 @@ def block(base: Kind, item: Node) -> str:
     key = "during" if "every" in fields else family(base).key
     one = item if fields.keys() - {"type"} else kind_of_item(item)
     data = {key: [one] if family(base).listed else one}
-    text = dumped(data, None if isinstance(data[key], list | dict) else False)
-    return text if max(map(len, text.splitlines())) <= MAX_WIDTH else dumped(data, False)
+    text = to_yaml(data, None if isinstance(data[key], list | dict) else False)
+    return text if max(map(len, text.splitlines())) <= MAX_WIDTH else to_yaml(data, False)
 
 
-def dumped(data: Node, flow_style: bool | None) -> str:
+def to_yaml(data: Node, flow_style: bool | None) -> str:
     """Return YAML; flow_style None: innermost collections on one line."""
     stream, yaml = io.StringIO(), YAML(typ="safe")
     yaml.default_flow_style, yaml.width = flow_style, 1000

@@ -29,12 +29,12 @@ from clsplat.training.modules.sky import SKY
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
 
-from families import families, tag, undescribed, unnamed  # noqa: E402
+from families import families, tag, undescribed_keys, unnamed_settings  # noqa: E402
 from other_pages import other_pages  # noqa: E402
 from python_pages import FOLDER  # noqa: E402
 from reference_pages import key_table, reference_pages  # noqa: E402
 from schedule_page import EXAMPLES, SAMPLES  # noqa: E402
-from yaml_examples import example, fields_of  # noqa: E402
+from yaml_examples import fields_of, find_example  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -72,7 +72,7 @@ def check_manual_and_example(pages, base, kind):
     assert kind.__doc__ not in (None, base.__doc__)
     page = next(text for text in pages if f"{{: #{tag(kind)} }}\n\n{kind.__doc__[:20]}" in text)
     assert all(f"| `{name}` |" in page for name in kind.model_fields if name not in ("type", "stage")), page
-    (value,) = YAML(typ="safe").load(example(base, kind)[0]).values()
+    (value,) = YAML(typ="safe").load(find_example(base, kind)[0]).values()
     item = value[0] if isinstance(value, list) else value
     if "type" in kind.model_fields and isinstance(item, str):
         item = {"type": item}
@@ -106,7 +106,7 @@ def test_key_table_has_schedules_and_their_bounds():
 
 
 def test_every_key_has_a_description():
-    assert undescribed() == []
+    assert undescribed_keys() == []
 
 
 def test_reference_lists_every_reader_and_schedule_notation():
@@ -258,7 +258,7 @@ def test_glossary_is_sorted():
 
 def test_names_in_the_glossary_exist(few_steps):
     """Keys, classes, tables, and checkpoint entries of the table "One concept, one name"."""
-    classes = [*unnamed(), *(kind for base, kinds in families().items() for kind in (base, *kinds))]
+    classes = [*unnamed_settings(), *(kind for base, kinds in families().items() for kind in (base, *kinds))]
     keys = {name for kind in classes for name in (tag(kind), *kind.model_fields)}
     by_name = {kind.__name__: kind for kind in [*classes, clsplat.Model, clsplat.Scene, clsplat.View]}
     tables = {*PARAMETERS, "filter_variance", *(tag(kind) for kind in families()[Statistic])}
