@@ -57,7 +57,7 @@ SHARED = 8  # times that a byte may be read on average, because equal columns ma
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 FLIP_4 = np.diag([*FLIP, 1.0])  # converts between the axes of glTF and of a PLY
 LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
-MAX_TYPE = 200  # characters of a data URI before its data
+MAX_NAME = 500  # characters of a file name, and of a data URI before its data
 MAX_TEXT = 1 << 29  # bytes of a .gltf
 
 
@@ -75,7 +75,7 @@ class Gltf:
         primitives = [
             (primitive, matrix) for mesh, matrix in self._meshes() for primitive in tree["meshes"][mesh]["primitives"]
         ]
-        self.primitives = [pair for pair in primitives if EXTENSION in (own := _extensions(pair[0])) or _spz_view(own)]
+        self.primitives = [pair for pair in primitives if _has_gaussians(pair[0])]
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
         placement = FLIP_4 @ self.primitives[0][1] @ FLIP_4
@@ -214,16 +214,15 @@ class Gltf:
 
     def _content(self, uri: Any, number: int) -> bytes:
         """Return the bytes of a buffer: of the GLB itself, of a data URI, or of a file in the same folder."""
-        if uri in self.files:
+        if uri in self.files and (uri or not number):
             return self.files[uri]
+        data = None
         if uri is None:
-            data = self.binary if number == 0 else None
+            data = None if number else self.binary
         elif uri.startswith("data:"):
-            data = base64.b64decode(uri.partition(",")[2]) if ";base64," in uri[:MAX_TYPE] else None
-        else:
-            data = None
-            if is_inside(name := unquote(uri)):
-                data = read_file(self.path.parent / name, f"a buffer of {self.path.name}", limit=MAX_FILE)
+            data = base64.b64decode(uri.partition(",")[2]) if ";base64," in uri[:MAX_NAME] else None
+        elif len(uri) < MAX_NAME and is_inside(name := unquote(uri)):
+            data = read_file(self.path.parent / name, f"a buffer of {self.path.name}", limit=MAX_FILE)
         if data is None:
             raise DataError(
                 f"{self.path}: buffer {number} is {quote(uri)}; expected data in the file, or a file in its folder; "
@@ -285,6 +284,11 @@ def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:
     return {**extensions, **extensions.get(EXTENSION, {}).get("extensions", {})}
 
 
+def _has_gaussians(primitive: dict[str, Any]) -> bool:
+    extensions = _extensions(primitive)
+    return EXTENSION in extensions or _spz_view(extensions) is not None
+
+
 def _spz_view(extensions: dict[str, Any]) -> Any:
     """Return the view that holds an SPZ file, as several drafts name it, or None."""
     return next((one["bufferView"] for name, one in extensions.items() if "spz" in name), None)
@@ -319,8 +323,8 @@ def looks_like_gltf(data: bytes) -> bool:
 def gltf_files(path: Path) -> list[Path]:
     """Return a .gltf and the existing files of its buffers; only itself if it is damaged."""
     try:
-        uris = [buffer["uri"] for buffer in read_json(path)["buffers"]]
-        return [path, *(path.parent / unquote(uri) for uri in uris if is_inside(uri) and not uri.startswith("data:"))]
+        uris = [unquote(buffer["uri"]) for buffer in read_json(path)["buffers"]]
+        return [path, *(path.parent / uri for uri in uris if is_inside(uri) and not uri.startswith("data:"))]
     except (DataError, KeyError, TypeError, AttributeError):
         return [path]
 
@@ -330,8 +334,8 @@ def read_gltf(path: Path) -> SplatFile:
     data = read_file(path, "a .glb or .gltf file", limit=MAX_FILE)
     is_text = not data.startswith(MAGIC) and (path.suffix.lower() == ".gltf" or data.lstrip()[:1] == b"{")
     text, binary = (data, None) if is_text else _chunks(path, data)
-    if is_text and len(data) > MAX_TEXT:
-        raise DataError(f"{path}: has {len(data)} bytes; expected at most {MAX_TEXT}; export it as .glb")
+    if len(text) > (most := MAX_TEXT if is_text else MAX_JSON):
+        raise DataError(f"{path}: its JSON has {len(text)} bytes; expected at most {most}; export fewer primitives")
     try:
         tree = json.loads(text)
         found = Gltf(path, tree, binary)
@@ -447,10 +451,6 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     text = chunks.get(JSON, b"")
     if not text:
         raise DataError(f"{path}: has no JSON chunk; copy or export it again")
-    if len(text) > MAX_JSON:
-        raise DataError(
-            f"{path}: its JSON has {len(text)} bytes; expected at most {MAX_JSON}; export it with fewer primitives"
-        )
     return text, chunks.get(BINARY, b"")
 
 

@@ -15,6 +15,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -139,8 +140,9 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
     require_size(path, len(data) + 1, size, f"{header.count} vertices")
     if header.count == 0:
         return np.empty(0, header.dtype)
+    lines = islice((line for line in body if not line.isspace()), header.count)
     try:
-        table = np.loadtxt(body, header.dtype, comments=None, max_rows=header.count, ndmin=1)
+        table = np.loadtxt(lines, header.dtype, comments=None, ndmin=1)
     except (ValueError, OverflowError) as error:
         raise DataError(
             f"{path}: {shorten(str(error), 200)} after the header; expected one number for each property"

@@ -88,7 +88,7 @@ MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-MOST = 0.5  # share of values outside of their range that shows another unit
+MOST = 0.5  # share of values outside of their range that shows another unit; mirrored axes have negative scales, too
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
@@ -272,21 +272,13 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     """Replace the logits of opacities 0 and 1, and the logarithms of scales 0, by finite numbers."""
     logit, log_scales = (splats.parameters[name] for name in ("logit_opacity", "log_scales"))
     infinite, flat = np.isinf(logit), np.isneginf(log_scales)
-    count = int((infinite.any(axis=1) | flat.any(axis=1)).sum())
-    if not count:
+    if not (count := int((infinite.any(axis=1) | flat.any(axis=1)).sum())):
         return splats
     if not options.quiet:
-        LOG.warning(
-            "%s: %s Gaussians have an opacity of 0 or 1, or a scale of 0, which have no finite logit or logarithm; "
-            "they are moved by %g",
-            path,
-            f"{count:,}",
-            MIN_ALPHA,
-        )
-    limits = {
-        "logit_opacity": np.where(infinite, logits((logit > 0).astype(np.float32)), logit),
-        "log_scales": np.where(flat, np.float32(FLAT_LOG_SCALE), log_scales),
-    }
+        fault = f"{count:,} Gaussians have an opacity of 0 or 1, or a scale of 0, without a finite logit or logarithm"
+        LOG.warning("%s: %s; they are moved by %g", path, fault, MIN_ALPHA)
+    ends, flat_scale = logits((logit > 0).astype(np.float32)), np.float32(FLAT_LOG_SCALE)
+    limits = {"logit_opacity": np.where(infinite, ends, logit), "log_scales": np.where(flat, flat_scale, log_scales)}
     return replace(splats, parameters={**splats.parameters, **limits})
 
 

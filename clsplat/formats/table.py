@@ -69,6 +69,7 @@ class Codec:
     keeps_origin: bool = False  # in another place than the numbers for rendering
     keeps_doubles: bool = False  # positions in float64
     has_quality: bool = False  # writing uses Writing.quality
+    has_mark: bool = True  # at the start of files
 
 
 # The files of a model.
@@ -181,6 +182,7 @@ CODECS = (
         lambda path, options: read_splat(path),
         write_splat,
         keeps_mode=False,
+        has_mark=False,
     ),
 )
 
@@ -191,10 +193,14 @@ def endings(reads: bool = False) -> list[str]:
 
 
 def detect(path: Path) -> Codec | None:
-    """Return the format of a file by its content, or None.  Raises DataError if the file cannot be read."""
+    """Return the format of a file by its content, or None; one without a mark only if the name is not of another.
+
+    Raises DataError if the file cannot be read.
+    """
     with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
-    return next((codec for codec in CODECS if codec.matches(start)), None)
+    named = format_of_name(path)
+    return next((c for c in CODECS if c.matches(start) and (c.has_mark or named in (None, c))), None)
 
 
 def format_of_name(path: Path) -> Codec | None:

@@ -140,6 +140,15 @@ def test_a_ksplat_without_a_count_of_sections_has_all_its_places(tmp_path):
     assert len(read(tmp_path / "a.ksplat")) == 0
 
 
+def test_a_splat_is_recognized_unless_the_name_is_of_another(tmp_path):
+    for name in ("a", "a.bin", "a.splat"):
+        (tmp_path / name).write_bytes(PUBLISHED * 40)
+        assert len(read(tmp_path / name)) == 40
+    (tmp_path / "a.ksplat").write_bytes(PUBLISHED * 200)
+    with pytest.raises(DataError, match=r"not a \.ksplat file"):
+        read(tmp_path / "a.ksplat")
+
+
 @pytest.mark.parametrize("fault", DAMAGED)
 def test_a_damaged_ksplat_is_refused(fault, tmp_path):
     change, words = DAMAGED[fault]
