@@ -1,4 +1,4 @@
-"""Run cells through a store, with an engine, and put their results into folders with their names."""
+"""Run cells through a store with an engine, and copy their results to folders with their names."""
 
 import logging
 import threading
@@ -37,7 +37,7 @@ from clsplat.training.status import StatusFile, read_status
 
 
 def copy_result(source: Path, target: Path) -> None:
-    """Copy a result to a folder, by links where nothing changes files in place; the manifest comes last.
+    """Copy a result to a folder, by hard links except for files that grow; the manifest comes last.
 
     Raises OutputError.
     """
@@ -49,7 +49,7 @@ def copy_result(source: Path, target: Path) -> None:
 
 
 def has_result(source: Path, target: Path) -> bool:
-    """Return whether a folder holds the files of a result, as `copy_result` leaves them.
+    """Return whether a folder holds the files of a result, as `copy_result` wrote them.
 
     Raises ConfigError if the run in it was continued with other settings.
     """
@@ -61,8 +61,8 @@ def has_result(source: Path, target: Path) -> bool:
             f"{target}: the run was continued with other settings after the sweep; move that folder away, "
             "and run the sweep again with --resume"
         )
-    here = RunState.read(target)
-    return here.phase is Phase.DONE and here.sums == read_sums(source) and not here.damaged
+    state = RunState.read(target)
+    return state.phase is Phase.DONE and state.sums == read_sums(source) and not state.damaged
 
 
 PROGRESS_INTERVAL_S = 2.0  # between two reads of the cells' status files
@@ -73,12 +73,12 @@ LOG = logging.getLogger("clsplat")
 
 @dataclass
 class Batch:
-    """Cells that are run together, and their progress."""
+    """Runs cells together, and reports their progress."""
 
     name: str
     text: str  # distinguishes batches with the same name
     cells: Sequence[matrix.Cell]
-    out: Path  # of the folders of results
+    out: Path  # parent of the folders of results
     store: Store
     failures: Failures
     overwrites: bool = False  # whether the contents of those folders are replaced
@@ -88,8 +88,8 @@ class Batch:
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def __post_init__(self) -> None:
-        self._steps = {cell.name: steps_of(cell.pipeline) for cell in self.cells}
-        self._count, self._looked = Count("steps", sum(self._steps.values())), time.monotonic()
+        self._steps = {cell.name: count_steps(cell.pipeline) for cell in self.cells}
+        self._count, self._last_report = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
         """Called once, before the first cell starts."""
@@ -98,30 +98,32 @@ class Batch:
         """Called when a cell has started, with its name, or has ended, with None."""
 
     def require_held(self) -> None:
-        """Raise OutputError if the folder now belongs to another process."""
+        """Raise OutputError if the folder belongs to another process by now."""
 
     def run(self, execution: Execution, device: str | None) -> None:
         """Run every cell whose result is not in the store; `failures` collects the failed ones.
 
         device: for the engine inline.  Raises Interrupted, BitsMismatch.
         """
-        driving = threading.Event()
-        with stopping_on_signals(lambda: ask_to_stop(self._stop, driving)), terminal.counts_on_terminal():
-            wanted = self._pending_cells()
-            if not wanted:
+        has_started = threading.Event()
+        with stopping_on_signals(lambda: ask_to_stop(self._stop, has_started)), terminal.counts_on_terminal():
+            pending = self._pending_cells()
+            if not pending:
                 self.ready()
                 return
             with _engine(execution, self.store, device, self._is_stopped) as engine:
                 options = CellOptions(self.store.now(), execution.retries)
-                drive = Dispatcher(self.store, engine, execution.placement.bits == "same", options, self._stop.is_set)
-                driving.set()
-                self._go(drive, wanted)
+                dispatcher = Dispatcher(
+                    self.store, engine, execution.placement.bits == "same", options, self._stop.is_set
+                )
+                has_started.set()
+                self._dispatch(dispatcher, pending)
 
-    def _look(self) -> None:
-        """Report the progress of running cells from their files, if it is time to."""
-        if time.monotonic() - self._looked < PROGRESS_INTERVAL_S:
+    def _report_progress(self) -> None:
+        """Report the progress of running cells from their files, at most once per interval."""
+        if time.monotonic() - self._last_report < PROGRESS_INTERVAL_S:
             return
-        self._looked = time.monotonic()
+        self._last_report = time.monotonic()
         done, progress = sum(self._steps[name] for name in self.outcomes), []
         for name, cell in self.running.items():
             newest = max(self.store.folder(cell.key).attempts(), key=lambda attempt: attempt.last_beat, default=None)
@@ -134,12 +136,12 @@ class Batch:
         self._count.reach(min(done, self._count.total))
 
     def _is_stopped(self) -> bool:
-        """Return whether a signal arrived; the engine inline calls this regularly, so it also reports progress."""
-        self._look()
+        """Return whether a signal has arrived, and report progress, as the engine inline calls this regularly."""
+        self._report_progress()
         return self._stop.is_set()
 
     def _pending_cells(self) -> list[PendingCell]:
-        """Return the cells without an outcome whose scenes can be read; the others fail."""
+        """Return the cells without an outcome; cells whose scenes cannot be read are recorded as failures."""
         scenes, pending = Scenes(self.store.prepared), []
         for cell in self.cells:
             if cell.name in self.outcomes:
@@ -148,22 +150,22 @@ class Batch:
                 pending.append(pending_cell(cell, scenes, self.store))
         return pending
 
-    def _go(self, drive: Dispatcher, wanted: Sequence[PendingCell]) -> None:
-        drive.ended, drive.look = self._ended, self._look
+    def _dispatch(self, dispatcher: Dispatcher, pending: Sequence[PendingCell]) -> None:
+        dispatcher.on_end, dispatcher.poll = self._note_end, self._report_progress
 
-        def began(cell: CellRun) -> None:
-            if drive.is_same and not self._keys:  # so that `clsplat status` shows waiting cells
-                for one in wanted:
-                    self._keys[one.cell.name] = one.on(cell.spec["bits"]).key
+        def note_start(cell: CellRun) -> None:
+            if dispatcher.is_same and not self._keys:  # so that `clsplat status` shows waiting cells
+                for waiting in pending:
+                    self._keys[waiting.cell.name] = waiting.in_class(cell.spec["bits"]).key
                     with suppress(ClsplatError):  # reported when that cell runs
-                        self.store.add(one.on(cell.spec["bits"]))
-            self._began(cell)
+                        self.store.add(waiting.in_class(cell.spec["bits"]))
+            self._note_start(cell)
 
-        drive.began = began
+        dispatcher.on_start = note_start
         self.ready()
-        drive.run(wanted)
+        dispatcher.run(pending)
 
-    def _began(self, cell: CellRun) -> None:
+    def _note_start(self, cell: CellRun) -> None:
         if self._keys.get(cell.name) != cell.key or not self.running:
             self._keys[cell.name] = cell.key
             self.store.note_sweep(self.name, self._keys, self.text)
@@ -172,7 +174,7 @@ class Batch:
         number = len(self.outcomes) + len(self.running)
         LOG.info("cell %d of %d: %s", number, len(self.cells), cell.name)
 
-    def _ended(self, cell: CellRun, outcome: Outcome) -> None:
+    def _note_end(self, cell: CellRun, outcome: Outcome) -> None:
         self.running.pop(cell.name, None)
         if outcome.state == "stopped" and self._stop.is_set():
             return
@@ -186,7 +188,7 @@ class Batch:
         self.on_change(None)
 
     def _copy(self, cell: CellRun) -> None:
-        """Copy a result to the folder with its name, unless it is there."""
+        """Copy a result to the folder with the cell's name, unless it is there already."""
         result, target = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.recording(cell.name):
             if self.overwrites or not has_result(result, target):
@@ -194,9 +196,9 @@ class Batch:
                 copy_result(result, target)
 
 
-def ask_to_stop(stop: threading.Event, driving: threading.Event) -> None:
-    """Let running cells save their state and stop; before any runs, and at the second signal, stop at once."""
-    if stop.is_set() or not driving.is_set():
+def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
+    """Let running cells save their state and stop; before any has started, and at the second signal, stop at once."""
+    if stop.is_set() or not has_started.is_set():
         stop_at_once()
     stop.set()
 
@@ -220,21 +222,21 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
 def pending_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
     """Return the cell of a matrix, after running its `prepare` steps.
 
-    Raises ConfigError, DataError and the errors of the steps.
+    Raises ConfigError, DataError, and the errors of the steps.
     """
     if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
         prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
-    known = scenes.known(cell.pipeline)
-    without_class = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
-    return PendingCell(without_class, steps_of(cell.pipeline) * known.pixels)
+    facts = scenes.facts(cell.pipeline)
+    without_class = CellRun.from_pipeline(cell.name, cell.pipeline, facts.digest, bits="")
+    return PendingCell(without_class, count_steps(cell.pipeline) * facts.pixels)
 
 
-def steps_of(pipeline: Pipeline) -> int:
-    """Return the steps of all trainings of a pipeline."""
+def count_steps(pipeline: Pipeline) -> int:
+    """Return the number of steps of all trainings of a pipeline."""
     return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Training))
 
 
-# A single cell, for `sbatch --array` and other queues.
+# A single cell, for `sbatch --array` and other job queues.
 
 
 def run_one(
@@ -253,21 +255,21 @@ def run_one(
     if experiment is None:
         if index:
             raise ConfigError(f"{pipeline}: is a single pipeline without cell {index}; remove --index")
-        checked = load(pipeline, list(overrides))
-        cells = [MatrixCell(checked.settings.name, checked)]
-        experiment = Experiment(checked.path, checked.settings.name, "", cells)
+        loaded = load(pipeline, list(overrides))
+        cells = [MatrixCell(loaded.settings.name, loaded)]
+        experiment = Experiment(loaded.path, loaded.settings.name, "", cells)
     elif index is None or not 0 <= index < len(experiment.cells):
         last = len(experiment.cells) - 1
         raise ConfigError(f"{pipeline}: is a matrix; give the number of a cell, --index 0 to {last}")
-    chosen = experiment.cells[index or 0]
-    store, stop, driving = Store(root), threading.Event(), threading.Event()
-    with stopping_on_signals(lambda: ask_to_stop(stop, driving)):
+    matrix_cell = experiment.cells[index or 0]
+    store, stop, has_started = Store(root), threading.Event(), threading.Event()
+    with stopping_on_signals(lambda: ask_to_stop(stop, has_started)):
         options = CellOptions(store.now(), retries, "cell")
-        wanted = pending_cell(chosen, Scenes(store.prepared), store)
+        pending = pending_cell(matrix_cell, Scenes(store.prepared), store)
         (slot,) = find_slots("cell", [device or ""])
-        cell = wanted.on(slot.bits)
+        cell = pending.in_class(slot.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)
-        driving.set()
+        has_started.set()
         outcome = run_cell(cell, store, run_command(slot.device, plugin_files()), options, stop.is_set)
     if outcome.state == "stopped":
         raise Interrupted(f"cell {cell.name}: {outcome.message}; continue with the same command")
@@ -300,7 +302,7 @@ def run_sweep(
         )
         sweep.status = status
         for cell in experiment.cells if start == "resume" else ():
-            if RunState.read(state.out / cell.name).is_complete(cell.pipeline):  # wherever it ran
+            if RunState.read(state.out / cell.name).is_complete(cell.pipeline):  # here or elsewhere
                 sweep.outcomes[cell.name] = Outcome("published")
         sweep.run(execution, device)
 

@@ -1,4 +1,4 @@
-"""Identify cells, the runs of a sweep, by the content of everything that determines their bits, not by paths."""
+"""Identify cells, the runs of a sweep, by a hash of everything that determines their bits."""
 
 import hashlib
 import json
@@ -33,10 +33,10 @@ LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "d
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Facts of a scene before any run."""
+    """A fingerprint of a scene, and its size."""
 
     digest: str
-    pixels: float  # of all training images, for the order of cells
+    pixels: float  # of all training images; determines the order of cells
 
 
 @cache
@@ -59,7 +59,7 @@ def _versions(*names: str) -> Iterator[str]:
 
 
 def _builtin_zstd() -> str:
-    """Return the version of Python's own Zstandard, which exists since 3.14."""
+    """Return the version of Python's built-in Zstandard (3.14 and later), or an empty string."""
     with suppress(ImportError):
         from compression import zstd
 
@@ -72,7 +72,7 @@ def _digest(parts: Iterable[str]) -> str:
 
 
 def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
-    """Read a scene, and hash its files with a function; photos are not decoded.  Raises DataError."""
+    """Read a scene, and hash its files with `digest_of`; photos are not decoded.  Raises DataError."""
     scene, _ = settings.applied(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
     files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
@@ -83,23 +83,23 @@ class Scenes:
     """Fingerprints of scenes; each file is hashed once."""
 
     def __init__(self, prepared: Path) -> None:
-        """prepared: the folder of the output of `prepare`."""
+        """prepared: the folder with the output of `prepare`."""
         self._prepared = prepared
-        self._known: dict[str, SceneFacts] = {}
+        self._cache: dict[str, SceneFacts] = {}
         self._digest_of = cache(_digest_of)
 
-    def known(self, pipeline: Pipeline) -> SceneFacts:
+    def facts(self, pipeline: Pipeline) -> SceneFacts:
         """Return the facts of a pipeline's scene.
 
         The digest is the one that a run writes to inputs.json, or to prepared.json if `prepare` makes the scene.
-        Raises DataError if the scene cannot be read, and ConfigError if the pipeline has none.
+        Raises DataError if the scene cannot be read, and ConfigError if the pipeline has no scene.
         """
         settings = pipeline.settings
         steps = [step.model_dump(mode="json") for step in settings.prepare]
         key = json.dumps([settings.scene.model_dump(mode="json"), steps])
-        if key not in self._known:
-            self._known[key] = self._read(pipeline)
-        return self._known[key]
+        if key not in self._cache:
+            self._cache[key] = self._read(pipeline)
+        return self._cache[key]
 
     def _read(self, pipeline: Pipeline) -> SceneFacts:
         settings = pipeline.settings.scene
@@ -120,42 +120,42 @@ KEY = 20  # hexadecimal digits of the hash that names a cell
 
 
 def is_key(value: Any) -> bool:
-    """Return whether a value, such as one in a store of somebody else, can name the folder of a cell."""
+    """Return whether a value, such as one in an untrusted store, can name the folder of a cell."""
     return isinstance(value, str) and re.fullmatch(f"[0-9a-f]{{{KEY}}}", value) is not None
 
 
 @dataclass(frozen=True)
 class CellRun:
-    """A run, and the pipeline file that runs it on this machine."""
+    """A run of a sweep, with the text of its pipeline file on this machine."""
 
     name: str  # in its sweep
-    spec: dict[str, Any]  # the values that the key is a hash of: pipeline, scene, code, bits
+    spec: dict[str, Any]  # the hashed values of the key: pipeline, scene, code, bits
     text: str  # the resolved pipeline, with absolute paths
     files: dict[str, str] = field(default_factory=dict)  # hashes of the input files of the pipeline, by path
 
     @classmethod
-    def of(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "CellRun":
+    def from_pipeline(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "CellRun":
         """Return the cell of a pipeline.  scene: the fingerprint of its scene; bits: the bits class of its device.
 
         Raises DataError if an input file of the pipeline cannot be read.
         """
-        placed = with_absolute_paths(pipeline)
-        spec = {"pipeline": with_content_hashes(placed), "scene": scene, "code": code_digest(), "bits": bits}
+        absolute = with_absolute_paths(pipeline)
+        spec = {"pipeline": with_content_hashes(absolute), "scene": scene, "code": code_digest(), "bits": bits}
         if pipeline.settings.prepare:
             spec["tools"] = tools_digest()
-        return cls(name, spec, placed.text(), contents(placed))
+        return cls(name, spec, absolute.text(), contents(absolute))
 
     @classmethod
     def from_json(cls, text: str) -> "CellRun":
-        """Return the cell from the text that `json` returned."""
+        """Return the cell from the text returned by `json`."""
         return cls(**json.loads(text))
 
     def json(self) -> str:
-        """Return the cell as text, for another process."""
+        """Return the cell as JSON, for another process."""
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError if an input file differs on this machine from the one that the key was made from."""
+        """Raise DataError if an input file on this machine differs from the file hashed for the key."""
         for path, digest in self.files.items():
             if content_of(Path(path)) != digest:
                 raise DataError(
@@ -165,5 +165,5 @@ class CellRun:
 
     @property
     def key(self) -> str:
-        """Name of the cell's folder in a store."""
+        """The name of the cell's folder in a store."""
         return hashlib.sha256(json.dumps(self.spec, sort_keys=True).encode()).hexdigest()[:KEY]

@@ -22,18 +22,31 @@ PROCESS_GROUP: dict[str, Any] = (
 )
 POLL = 0.25  # seconds between two checks of a process
 STOP_TIMEOUT_S = 90.0  # for the last step and its checkpoint, before the process is killed
-Command = Sequence[str]  # words; these are filled in where the command runs
+Command = Sequence[str]  # words; the placeholders are filled in on the machine that runs it
 PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
 
 
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
-    """Return the command of a run on a device, which ends when its standard input closes.
+    """Return the command of a run on a device; the run ends when its standard input closes.
 
     -P keeps the working folder off the import path.
     """
-    loaded = [word for path in plugins for word in ("--plugin", str(path))]
-    chosen = ["--device", device] if device else []
-    return [PYTHON, "-P", "-m", "clsplat", "--attended", *loaded, "run", FILE, "--out", OUT, "--resume", *chosen]
+    plugin_options = [word for path in plugins for word in ("--plugin", str(path))]
+    device_options = ["--device", device] if device else []
+    return [
+        PYTHON,
+        "-P",
+        "-m",
+        "clsplat",
+        "--attended",
+        *plugin_options,
+        "run",
+        FILE,
+        "--out",
+        OUT,
+        "--resume",
+        *device_options,
+    ]
 
 
 def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
@@ -42,10 +55,10 @@ def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
     return [values.get(word, word) for word in command]
 
 
-def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], own: Cores = ()) -> int:
+def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], cores: Cores = ()) -> int:
     """Run an attempt to its end; return its exit code, or the negative number of the signal that ended it.
 
-    If `is_stopped`, the run saves its state and ends.  own: cores to pin it to; none: those of this process.
+    If `is_stopped`, the run saves its state and ends.  cores: to pin it to; empty: the cores of this process.
     Raises LeaseLost.
     """
     with raising_output_error(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
@@ -54,11 +67,11 @@ def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], b
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            env=machine.limited_environment(own) if own else None,
+            env=machine.limited_environment(cores) if cores else None,
             **PROCESS_GROUP,
         )
-        if own:
-            machine.pin_to_cores(own, process.pid)  # before it has started a runtime
+        if cores:
+            machine.pin_to_cores(cores, process.pid)  # before it starts a runtime
     try:
         code = _wait(process, attempt, is_stopped)
     finally:
@@ -72,21 +85,21 @@ def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], b
 
 
 def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: Callable[[], bool]) -> int:
-    asked: float | None = None  # when the run was asked to stop
+    stop_time: float | None = None  # when the run was asked to stop
     while True:
         try:
             return process.wait(POLL)
         except subprocess.TimeoutExpired:
             pass
         attempt.beat()
-        if asked is None and is_stopped():
-            asked = time.monotonic()
+        if stop_time is None and is_stopped():
+            stop_time = time.monotonic()
             if process.stdin:
-                process.stdin.close()  # the run finishes its step, saves and ends
-        elif asked is not None and time.monotonic() - asked > STOP_TIMEOUT_S:
+                process.stdin.close()  # the run finishes its step, saves its state, and ends
+        elif stop_time is not None and time.monotonic() - stop_time > STOP_TIMEOUT_S:
             process.kill()
 
 
 def plugin_files() -> list[Path]:
-    """Return the plug-in files that child processes have to load; installed plug-ins are found by themselves."""
+    """Return the plug-in files that child processes have to load; installed plug-ins load automatically."""
     return [plugin.path for plugin in plugins.loaded() if not plugin.installed]

@@ -1,7 +1,7 @@
 """Run cells with Dask: on a cluster of this machine, or through a scheduler elsewhere.
 
-Dask provides membership, liveness and a queue.  The store provides the rest: continuing a cell, counting it once,
-stopping it.  At most one cell per device is in flight, since a worker that dies loses all cells in its queue.
+Dask provides membership, liveness, and a queue.  The store lets cells resume, counts each once, and stops them.  At
+most one cell per device is in flight, because a worker that dies loses all cells in its queue.
 """
 
 import asyncio
@@ -44,9 +44,9 @@ LOOPBACK = "127.0.0.1"
 SIDES = ("client", "worker", "scheduler")
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
-    "distributed.scheduler.worker-ttl": "60s",  # a frozen worker is given up, and its cell continues elsewhere
+    "distributed.scheduler.worker-ttl": "60s",  # then a frozen worker is dropped, and its cell continues elsewhere
     "distributed.worker.preload": ["clsplat.sweeps.preload"],
-    "distributed.worker.memory.target": False,  # the run is a child process, which these limits do not see
+    "distributed.worker.memory.target": False,  # these limits do not apply to the child process that runs the cell
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
@@ -55,7 +55,7 @@ SETTINGS = {
 
 
 def require_certificates(tls: Tls) -> None:
-    """Raise ConfigError if a file cannot be read, or key and certificate do not match.  Dask would name no file."""
+    """Raise ConfigError if a file cannot be read, or key and certificate do not match; Dask would not name the file."""
     for key in ("ca", "cert", "key"):
         try:
             read_file(Path(getattr(tls, key)))
@@ -67,7 +67,7 @@ def require_certificates(tls: Tls) -> None:
     except ssl.SSLError as error:
         raise ConfigError(f"tls.ca (--tls-ca): {tls.ca}: expected a certificate in PEM ({error.reason})") from error
     try:
-        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # otherwise it asks in the terminal
+        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # without this, it asks in the terminal
     except (ssl.SSLError, ValueError) as error:
         reason = getattr(error, "reason", None) or error
         raise ConfigError(
@@ -86,13 +86,13 @@ def security(tls: Tls | None) -> Any:
 
 
 def warn_of_open_port(execution: Execution) -> None:
-    """Warn if a scheduler elsewhere is used without TLS."""
+    """Warn if a remote scheduler is used without TLS."""
     if execution.insecure:
         LOG.warning("%s: not encrypted; anyone who can reach the scheduler's port can run code", execution.engine)
 
 
 def scheduler_error(execution: Execution, error: BaseException) -> DeviceError:
-    """Return the error for a scheduler that cannot be reached."""
+    """Return the error for an unreachable scheduler."""
     reason = one_line(error.__cause__ or error) or "no answer"
     remedy = "start it with `dask scheduler`"
     if execution.tls:
@@ -102,7 +102,7 @@ def scheduler_error(execution: Execution, error: BaseException) -> DeviceError:
 
 LOG = logging.getLogger("clsplat")
 WORKERS_INTERVAL_S = 5.0  # between two checks of the workers
-CONNECT_TIMEOUT_S = 20.0  # of a scheduler
+CONNECT_TIMEOUT_S = 20.0  # for connecting to a scheduler
 
 
 def work(cell: str, store: str, command: list[str], options: str) -> str:
@@ -173,41 +173,41 @@ class Cluster:
     def __init__(
         self, client: Any, store: Store, cluster: Any = None, local_slots: list[DeviceSlot] | None = None
     ) -> None:
-        """cluster: starts and restarts workers on this machine.  local_slots: its devices; any worker can use any.
+        """cluster: starts and restarts local workers.  local_slots: their devices; any worker can use any device.
 
-        With a scheduler elsewhere both are None, and each worker has its own device.
+        With a remote scheduler both are None, and each worker has a device.
         """
         self._client, self._store, self._cluster, self._local_slots = client, store, cluster, local_slots
         self._sweep = uuid.uuid4().hex
-        self._looked, self._seen = -WORKERS_INTERVAL_S, time.monotonic()
+        self._last_check, self._last_worker = -WORKERS_INTERVAL_S, time.monotonic()
         self._slots: list[DeviceSlot] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
-        self.settings = ExitStack()  # of Dask, which end with the cluster
-        self.command_of = lambda device: run_command(device, plugin_files())
+        self.settings = ExitStack()  # of Dask, restored when the cluster closes
+        self.make_command = lambda device: run_command(device, plugin_files())
 
     def slots(self) -> list[DeviceSlot]:
         """Return the devices with a live worker.
 
-        Raises DeviceError if the scheduler ended, or there was no worker of this version for a minute.
+        Raises DeviceError if the scheduler has ended, or there was no worker of this version for a minute.
         """
         now = time.monotonic()
-        if now - self._looked >= WORKERS_INTERVAL_S or (not self._slots and now - self._looked >= 0.5):
-            self._looked = now
-            self._look(now)
+        if now - self._last_check >= WORKERS_INTERVAL_S or (not self._slots and now - self._last_check >= 0.5):
+            self._last_check = now
+            self._update_slots(now)
         return self._slots
 
-    def _look(self, now: float) -> None:
+    def _update_slots(self, now: float) -> None:
         with self._requires_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
         if self._cluster and len(workers) < (count := len(self._local_slots or ())):
             self._cluster.scale(count)  # Dask does not restart a worker that dies while it starts
-        known = [slot for address, worker in workers.items() if (slot := slot_from_worker(address, worker))]
-        self._slots = known if self._local_slots is None else self._local_slots if workers else []
+        remote = [slot for address, worker in workers.items() if (slot := slot_from_worker(address, worker))]
+        self._slots = remote if self._local_slots is None else self._local_slots if workers else []
         if self._slots:
-            self._seen = now
-        elif now - self._seen > NO_DEVICE_TIMEOUT_S:
+            self._last_worker = now
+        elif now - self._last_worker > NO_DEVICE_TIMEOUT_S:
             others = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
                 f"no worker of this version for {NO_DEVICE_TIMEOUT_S:.0f} s{others}; start some with "
@@ -216,7 +216,7 @@ class Cluster:
 
     @contextmanager
     def _requires_scheduler(self) -> Iterator[None]:
-        """Raise DeviceError if the block fails because the scheduler ended."""
+        """Raise DeviceError if the block fails because the scheduler has ended."""
         try:
             yield
         except Exception as error:  # its type depends on when the scheduler ended
@@ -225,15 +225,15 @@ class Cluster:
             raise
 
     def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
-        own_options = replace(options, worker=slot.worker, sweep=self._sweep, cores=slot.cores)
+        slot_options = replace(options, worker=slot.worker, sweep=self._sweep, cores=slot.cores)
         address = slot.worker if self._local_slots is None else None
         with self._requires_scheduler():
             future = self._client.submit(
                 work,
                 cell.json(),
                 str(self._store.root),
-                list(self.command_of(slot.device)),
-                json.dumps(asdict(own_options)),
+                list(self.make_command(slot.device)),
+                json.dumps(asdict(slot_options)),
                 key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
                 workers=[address] if address else None,
                 pure=False,
@@ -243,7 +243,7 @@ class Cluster:
         return ticket
 
     def close(self) -> None:
-        """Let running cells save their state and end, then end the workers of this machine."""
+        """Let running cells save their state and end, then close the local workers."""
         if self._pending:
             self._store.stop(self._sweep)
         end = time.monotonic() + STOP_TIMEOUT_S
@@ -261,14 +261,14 @@ class Cluster:
         return [ticket for ticket in self._tickets if not ticket.is_over and ticket.future.status == "pending"]
 
 
-# Worker processes of this machine, one per device, for a scheduler elsewhere.
+# Worker processes of this machine, one per device, for a remote scheduler.
 
 
 def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
-    """Test each device by a short run, and work for a scheduler until it ends or a signal arrives (`clsplat worker`).
+    """Test each device with a short run, and work for a scheduler until it ends or a signal arrives (`clsplat worker`).
 
-    execution: its engine is the scheduler.  devices: names; default: all devices that work.  Raises DeviceError if
-    there is no device, or the scheduler does not answer.
+    execution: the engine names the scheduler.  devices: names; default: all working devices.  Raises DeviceError if
+    there is no device, or the scheduler does not respond.
     """
     if execution.tls:
         require_certificates(execution.tls)  # before the devices are tested, which takes a while
@@ -284,7 +284,7 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
 
 
 def _constant_metric(text: str, worker: object) -> str:
-    """Return a worker's description of its device, as one of its metrics."""
+    """Return the description of a worker's device, as a Dask metric."""
     return text
 
 

@@ -1,7 +1,7 @@
 """Find devices and their bits classes: a class is the hash of the result of a fixed run.
 
-Names of devices do not serve: different runtimes may give the same bits, and the same runtime other bits on another
-processor.  Devices of one class can continue each other's cells.
+Names of devices are not enough: different runtimes may give the same bits, and one runtime may give other bits on
+another processor.  Devices of one class can continue each other's cells.
 """
 
 import json
@@ -28,13 +28,13 @@ from clsplat.sweeps.cell import code_digest
 from clsplat.sweeps.child import fill_command, run_command
 
 LOG = logging.getLogger("clsplat")
-Parts = list[tuple[int, ...]]  # the cores of each run; (): all cores, without pinning
+Parts = list[tuple[int, ...]]  # the cores of each run; (): all cores, not pinned
 
 
 def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
     """Return the cores of the runs of each device: `packing` runs on a CPU, one on other devices.
 
-    Raises ConfigError for more runs than cores.
+    Raises ConfigError if there are more runs than cores.
     """
     cores = machine.usable_cores()
     if packing > len(cores):
@@ -47,9 +47,9 @@ def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Part
 
 METRIC_KEY = "clsplat"  # of the Dask metric in which a worker describes its device
 CLASS_DIGITS = 8  # hexadecimal digits of a bits class
-RUN_TIMEOUT_S = 600.0  # of the fixed run: some runtimes build kernels for minutes
+RUN_TIMEOUT_S = 600.0  # for the fixed run; some runtimes take minutes to build kernels
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
-PIPELINE = "smoke"  # it grows and resets opacity; the settings add all SH bands and both filters
+PIPELINE = "smoke"  # has growth and opacity resets; the settings add all SH bands and both filters
 SETTINGS = (
     "model.sh_degree=3",
     "model.world_filter={type: smoothing, variance: 0.2}",
@@ -61,16 +61,16 @@ SETTINGS = (
 class DeviceSlot:
     """A device, or a part of a CPU, that runs one cell at a time."""
 
-    worker: str  # that offers it
-    device: str  # as `--device` takes it
-    bits: str  # its class
+    worker: str  # name or address of its worker
+    device: str  # a value for `--device`
+    bits: str  # bits class
     text: str = ""  # description
-    cores: tuple[int, ...] = ()  # of a CPU that several runs share; (): all
+    cores: tuple[int, ...] = ()  # if several runs share a CPU; (): all cores
     memory: int = sys.maxsize  # available to a run, bytes
 
 
 def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
-    """Return the device that a worker describes, or None for a worker of another program or version."""
+    """Return the device that a Dask worker describes, or None for a worker of another program or version."""
     try:
         values = json.loads(str(worker["metrics"][METRIC_KEY]))
         if values["code"] != code_digest():
@@ -82,61 +82,63 @@ def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
 
 
 def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
-    """Return the working devices of this machine, or those of a list of names, with their bits classes.
+    """Return slots for the working devices of this machine, or for named devices, with their bits classes.
 
-    packing: runs that share a CPU, each with its own slot.
-    Raises DeviceError if no device works, or one in the list does not, and ConfigError for more runs than cores.
+    packing: number of runs that share a CPU; each gets a slot.
+    Raises DeviceError if no device works, or a named one does not, and ConfigError for more runs than cores.
     """
     infos = list_devices()
-    chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
+    chosen = [choose(name) for name in devices] if devices is not None else [info for info in infos if not info.fault()]
     if not chosen:
         raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []
     for info, parts in zip(chosen, split_device_cores(chosen, packing), strict=True):
         bits, memory = bits_class(info, infos), info.memory // len(parts)
-        slot = DeviceSlot(worker, device_words(info, infos), bits, info.text, memory=memory)
+        slot = DeviceSlot(worker, device_query(info, infos), bits, info.text, memory=memory)
         slots += [replace(slot, cores=part) for part in parts]
     return slots
 
 
-def device_words(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the words that identify a device for `--device`."""
+def device_query(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return a value for `--device` that matches only this device."""
     words = f"{info.platform} {info.name} {info.kind}"
-    same = [one.index for one in infos if one.matches(words)]
-    return f"{words}:{same.index(info.index)}"
+    matches = [other.index for other in infos if other.matches(words)]
+    return f"{words}:{matches.index(info.index)}"
 
 
 def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the bits class of a device; the fixed run is done once per device, driver and program version.
+    """Return the bits class of a device; the result is cached by device, driver, and program version.
 
     Raises DeviceError if the run fails.
     """
     key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
-    note = cache_folder() / "bits" / f"{key[:16]}.json"
+    cache_file = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
-        values = read_json(note)
+        values = read_json(cache_file)
         if isinstance(values, dict) and isinstance(values.get("bits"), str):
             return str(values["bits"])
-    LOG.info("%s: running a short test that shows which devices give the same bits", info.text)
-    bits = _run(device_words(info, infos))
+    LOG.info("%s: running a short test to find devices that give the same bits", info.text)
+    bits = _hash_fixed_run(device_query(info, infos))
     with suppress(OutputError):
-        write_text(note, json.dumps({"bits": bits, "device": info.text}) + "\n")
+        write_text(cache_file, json.dumps({"bits": bits, "device": info.text}) + "\n")
     return bits
 
 
-def _run(device: str) -> str:
+def _hash_fixed_run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
         folder = Path(name)
         scene = str(folder / "scene")
-        _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
+        _run_command(
+            device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder
+        )
         words = fill_command(run_command(device), shipped()[PIPELINE], folder / "run")
-        _call(
+        _run_command(
             device, [*words, "--scene", scene, *(word for setting in SETTINGS for word in ("--set", setting))], folder
         )
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS_DIGITS]
 
 
-def _call(device: str, command: list[str], folder: Path) -> None:
+def _run_command(device: str, command: list[str], folder: Path) -> None:
     """Run a command of the test, with its standard input open.  Raises DeviceError if it fails."""
     with (folder / "errors.txt").open("wb") as errors:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)

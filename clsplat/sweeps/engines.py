@@ -1,4 +1,4 @@
-"""Assign the cells of a sweep to the devices of an engine: longest first, one per device, in one bits class."""
+"""Assign the cells of a sweep to the devices of an engine: longest cells first, one per device, in one bits class."""
 
 import logging
 import time
@@ -16,10 +16,10 @@ from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 
 
 class Ticket(Protocol):
-    """A cell that an engine runs."""
+    """A cell that is running on an engine."""
 
     def outcome(self) -> Outcome | None:
-        """Return how the cell ended, or None while it runs.  Raises CellLost if its process is gone, and its errors."""
+        """Return how the cell ended, or None while it runs.  Raises CellLost if its process is gone."""
 
 
 class CellLost(Exception):
@@ -27,7 +27,7 @@ class CellLost(Exception):
 
 
 class Engine(Protocol):
-    """Devices, and a way to run cells on them."""
+    """Provides devices, and runs cells on them."""
 
     def slots(self) -> list[DeviceSlot]:
         """Return the devices that are available now.  Raises ClsplatError if there will be none."""
@@ -36,7 +36,7 @@ class Engine(Protocol):
         """Start a cell on a free device."""
 
     def close(self) -> None:
-        """End everything that was started."""
+        """End all running cells."""
 
 
 class _FinishedTicket:
@@ -48,7 +48,7 @@ class _FinishedTicket:
 
 
 class InlineEngine:
-    """Run one cell at a time, as a child of this process."""
+    """Runs one cell at a time, as a child of this process."""
 
     def __init__(self, store: Store, slot: DeviceSlot, is_stopped: Callable[[], bool]) -> None:
         self._store, self._slot, self._is_stopped = store, slot, is_stopped
@@ -66,56 +66,56 @@ class InlineEngine:
 
 LOG = logging.getLogger("clsplat")
 POLL_INTERVAL_S = 0.05  # between two checks of running cells
-NO_DEVICE_TIMEOUT_S = 60.0  # without a suitable device, after which a sweep ends
+NO_DEVICE_TIMEOUT_S = 60.0  # a sweep ends after this time without a suitable device
 
 
 @dataclass(frozen=True)
 class PendingCell:
-    """A cell without a device."""
+    """A cell that waits for a device."""
 
     cell: CellRun  # without a bits class
-    cost: float  # steps times pixels, for the order of cells
-    above: int = 0  # memory of the largest device that was too small, bytes
+    cost: float  # steps times pixels; determines the order of cells
+    too_small: int = 0  # memory of the largest device that was too small, bytes
 
-    def on(self, bits: str) -> CellRun:
+    def in_class(self, bits: str) -> CellRun:
         """Return the cell in a bits class."""
         return replace(self.cell, spec={**self.cell.spec, "bits": bits})
 
 
 @dataclass
 class Dispatcher:
-    """A sweep in progress."""
+    """Assigns cells to devices until all have ended."""
 
     store: Store
     engine: Engine
     is_same: bool  # whether all cells run in one bits class
     options: CellOptions
     is_stopped: Callable[[], bool] = lambda: False
-    began: Callable[[CellRun], None] = lambda cell: None
-    ended: Callable[[CellRun, Outcome], None] = lambda cell, outcome: None
-    look: Callable[[], None] = lambda: None  # called regularly
+    on_start: Callable[[CellRun], None] = lambda cell: None
+    on_end: Callable[[CellRun, Outcome], None] = lambda cell, outcome: None
+    poll: Callable[[], None] = lambda: None  # called regularly
     bits: str | None = None  # bits class of all cells, once chosen
-    _seen: float = field(default_factory=time.monotonic)  # when a device of that class was last available
+    _last_available: float = field(default_factory=time.monotonic)  # when a device of that class was last available
     _unsuitable: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
     """All devices, and those on which no waiting cell can run."""
     _running: dict[DeviceSlot, tuple[PendingCell, CellRun, Ticket]] = field(default_factory=dict)
 
-    def run(self, wanted: Sequence[PendingCell]) -> None:
-        """Run all cells, and call `ended` for each.
+    def run(self, cells: Sequence[PendingCell]) -> None:
+        """Run all cells, and call `on_end` for each.
 
-        Raises BitsMismatch if two runs of a cell differ, Interrupted, and what the engine raises; `close` of the engine
-        then ends the running cells.
+        Raises BitsMismatch if two runs of a cell differ, Interrupted, and the errors of the engine; `close` of the
+        engine then ends the running cells.
         """
-        waiting = sorted(wanted, key=lambda pending: -pending.cost)
+        waiting = sorted(cells, key=lambda pending: -pending.cost)
         while waiting or self._running:
             if self.is_stopped():
                 raise Interrupted("stopped; continue with the same command and --resume")
             self._assign(waiting)
-            before = len(self._running)
+            count = len(self._running)
             for slot in list(self._running):
                 self._collect(slot, waiting)
-            self.look()
-            if (self._running and len(self._running) == before) or (waiting and not self._running):
+            self.poll()
+            if (self._running and len(self._running) == count) or (waiting and not self._running):
                 time.sleep(POLL_INTERVAL_S)
 
     def _assign(self, waiting: list[PendingCell]) -> None:
@@ -129,46 +129,47 @@ class Dispatcher:
         for slot in slots:
             if slot in self._running or slot in self._unsuitable[1]:
                 continue
-            suited = next((i for i, one in enumerate(waiting) if self._fits(one, slot, slots)), None)
-            if suited is None:
+            index = next((i for i, pending in enumerate(waiting) if self._fits(pending, slot, slots)), None)
+            if index is None:
                 self._unsuitable[1].add(slot)  # each check reads the store, so do not repeat it
                 continue
-            one = waiting.pop(suited)
-            cell = one.on(slot.bits)
-            self.began(cell)
-            self._running[slot] = (one, cell, self.engine.start(cell, slot, self.options))
+            pending = waiting.pop(index)
+            cell = pending.in_class(slot.bits)
+            self.on_start(cell)
+            self._running[slot] = (pending, cell, self.engine.start(cell, slot, self.options))
 
-    def _choose_class(self, classes: Sequence[str], wanted: Sequence[PendingCell]) -> str:
-        """Return the class of most devices; ties: the one in which most cells are published, then by name."""
+    def _choose_class(self, classes: Sequence[str], cells: Sequence[PendingCell]) -> str:
+        """Return the class with the most devices; in a tie, the one with the most published cells, then by name."""
         counts = Counter(classes)
-        most = sorted(bits for bits in counts if counts[bits] == max(counts.values()))
+        candidates = sorted(bits for bits in counts if counts[bits] == max(counts.values()))
         return max(
-            most, key=lambda bits: sum(self.store.folder(pending.on(bits).key).result.is_dir() for pending in wanted)
+            candidates,
+            key=lambda bits: sum(self.store.folder(pending.in_class(bits).key).result.is_dir() for pending in cells),
         )
 
     def _require_class(self, classes: Sequence[str]) -> None:
         """Raise DeviceError if there are devices, but none of the chosen class for NO_DEVICE_TIMEOUT_S seconds."""
         now = time.monotonic()
         if not self.is_same or not classes or self.bits in classes or self._running:
-            self._seen = now
-        elif now - self._seen > NO_DEVICE_TIMEOUT_S:
-            others = ", ".join(sorted({*classes}))
+            self._last_available = now
+        elif now - self._last_available > NO_DEVICE_TIMEOUT_S:
+            available = ", ".join(sorted({*classes}))
             raise DeviceError(
-                f"no device of bits class {self.bits} for {NO_DEVICE_TIMEOUT_S:.0f} s, only of {others}; offer one of "
-                "that class, or set placement: {bits: any}; the store keeps all progress"
+                f"no device of bits class {self.bits} for {NO_DEVICE_TIMEOUT_S:.0f} s, only of {available}; offer a "
+                "device of that class, or set placement: {bits: any}; the store keeps all progress"
             )
 
     def _fits(self, pending: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
         """Return whether a cell may run on a device: in its class, and larger than devices that were too small."""
         allowed = self._allowed(pending, slots)
-        return slot in ([other for other in allowed if other.memory > pending.above] or allowed)
+        return slot in ([other for other in allowed if other.memory > pending.too_small] or allowed)
 
     def _allowed(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
-        """Return the devices on which a cell may run; a started cell stays in its class while that has devices."""
+        """Return the devices on which a cell may run; a started cell stays in its class while devices are available."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
-        classes = {slot.bits for slot in slots if not pending.above}
-        started = [bits for bits in classes if self.store.folder(pending.on(bits).key).path.is_dir()]
+        classes = {slot.bits for slot in slots if not pending.too_small}
+        started = [bits for bits in classes if self.store.folder(pending.in_class(bits).key).path.is_dir()]
         return [slot for slot in slots if not started or slot.bits in started]
 
     def _collect(self, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
@@ -183,7 +184,7 @@ class Dispatcher:
             return
         if outcome.state == "different":
             raise BitsMismatch(outcome.message)
-        larger = replace(pending, above=slot.memory)
+        larger = replace(pending, too_small=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
             other.memory > slot.memory for other in self._allowed(larger, self.engine.slots())
         ):
@@ -191,7 +192,7 @@ class Dispatcher:
             self._requeue(larger, slot, waiting)
             return
         del self._running[slot]
-        self.ended(cell, outcome)
+        self.on_end(cell, outcome)
 
     def _requeue(self, pending: PendingCell, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
         """Return a cell to the queue, and free its device."""

@@ -54,7 +54,7 @@ def run_pipeline(
     live: Live | None = None,
     minutes: float | None = None,
 ) -> None:
-    """Run one pipeline in its folder, with a log and a progress bar.
+    """Run a pipeline in its folder, with a log and a progress bar.
 
     state: the folder before the run.  minutes: as for `Job.run`.  Raises ClsplatError; status.json holds the reason.
     """
@@ -139,10 +139,10 @@ class Job:
         if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
         if experiment and state and start == "resume" and execution is None and state.phase is not Phase.DONE:
-            before, now = state.status.get("store"), STORE if experiment.execution.has_store else None
-            if before not in (None, now):
+            previous, current = state.status.get("store"), STORE if experiment.execution.has_store else None
+            if previous not in (None, current):
                 raise ConfigError(
-                    f"{state.out}: was started with --on; its cells are in {shorten(str(before))}: give --on FILE again"
+                    f"{state.out}: was started with --on; its cells are in {shorten(str(previous))}; give --on again"
                 )
         if state:
             return cls(experiment or load(pipeline, edits), state, start)
@@ -162,8 +162,8 @@ class Job:
     ) -> "Job":
         """Open the run in a folder to continue it.  Raises ConfigError or DataError.
 
-        scene: the new folder of its photographs, if they were moved.  execution: as for `open`.  steps: a new number
-        of training steps.
+        scene: the new folder of the photos, if they were moved.  execution: as for `open`.  steps: the new number of
+        training steps.
         """
         state = RunState.read(out)
         if PIPELINE not in state.names:
@@ -174,27 +174,25 @@ class Job:
         return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
-        """Return what would run, as lines of text; for a single run with a rough estimate of its time.
+        """Return what would run, as lines of text; for a single run, with a rough estimate of the time.
 
-        Raises what `run` raises before it starts.
+        Raises the errors that `run` raises before it starts.
         """
         if isinstance(self.work, Experiment):
             return describe_matrix(self.work, self.state, device, self.start)
         return describe.describe(self.work, self.state, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
-        """Run it; finished outputs that are up to date are not made again.
+        """Run the pipeline or matrix; finished outputs that are up to date are kept.
 
         live: the port of a live preview, 0 for any free one; None: no preview.  minutes: a time budget that starts
-        when the photographs are read; the number of steps is chosen to fit it.
+        when the photos are read; the number of steps is chosen to fit it.
         Raises ClsplatError; status.json holds the reason.
         """
         if minutes is not None and not 0 < minutes <= MAX_MINUTES:
             raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0, up to {MAX_MINUTES:,}")
         if minutes is not None and isinstance(self.work, Experiment):
-            raise ConfigError(
-                "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
-            )
+            raise ConfigError("--minutes: expected a single run; for a matrix, set optimize.steps in its cells")
         if minutes is not None and self.start == "resume" and self.state.phase >= Phase.BEGUN:
             raise ConfigError("--minutes chooses the steps of a new run; omit it to continue this run")
         with live_preview(live) as preview:
@@ -204,17 +202,17 @@ class Job:
                 folder = self.work.settings.scene.folder
                 if start == "resume" and not folder.exists():
                     remedy = f"if you moved it, run `clsplat resume {shell_quote(self.out)} --scene DIR`"
-                    raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
+                    raise DataError(f"{self.out}: the folder of its photos, {folder}, is missing; {remedy}")
                 run_pipeline(self.work, self.state, device, start, preview, minutes)
             else:
-                _require_same_photographs(self.work, self.out)
+                _require_same_photos(self.work, self.out)
                 LOG.info(
                     "%s: up to date: its outputs are complete; change a setting or the folder to run again", self.out
                 )
 
 
-def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError if the photographs changed after the run; prepared photographs are not checked."""
+def _require_same_photos(pipeline: Pipeline, out: Path) -> None:
+    """Raise ConfigError if the photos changed after the run; prepared photos are not checked."""
     scene = pipeline.settings.scene
     if not pipeline.settings.prepare and scene.folder.exists():
         _, identity = identify(scene, sha256)
@@ -228,7 +226,7 @@ def live_preview(port: int | None) -> Iterator[Live | None]:
         yield None
         return
     with Live(port) as live:
-        terminal.print_message(live.text)  # not in the log, which others may read: the address is secret
+        terminal.print_message(live.text)  # the address is secret, and others may read the log
         yield live
 
 
@@ -261,7 +259,7 @@ def run_matrix(
 
 @contextmanager
 def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
-    """Lock the folder of a matrix while its cells run; at the end write compare.html.
+    """Lock the folder of a matrix while its cells run; write compare.html at the end.
 
     Raises a ClsplatError with the exit code of the first failed cell.
     """
@@ -295,11 +293,11 @@ def check_matrix_folder(state: RunState) -> None:
     outputs.require_inside(state.out, [state.out / PREPARED, state.out / UNDISTORTED])  # cells share them
     out = state.out
     if PIPELINE in state.names and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
-        raise ConfigError(f"{out}: holds a single run, not a matrix; give another folder")
+        raise ConfigError(f"{out}: has a single run, not a matrix; use another folder")
 
 
 def describe_matrix(experiment: Experiment, state: RunState, device: str | Device | None, start: Start) -> str:
-    """Return what would run, one line per cell.
+    """Return a description of what would run, one line per cell.
 
     Raises a ClsplatError with the exit code of the first cell that could not run.
     """
@@ -323,7 +321,7 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
 
 
 def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:
-    """Write the page that compares the finished cells.  Raises what `write_comparison` raises."""
+    """Write the page that compares the finished cells.  Raises the errors of `write_comparison`."""
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:

@@ -9,10 +9,10 @@ from clsplat.core.errors import DataError, one_line
 from clsplat.core.files import METRICS
 from clsplat.core.reading import read_json
 from clsplat.runs.results import read_metrics
-from clsplat.sweeps.store import CELLS, SPEC, STALE_AFTER_S, CellAttempt, CellFolder, Store, number_of
+from clsplat.sweeps.store import CELLS, SPEC, STALE_AFTER_S, CellAttempt, CellFolder, Store, finite_number
 from clsplat.training.status import read_status
 
-NO_BEAT_S = 60.0  # seconds without a beat after which a run may have ended
+NO_BEAT_S = 60.0  # seconds without a heartbeat after which a run may have ended
 
 
 def is_store(folder: Path) -> bool:
@@ -23,7 +23,7 @@ def is_store(folder: Path) -> bool:
 def store_status(root: Path) -> dict[str, Any]:
     """Return the `cells` of a store with their states, `counts` of states, `events` by kind, and the current `time`.
 
-    A cell is published, failed, running, silent (its lease had no beat for a minute), stopped, or waiting.
+    A cell is published, failed, running, silent (no heartbeat for a minute), stopped, or waiting.
     Raises DataError if the folder is not a store.
     """
     store = Store.open(root)
@@ -41,7 +41,7 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
-    """Return the state of a cell.  names: of its sweep, and of the cell in it."""
+    """Return the state of a cell.  names: of the sweep, and of the cell in the sweep."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
@@ -51,10 +51,10 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
     facts |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
         values = {key: manifest.get(key) for key in ("device", "host", "worker")}
-        values["seconds"] = number_of(manifest.get("seconds"))
+        values["seconds"] = finite_number(manifest.get("seconds"))
         return {**facts, "state": "published", **values, **_figures(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
-    alive = [one for one in attempts if one.exit_code is None and now - one.last_beat < NO_BEAT_S]
+    alive = [item for item in attempts if item.exit_code is None and now - item.last_beat < NO_BEAT_S]
     if (failed := folder.failed()) and not alive:
         return {**facts, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
     last = (alive or attempts)[-1:]
@@ -69,7 +69,7 @@ def _steps(pipeline: dict[str, Any]) -> int | None:
 
 
 def _figures(folder: CellFolder) -> dict[str, Any]:
-    """Return PSNR and SSIM of a result at its first size, of test views if it has any, and its Gaussians."""
+    """Return the PSNR and SSIM of a result at its first size, of test views if there are any, steps, and Gaussians."""
     with suppress(DataError):
         metrics = read_metrics(folder.result / METRICS)
         sizes = [*metrics.test.values(), *metrics.train.values()]
@@ -93,22 +93,22 @@ def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
 
 
 def overview_text(status: dict[str, Any]) -> str:
-    """Return the result of `store_status` as lines of text, one per cell."""
+    """Format the result of `store_status` as text, one line per cell."""
     counts = ", ".join(f"{count} {state}" for state, count in sorted(status["counts"].items())) or "no cells"
     lines = [f"{status['store']}: {counts}"]
     for cell in status["cells"]:
         name = cell["name"] or f"{cell['pipeline']} seed={cell['seed']}"
-        lines.append(f"{cell['key']}  {cell['state']:9}  {name}{_detail(cell)}")
+        lines.append(f"{cell['key']}  {cell['state']:9}  {name}{_format_detail(cell)}")
     return "\n  ".join(map(one_line, lines))
 
 
-def _detail(cell: dict[str, Any]) -> str:
+def _format_detail(cell: dict[str, Any]) -> str:
     if cell["state"] == "published":
         psnr = f", {cell['psnr']:.2f} dB" if cell.get("psnr") is not None else ""
         return psnr + (f", {cell['seconds']:.0f} s" if cell["seconds"] is not None else "")
     step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
     more = f": {cell['message']}" if cell.get("message") else ""
     if cell["state"] == "silent":
-        waits = "; run the sweep again to continue it" if cell["silent"] > STALE_AFTER_S else ""
-        more = f", no sign of life for {cell['silent']} s on {cell.get('host')}{waits}"
+        advice = "; run the sweep again to continue it" if cell["silent"] > STALE_AFTER_S else ""
+        more = f", no heartbeat for {cell['silent']} s on {cell.get('host')}{advice}"
     return step + more

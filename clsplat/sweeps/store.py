@@ -1,13 +1,13 @@
-"""Keep the cells of a sweep in a folder that all machines share.
+"""Store the cells of a sweep in a folder that all machines share.
 
-    cells/<key>/spec.json           the values that the key is a hash of; written first, never changed
-                attempts/<uuid>/    an ordinary run folder, written by a single process, with its lease.json
+    cells/<key>/spec.json           the hashed values of the key; written first, never changed
+                attempts/<uuid>/    an ordinary run folder, written by a single process, with a lease.json
                 result/             the first attempt that finished, renamed, with its manifest.json
-                failed.json         why the cell was given up
+                failed.json         why the cell failed
     prepared/                       output of `prepare`
     undistorted/<scene>-<code>/     undistorted photos, made once per host
     sweeps/<name>-<hash>.json       the cells of a matrix by name
-    cancel/all  cancel/<key>        requests to stop what started before
+    cancel/all  cancel/<key>        requests to stop cells that started earlier
     events/<host>-<process>.jsonl   one file per process, so that no two append to the same file
 
 Engines start a cell at least once.  A cell counts once: attempts share no file, the bits do not depend on who runs the
@@ -62,31 +62,31 @@ from clsplat.training.status import read_status
 GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # a run appends to these files, so they are copied, not linked
 
 
-def copy_files(source: Path, target: Path, left_out: Collection[str]) -> None:
-    """Copy a folder recursively, except the names `left_out` at its top.
+def copy_files(source: Path, target: Path, excluded: Collection[str]) -> None:
+    """Copy a folder recursively, except for names at its top level.
 
-    Existing files are replaced.  Partial files, and files that a process removes meanwhile, are skipped.
+    excluded: the names.  Existing files are replaced.  Partial files, and files that disappear meanwhile, are skipped.
     Raises OSError.
     """
     for base, folders, files in os.walk(source):
-        here = Path(base).relative_to(source)
-        is_top = here == Path()
-        skipped = left_out if is_top else ()
+        relative = Path(base).relative_to(source)
+        is_top = relative == Path()
+        skipped = excluded if is_top else ()
         folders[:] = [name for name in folders if name not in skipped]
-        if not is_top and (target / here).is_symlink():  # it may lead outside of the target
-            (target / here).unlink()
-        (target / here).mkdir(parents=True, exist_ok=True)
+        if not is_top and (target / relative).is_symlink():  # a link may point outside of the target
+            (target / relative).unlink()
+        (target / relative).mkdir(parents=True, exist_ok=True)
         for name in files:
             if name in skipped or PARTIAL.fullmatch(name):
                 continue
-            (target / here / name).unlink(missing_ok=True)
+            (target / relative / name).unlink(missing_ok=True)
             copy = shutil.copyfile if is_top and name in GROWING else link_or_copy
             with suppress(FileNotFoundError):
-                copy(Path(base) / name, target / here / name)
+                copy(Path(base) / name, target / relative / name)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Hard-link a file that is never changed in place, or copy it.  Raises OSError."""
+    """Hard-link a file, or copy it if links are not possible; neither must change in place.  Raises OSError."""
     try:
         os.link(source, target)
     except FileExistsError:
@@ -100,11 +100,11 @@ def link_or_copy(source: Path, target: Path) -> None:
 # An attempt at a cell: a run folder with a lease, and a manifest once the run is done.
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
-OWN = frozenset(
+ATTEMPT_FILES = frozenset(
     {LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY}
-)  # of one attempt alone; NOTE has a path
-MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that the bits of a device determine
-BEAT = 10.0  # seconds between two beats of a lease
+)  # not copied to other attempts; PREPARE_SUMMARY has a path
+MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that depend only on bits, not on time
+BEAT = 10.0  # seconds between two heartbeats of a lease
 Rank = tuple[bool, int]  # of a checkpoint: whether it belongs to a refit, and its step
 
 
@@ -113,7 +113,7 @@ class LeaseLost(OutputError):
 
 
 class CellAttempt:
-    """A folder below `attempts`, written by a single process."""
+    """An attempt at a cell: a run folder that a single process writes, with a lease."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -126,7 +126,7 @@ class CellAttempt:
         self._write()
 
     def beat(self) -> None:
-        """Renew the lease if it is due.  Raises LeaseLost."""
+        """Renew the lease every BEAT seconds.  Raises LeaseLost."""
         if time.monotonic() - self._last >= BEAT:
             self.require_lease()
             self._write()
@@ -156,7 +156,7 @@ class CellAttempt:
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code of the run; None if it is running, or its process was killed."""
+        """The exit code of the run; None if it is running, or its process was killed."""
         code = self.lease.get("exit_code")
         return code if isinstance(code, int) and abs(code) < 1 << 32 else None
 
@@ -167,12 +167,12 @@ class CellAttempt:
     @property
     def since(self) -> float:
         """When the caller started, by the clock of the store."""
-        return number_of(self.lease.get("since")) or 0.0
+        return finite_number(self.lease.get("since")) or 0.0
 
     @property
     def start_rank(self) -> Rank:
         """The rank of the checkpoint that the attempt continued from."""
-        return _rank_of(str(self.lease.get("from", "")))
+        return _parse_rank(str(self.lease.get("from", "")))
 
     @property
     def last_beat(self) -> float:
@@ -193,9 +193,9 @@ class CellAttempt:
                 target.parent.mkdir(exist_ok=True)
                 try:
                     link_or_copy(path, target)
-                except FileNotFoundError:  # removed meanwhile by its process
+                except FileNotFoundError:  # its process has removed it
                     continue
-                copy_files(other.path, self.path, {*OWN, CHECKPOINTS})
+                copy_files(other.path, self.path, {*ATTEMPT_FILES, CHECKPOINTS})
             self._values["from"] = path.name
             self._write()
             return
@@ -207,14 +207,14 @@ class CellAttempt:
         lines: list[str] = []
         with suppress(DataError):
             lines = read_file(self.path / ERRORS).decode(errors="replace").strip().splitlines()
-        how = f"signal {-exit_code}" if exit_code < 0 else f"exit code {exit_code}"
-        return lines[-1].removeprefix("error: ") if lines else f"its process ended with {how}"
+        cause = f"signal {-exit_code}" if exit_code < 0 else f"exit code {exit_code}"
+        return lines[-1].removeprefix("error: ") if lines else f"its process ended with {cause}"
 
     def manifest(self) -> dict[str, Any]:
         """Write and return the manifest: hashes of all files, and of the bits.  Raises OutputError."""
         names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
-        kept = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
-        files = {name: sha256(self.path / name, kind=OutputError) for name in kept}
+        hashed = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
+        files = {name: sha256(self.path / name, kind=OutputError) for name in hashed}
         values = {
             "attempt": self.path.name,
             "from": self._values.get("from"),
@@ -222,7 +222,7 @@ class CellAttempt:
             "worker": self._values.get("worker"),
             "device": read_status(self.path).get("device"),
             "seconds": round(time.time() - self._values.get("begun", time.time()), 3),
-            "bits": bits_of(self.path, files),
+            "bits": hash_bits(self.path, files),
             "files": files,
         }
         write_text(self.path / MANIFEST, json.dumps(values, indent=1) + "\n")
@@ -230,9 +230,9 @@ class CellAttempt:
 
 
 def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
-    """Yield the readable checkpoints of attempts, the newest first: rank, file and attempt."""
+    """Yield the readable checkpoints of attempts, newest first: rank, file, and attempt."""
     saved = [
-        (_rank_of(path.name), path, attempt) for attempt in attempts for path in checkpoint.list_files(attempt.path)
+        (_parse_rank(path.name), path, attempt) for attempt in attempts for path in checkpoint.list_files(attempt.path)
     ]
     for rank, path, attempt in sorted(saved, key=lambda entry: entry[0], reverse=True):
         try:
@@ -242,12 +242,12 @@ def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank
         yield rank, path, attempt
 
 
-def _rank_of(name: str) -> Rank:
-    found = re.fullmatch(r"(step|refit)_(\d{1,18})\.npz", name)
-    return (found[1] == "refit", int(found[2])) if found else (False, 0)
+def _parse_rank(name: str) -> Rank:
+    match = re.fullmatch(r"(step|refit)_(\d{1,18})\.npz", name)
+    return (match[1] == "refit", int(match[2])) if match else (False, 0)
 
 
-def bits_of(folder: Path, files: dict[str, str]) -> str:
+def hash_bits(folder: Path, files: dict[str, str]) -> str:
     """Return a hash of everything that a device computed: model files, and metrics without times.
 
     files: hashes of the run's files, by name.
@@ -269,7 +269,7 @@ def bits_of(folder: Path, files: dict[str, str]) -> str:
 LOG = logging.getLogger("clsplat")
 SPEC, ATTEMPTS, RESULT, FAILED = "spec.json", "attempts", "result", "failed.json"
 NAME = re.compile("[0-9a-f]{32}")  # of an attempt
-STALE_AFTER_S = 600.0  # seconds without a beat of its lease after which an attempt may be removed
+STALE_AFTER_S = 600.0  # seconds without a heartbeat after which an attempt may be removed
 
 
 class BitsMismatch(OutputError):
@@ -288,19 +288,19 @@ class CellFolder:
         return self.path.name
 
     def write_spec(self, spec: Mapping[str, Any]) -> None:
-        """Write the values that the key is a hash of, if they are missing or damaged.
+        """Write the hashed values of the key, if they are missing or damaged.
 
-        Raises OutputError if other values are there.
+        Raises OutputError if the file has other values.
         """
         file = self.path / SPEC
         try:
-            before = read_json(file) if file.exists() else None
+            existing = read_json(file) if file.exists() else None
         except DataError as error:
             LOG.warning("%s; writing it again", error)
-            before = None
-        if before is None:
+            existing = None
+        if existing is None:
             write_text(file, json.dumps(spec, indent=1, sort_keys=True) + "\n")
-        elif before != spec:
+        elif existing != spec:
             raise OutputError(f"{file}: belongs to another cell, or was changed; remove {self.path} to run it again")
 
     def manifest(self) -> dict[str, Any] | None:
@@ -312,16 +312,16 @@ class CellFolder:
         return None
 
     def published(self) -> dict[str, Any] | None:
-        """Return the manifest of the result, after comparing the files with their hashes, or None without a result.
+        """Return the manifest of the result after verifying the hashes of its files, or None without a result.
 
-        A damaged result becomes an attempt again, so that the cell continues from its checkpoint.
+        A damaged result is moved back to the attempts, so that the cell continues from its checkpoint.
         """
         if not self.result.is_dir():
             return None
         manifest = self.manifest()
         if manifest and all(try_sha256(self.result / name) == digest for name, digest in manifest["files"].items()):
             return manifest
-        with suppress(OSError):  # another process may have done so
+        with suppress(OSError):  # another process may have moved it
             make_folder(self.path / ATTEMPTS)
             os.rename(self.result, self.path / ATTEMPTS / uuid.uuid4().hex)
         return None
@@ -343,16 +343,16 @@ class CellFolder:
         return attempt
 
     def failures(self, since: float) -> list[CellAttempt]:
-        """Return the attempts of callers since a time that failed without a newer readable checkpoint."""
+        """Return failed attempts of callers that started at a time or later, without a newer readable checkpoint."""
         attempts = self.attempts()
         newest = next((rank for rank, *_ in readable_checkpoints(attempts)), (False, 0))
-        return [one for one in attempts if one.has_failed and one.since >= since and one.start_rank >= newest]
+        return [item for item in attempts if item.has_failed and item.since >= since and item.start_rank >= newest]
 
     def publish(self, attempt: CellAttempt) -> dict[str, Any]:
-        """Rename an attempt with its manifest to the result; return the manifest of the result.
+        """Rename an attempt to the result, with a manifest; return the manifest of the result.
 
         If another attempt was first, their bits are compared.  Raises BitsMismatch if they differ, and LeaseLost if the
-        attempt was removed because its process slept too long.
+        attempt was removed because its process was frozen too long.
         """
         attempt.require_lease()
         ours = attempt.manifest()
@@ -365,35 +365,35 @@ class CellFolder:
                 (self.result / LEASE).unlink()
                 (self.path / FAILED).unlink(missing_ok=True)
             return ours
-        os.listdir(self.path)  # refreshes what NFS has cached of the folder
+        os.listdir(self.path)  # refreshes the NFS cache of the folder
         theirs = self.manifest()
         if theirs is None:
-            raise OutputError(f"{self.result}: cannot be written; check the permissions of the folder and its space")
+            raise OutputError(f"{self.result}: cannot be written; check the permissions and the free space")
         if theirs["bits"] != ours["bits"]:
             raise BitsMismatch(
-                f"{self.path}: the same cell gave other bits on two devices of one bits class: {self.result} on "
+                f"{self.path}: the same cell gave different bits on two devices of one bits class: {self.result} on "
                 f"{theirs.get('device')}, {attempt.path} on {ours.get('device')}; one of them computes wrongly: "
                 "`clsplat doctor` shows which"
             )
         return theirs
 
     def give_up(self, exit_code: int, message: str) -> None:
-        """Write why the cell was given up."""
+        """Write failed.json: the exit code and the message of the last failure."""
         codes = [attempt.exit_code for attempt in self.attempts() if attempt.exit_code is not None]
         text = json.dumps({"exit_code": exit_code, "message": message, "exit_codes": codes}, indent=1)
         write_text(self.path / FAILED, text + "\n")
 
     def failed(self) -> dict[str, Any] | None:
-        """Return why the cell was given up, or None."""
+        """Return the content of failed.json, or None."""
         with suppress(DataError):
             values = read_json(self.path / FAILED)
             return values if isinstance(values, dict) else None
         return None
 
     def collect(self, now: float) -> None:
-        """Remove the attempts of a published cell whose lease had no beat for STALE_AFTER_S seconds.
+        """Remove the attempts of a published cell whose lease had no heartbeat for STALE_AFTER_S seconds.
 
-        now: by the clock of the store.  Other attempts stay, since their processes may be working.
+        now: by the clock of the store.  Other attempts remain, because their processes may be running.
         """
         if self.manifest() is None:
             return
@@ -402,7 +402,7 @@ class CellFolder:
                 shutil.rmtree(attempt.path, ignore_errors=True)
 
 
-# A store may come from somebody else: links, which may lead outside of it, are refused, and damaged values ignored.
+# A store may be untrusted: links, which may point outside of it, are rejected, and damaged values are ignored.
 
 
 def without_links(root: Path, *names: str) -> Path:
@@ -411,12 +411,12 @@ def without_links(root: Path, *names: str) -> Path:
     for name in names:
         path /= name
         if path.is_symlink():
-            raise DataError(f"{path}: is a symbolic link, which may lead outside of the store; remove it")
+            raise DataError(f"{path}: is a symbolic link, which may point outside of the store; remove it")
     return path
 
 
-def number_of(value: Any) -> float | None:
-    """Return a finite number in a record, or None."""
+def finite_number(value: Any) -> float | None:
+    """Return a value of a record if it is a finite number, or None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e18:
         return None
     return float(value)
@@ -427,18 +427,18 @@ ALL = "all"
 
 
 class Store:
-    """A store, as a process uses it.  Raises OutputError if it cannot be written."""
+    """A store of cells in a folder.  Methods raise OutputError if it cannot be written."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         owner = Owner.current()
-        self._own = f"{owner.host_slug}-{owner.process}"
+        self._process_name = f"{owner.host_slug}-{owner.process}"
 
     @classmethod
     def open(cls, root: Path) -> "Store":
         """Return the store in a folder.  Raises DataError if there is none."""
         if not (root / CELLS).is_dir():
-            raise DataError(f"{root}: is not the store of a sweep: it has no folder `{CELLS}`; check the path")
+            raise DataError(f"{root}: is not the store of a sweep, because it has no folder `{CELLS}`; check the path")
         return cls(root)
 
     @property
@@ -462,8 +462,8 @@ class Store:
         return [self.folder(name) for name in names if is_key(name)]
 
     def now(self) -> float:
-        """Return the time by the clock of the store's file system, which all machines share, in seconds."""
-        clock = without_links(self.root, EVENTS, f".{self._own}.clock")
+        """Return the time of the store's file system, s, which is the same for all machines."""
+        clock = without_links(self.root, EVENTS, f".{self._process_name}.clock")
         with raising_output_error(clock):
             make_folder(clock.parent)
             clock.touch()
@@ -471,26 +471,28 @@ class Store:
 
     def log_event(self, event: str, **values: Any) -> None:
         """Append an event to the file of this process."""
-        path = without_links(self.root, EVENTS, f"{self._own}.jsonl")
+        path = without_links(self.root, EVENTS, f"{self._process_name}.jsonl")
         with raising_output_error(path):
             make_folder(path.parent)
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps({"time": round(time.time(), 3), "event": event, **values}) + "\n")
 
     def events(self) -> list[dict[str, Any]]:
-        """Return the events of all processes, in order of time; lines cut by a crash are skipped."""
+        """Return the events of all processes, in order of time; incomplete lines are skipped."""
         events: list[dict[str, Any]] = []
         for path in (self.root / EVENTS).glob("*.jsonl"):
             for line in read_file(path).decode(errors="replace").splitlines() if path.is_file() else ():
                 with suppress(ValueError):
                     event = json.loads(line)
-                    events += [event] if isinstance(event, dict) and number_of(event.get("time")) is not None else []
+                    events += (
+                        [event] if isinstance(event, dict) and finite_number(event.get("time")) is not None else []
+                    )
         return sorted(events, key=lambda event: float(event["time"]))
 
     def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
         """Record the cells of a matrix by name, for `clsplat status`.
 
-        text: distinguishes matrices with the same name, such as the text of the file.  Other cells of it stay recorded.
+        text: distinguishes matrices with the same name, such as the text of the file.  Other recorded cells remain.
         """
         folder = without_links(self.root, SWEEPS)
         file = folder / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
@@ -498,7 +500,7 @@ class Store:
         write_text(file, json.dumps({"name": name, "cells": cells}, indent=1) + "\n")
 
     def sweeps(self, files: Sequence[Path] | None = None) -> list[tuple[str, dict[str, str]]]:
-        """Return the name of each matrix, and the keys of its cells by name; what is not a key is left out."""
+        """Return the name of each matrix, and the keys of its cells by name; invalid keys are left out."""
         sweeps = []
         for path in sorted((self.root / SWEEPS).glob("*.json")) if files is None else files:
             with suppress(DataError, KeyError, TypeError, AttributeError):
@@ -518,7 +520,7 @@ class Store:
 
         Raises ConfigError if there is no such cell.
         """
-        name = ALL if cell is None else self.key_of(cell)
+        name = ALL if cell is None else self.find_key(cell)
         self.stop(name)
         self.log_event("cancel", cell=name)
         return name
@@ -532,22 +534,22 @@ class Store:
             os.utime(flag)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether something that started at a time of `now`, under some names, has to stop."""
+        """Return whether work under one of these names that started at `since`, by the clock of `now`, has to stop."""
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):
                 if (self.root / CANCEL / name).stat().st_mtime >= since:
                     return True
         return False
 
-    def key_of(self, cell: str) -> str:
-        """Return the key of a cell, given its name in a sweep, its key or the start of its key.
+    def find_key(self, cell: str) -> str:
+        """Return the key of a cell, given its name in a sweep, its key, or the start of its key.
 
-        If several cells have the name, the one that is not published.
+        If several cells have the name, an unpublished one is chosen.
         """
         named = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
         named = {key for key in named if not self.folder(key).result.is_dir()} or named
         named = named or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
         if len(named) != 1:
-            fault = f"{len(named)} cells match; give a key" if named else "`clsplat status` lists the cells"
-            raise ConfigError(f"{self.root}: no cell '{cell}'; {fault}")
+            advice = f"{len(named)} cells match; give a key" if named else "`clsplat status` lists the cells"
+            raise ConfigError(f"{self.root}: no cell '{cell}'; {advice}")
         return named.pop()

@@ -1,4 +1,4 @@
-"""Run a cell in attempts until it is published, given up or stopped; all engines call this."""
+"""Run a cell in attempts until it is published, has failed, or is stopped; all engines call this."""
 
 import logging
 import os
@@ -38,21 +38,21 @@ class Outcome:
 
 @dataclass(frozen=True)
 class CellOptions:
-    """How a cell is run."""
+    """Options for running a cell."""
 
     since: float  # when the caller started, by the clock of the store
     retries: int = 3  # failures without a newer checkpoint
     worker: str = "inline"
     sweep: str = ""  # name under which the caller's cells can be stopped
-    cores: Sequence[int] = ()  # to pin the run to; none: those of the caller
+    cores: Sequence[int] = ()  # to pin the run to; empty: the cores of the caller
 
 
 def run_cell(
     cell: CellRun, store: Store, command: Command, options: CellOptions, is_stopped: Callable[[], bool] = lambda: False
 ) -> Outcome:
-    """Run a cell, unless it is published; return how it ended, and never raise a ClsplatError.
+    """Run a cell, unless it is published; return how it ended, instead of raising a ClsplatError.
 
-    is_stopped: whether the caller has to stop; the store is checked too.
+    is_stopped: whether the caller has to stop; requests in the store stop the cell too.
     """
     try:
         return _run_cell(cell, store, command, options, is_stopped)
@@ -67,7 +67,7 @@ def _run_cell(
 ) -> Outcome:
     folder = store.add(cell)
 
-    def stopped() -> bool:
+    def should_stop() -> bool:
         return is_stopped() or store.is_cancelled((cell.key, options.sweep), options.since)
 
     while True:
@@ -75,17 +75,17 @@ def _run_cell(
             store.log_event("skip", cell=cell.key, worker=options.worker)
             folder.collect(store.now())
             return Outcome("published", str(manifest["bits"]))
-        if stopped():
+        if should_stop():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped")
         cell.require_files()
         attempt = folder.begin(options.worker, options.since)
-        begun_from = attempt.lease.get("from")
+        start_checkpoint = attempt.lease.get("from")
         store.log_event(
-            "start", cell=cell.key, attempt=attempt.path.name, worker=options.worker, **{"from": begun_from}
+            "start", cell=cell.key, attempt=attempt.path.name, worker=options.worker, **{"from": start_checkpoint}
         )
-        _equip(cell, store, folder, attempt)
+        _prepare_attempt(cell, store, folder, attempt)
         try:
-            code = supervise(attempt, command, stopped, options.cores)
+            code = supervise(attempt, command, should_stop, options.cores)
             store.log_event("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
             if code == 0:
                 _require_same_scene(cell, attempt)
@@ -97,20 +97,20 @@ def _run_cell(
             raise
         except BitsMismatch:
             raise
-        except OutputError as error:  # while publishing: the same as if the run could not write
+        except OutputError as error:  # while publishing; handled as a write error of the run
             code, message = error.exit_code, one_line(error)
             attempt.end(code)
-        if stopped():
+        if should_stop():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped, its state is saved")
         if code in FINAL or len(folder.failures(options.since)) >= options.retries:
             return _give_up(folder, store, code, message)
         LOG.warning("cell %s: %s; trying again", cell.name, message)
 
 
-def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
-    """Write the pipeline file of an attempt, and link to output of `prepare` and undistorted photos of other cells.
+def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
+    """Write the pipeline file of an attempt, and links to the shared output of `prepare` and undistorted photos.
 
-    Without links, each cell makes its own.  Raises OutputError.
+    Where links are not possible, each cell makes these files itself.  Raises OutputError.
     """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
     shared = {UNDISTORTED: store.undistorted(cell.spec["scene"], cell.spec["code"])}
@@ -120,21 +120,21 @@ def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt
         make_folder(target)
         link = folder.path / ATTEMPTS / name
         if link.is_symlink() and not link.samefile(target):
-            raise DataError(f"{link}: is a symbolic link to another place than {target}; remove it")
+            raise DataError(f"{link}: is a symbolic link that does not point to {target}; remove it")
         if not link.exists():
             with suppress(OSError):
                 link.symlink_to(os.path.relpath(target, link.parent), target_is_directory=True)
 
 
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
-    """Raise DataError if the photos or other files differ from what the cell's key was made from."""
+    """Raise DataError if the photos or other files differ from those hashed for the cell's key."""
     cell.require_files()
     for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():
             continue
         if read_json(attempt.path / name).get(key) != cell.spec["scene"]:
             raise DataError(
-                f"cell {cell.name}: its photographs, cameras or points changed while it ran; run the sweep again"
+                f"cell {cell.name}: its photos, cameras, or points changed while it ran; run the sweep again"
             )
         return
 

@@ -171,7 +171,7 @@ def test_training_keeps_enough_steps_to_separate_edits():
 def test_impossible_time_budget_is_refused(tiny_scene, tmp_path, few_steps):
     with pytest.raises(ConfigError, match="omit it to continue"):
         clsplat.run(few_steps / "pipeline.yaml", out=few_steps, start="resume", minutes=1)
-    with pytest.raises(ConfigError, match="a matrix has several"):
+    with pytest.raises(ConfigError, match="for a matrix, set"):
         clsplat.run(Path("examples/growth.yaml").absolute(), tiny_scene, tmp_path / "m", minutes=1)
     with pytest.raises(ConfigError, match="found 3"):
         clsplat.run("compress", tiny_scene, tmp_path / "c", set={"init.file": few_steps / "point_cloud.ply"}, minutes=1)

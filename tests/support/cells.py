@@ -29,7 +29,7 @@ def command(code: str) -> list[str]:
 
 def keys(pipeline: str, scene: Path, folder: Path, *changes: str) -> str:
     checked = load(pipeline, [f"scene.path={scene}", *changes])
-    return CellRun.of("x", checked, Scenes(folder).known(checked).digest, "b").key
+    return CellRun.from_pipeline("x", checked, Scenes(folder).facts(checked).digest, "b").key
 
 
 class Fake:

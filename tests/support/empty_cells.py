@@ -27,7 +27,7 @@ def measure(cells: int, workers: int, folder: Path) -> None:
     dask.find_slots = lambda worker, devices, packing: slots
     store, memory, process = Store(folder), [], psutil.Process()
     engine = dask.engine(Execution(engine="local"), store, None)
-    engine.command_of = lambda device: ["touch", OUT]
+    engine.make_command = lambda device: ["touch", OUT]
     wanted = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
     drive = Dispatcher(store, engine, True, CellOptions(store.now()))
 
@@ -36,7 +36,7 @@ def measure(cells: int, workers: int, folder: Path) -> None:
             print(f"{len(memory)} cells, driver {process.memory_info().rss >> 20} MiB")
         memory.append(process.memory_info().rss)
 
-    drive.ended = ended
+    drive.on_end = ended
     begin = time.perf_counter()
     drive.run(wanted)
     seconds = time.perf_counter() - begin

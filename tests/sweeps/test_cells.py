@@ -62,7 +62,7 @@ def test_key_has_no_paths_and_all_inputs_that_change_bits(tiny_scene, tmp_path):
 def test_fingerprint_matches_the_runs_record_of_its_scene(few_steps, tiny_scene, tmp_path):
     checked = load("smoke", [f"scene.path={tiny_scene}"])
     expected = json.loads((few_steps / "inputs.json").read_text())["digest"]
-    assert Scenes(tmp_path).known(checked).digest == expected
+    assert Scenes(tmp_path).facts(checked).digest == expected
 
 
 def test_a_cell_is_published_once_and_then_skipped(store, options):
@@ -100,9 +100,9 @@ def test_first_of_two_writers_publishes_and_the_second_compares(store, options, 
     if state == "published":
         assert event_names(store)[-1] == "second"
     else:
-        assert "gave other bits" in outcome.message
+        assert "gave different bits" in outcome.message
         drive = Dispatcher(store, Fake(outcome), True, options)
-        with pytest.raises(BitsMismatch, match="gave other bits"):
+        with pytest.raises(BitsMismatch, match="gave different bits"):
             drive.run([PendingCell(CELL, 1)])
 
 
@@ -328,7 +328,7 @@ def test_longest_cell_is_first_and_a_lost_one_restarts(store, options):
     done = Outcome("published")
     engine = Fake(CellLost, done, done, done)
     ended = []
-    Dispatcher(store, engine, True, options, ended=lambda cell, outcome: ended.append(cell.name)).run(
+    Dispatcher(store, engine, True, options, on_end=lambda cell, outcome: ended.append(cell.name)).run(
         pending_cells(1, 3, 2)
     )
     assert [name for name, *_ in engine.started] == ["3", "3", "2", "1"]
@@ -346,7 +346,7 @@ def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, options):
 
 def test_cell_stays_in_the_class_it_started_in(store, options):
     (one,) = pending_cells(9)
-    store.add(one.on("x"))
+    store.add(one.in_class("x"))
     engine = Fake(*[Outcome("published")] * 4, slots=SLOTS)
     Dispatcher(store, engine, False, options).run([one, *pending_cells(1, 2, 3)])
     assert engine.started[0] == ("9", "one", "x")
@@ -356,7 +356,7 @@ def test_cell_stays_in_the_class_it_started_in(store, options):
 @pytest.mark.parametrize("published", ["x", "y", None])
 def test_class_with_most_results_breaks_ties(store, options, published):
     for one in pending_cells(1, 2) if published else []:
-        run_cell(one.on(published), store, command(WRITES), options)
+        run_cell(one.in_class(published), store, command(WRITES), options)
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS[1::-1])
     Dispatcher(store, engine, True, options).run(pending_cells(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {published or "x"}
@@ -367,7 +367,7 @@ def test_sweep_whose_class_has_no_device_left_names_the_others(store, options, m
     drive = Dispatcher(store, Fake(slots=SLOTS), True, options, bits="z")
     looks = iter(range(40))
     drive.is_stopped = lambda: next(looks) == 39
-    with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer one of that class"):
+    with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer a device of that class"):
         drive.run(pending_cells(1))
 
 
@@ -395,7 +395,7 @@ def test_device_that_suits_no_cell_is_checked_once(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.engines.POLL_INTERVAL_S", 0.0)
     engine, begun = Fake(slots=SLOTS[:2]), pending_cells(*range(5))
     for one in begun:
-        store.add(one.on("x"))
+        store.add(one.in_class("x"))
 
     def start(*values):
         ends = [*[None] * 9, Outcome("published")]

@@ -20,7 +20,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.view import load_image
 from clsplat.sweeps.compare import crops
-from clsplat.sweeps.compare.comparison import RunComparison, differing, flat, read_published
+from clsplat.sweeps.compare.comparison import RunComparison, differing_keys, flatten, read_published
 from clsplat.sweeps.compare.page import write_comparison
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
@@ -149,7 +149,7 @@ def test_invalid_file_of_published_results_is_refused(text, complaint, tmp_path)
 def test_sizes_unseen_in_training_are_explained(make_run, tmp_path):
     assert "sizes are relative" not in page_of(tmp_path, make_run("whole"))
     halves = make_run("halves", "scene.downscale=2", "scene.levels=2")
-    assert "sizes are relative to the original photographs; trained at 1/2, 1/4" in page_of(tmp_path, halves)
+    assert "sizes are relative to the original photos; trained at 1/2, 1/4" in page_of(tmp_path, halves)
 
 
 def test_curves_of_runs_with_one_seed_are_named_by_folder(make_run, tmp_path):
@@ -180,16 +180,16 @@ def test_each_scene_and_size_has_a_table(make_run, tiny_scene, tmp_path):
 
 
 def test_differing_settings_are_matched_by_name():
-    one = flat(load("splat").resolved())
+    one = flatten(load("splat").resolved())
     assert one["optimize.steps"] == "30000"
     assert one["optimize.densify.clone.gradient_above"] == "0.0002"
     assert one["optimize.reset_opacity#2.when_background"] == "white"
     assert one["optimize.dssim.weight"] == "0.2"
-    two = flat(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved())
-    assert differing([one, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
-    assert differing([one, one]) == []
-    short = flat(load("smoke").resolved())
-    assert "optimize.densify.prune_large.start" in differing([one, short]), "a rule that only one has"
+    two = flatten(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved())
+    assert differing_keys([one, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
+    assert differing_keys([one, one]) == []
+    short = flatten(load("smoke").resolved())
+    assert "optimize.densify.prune_large.start" in differing_keys([one, short]), "a rule that only one has"
 
 
 def test_page_shows_only_differing_settings(make_run, tmp_path):
@@ -350,7 +350,7 @@ def test_means_over_other_numbers_of_views_are_marked(make_run, tmp_path, size, 
     few = {"psnr_color": 30.0, "psnr_color_views": 1, "psnr_color_reason": "why"}
     one, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
     three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_color=25.0))
-    said = f"The number of {words} with a PSNR in the photographs' colors differs between runs (1, 7)."
+    said = f"The number of {words} with a PSNR in the photos' colors differs between runs (1, 7)."
     assert said in html.unescape(page_of(tmp_path, one, two, three))
     assert "differs between runs" not in page_of(tmp_path, two, three), "what has no figure is not compared"
 

@@ -65,9 +65,9 @@ def test_list_of_names_is_read_from_the_dataset_folder(tiny_scene, tmp_path, mon
     (tmp_path / "list.txt").write_text("train/r_000\n")
     monkeypatch.chdir(tmp_path)
     checked = load("smoke", [f"scene.path={scene}", "scene.holdout={file: list.txt}"])
-    cell = CellRun.of("x", checked, "s", "b")
+    cell = CellRun.from_pipeline("x", checked, "s", "b")
     (tmp_path / "list.txt").write_text("train/r_001\n")
-    assert CellRun.of("x", checked, "s", "b").key == cell.key
+    assert CellRun.from_pipeline("x", checked, "s", "b").key == cell.key
     assert cell.files.keys() == {str(scene / "list.txt")}
 
 
@@ -80,7 +80,7 @@ def test_camera_path_name_is_not_a_file(tmp_path, monkeypatch):
 
 def test_sweep_computes_the_expected_keys(tiny_scene, store, tmp_path):
     found = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
-    assert found.on("b").key == keys("smoke", tiny_scene, tmp_path)
+    assert found.in_class("b").key == keys("smoke", tiny_scene, tmp_path)
 
 
 def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, tmp_path, monkeypatch):
@@ -89,7 +89,7 @@ def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, t
         (folder / "m.ply").write_bytes(text)
     monkeypatch.chdir(tmp_path)
     overrides = [f"scene.path={os.path.relpath(tiny_scene)}", "init.source=model", "init.file=m.ply"]
-    cell = CellRun.from_json(CellRun.of("x", load("smoke", overrides), "s", "b").json())
+    cell = CellRun.from_json(CellRun.from_pipeline("x", load("smoke", overrides), "s", "b").json())
     monkeypatch.chdir("elsewhere")
     placed = load(str(write(tmp_path / "cell.yaml", cell.text))).settings
     assert Path(placed.stages[0].file) == tmp_path / "m.ply"
@@ -133,5 +133,5 @@ def test_libraries_that_change_results_are_in_keys(tiny_scene, tmp_path, monkeyp
     assert fingerprint.tools_digest.__wrapped__() != tools
     shutil.copytree(tiny_scene / "train", tmp_path / "photographs")
     scenes = [tmp_path / "photographs", tiny_scene]
-    specs = [CellRun.of("x", load("photos", [f"scene.path={scene}"]), "s", "b").spec for scene in scenes]
+    specs = [CellRun.from_pipeline("x", load("photos", [f"scene.path={scene}"]), "s", "b").spec for scene in scenes]
     assert ["tools" in spec for spec in specs] == [True, False]

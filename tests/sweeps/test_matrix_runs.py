@@ -194,7 +194,7 @@ def test_folders_of_matrices_and_runs_are_not_mixed(finished, tiny_scene, tmp_pa
     with pytest.raises(ConfigError, match="already has a run"):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(finished[1]), None, "new")
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
-    with pytest.raises(ConfigError, match="holds a single run"):
+    with pytest.raises(ConfigError, match="has a single run"):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path), None, "resume")
 
 

@@ -180,9 +180,7 @@ def test_sweep_resumes_only_in_its_first_store(file, execution_file, runs, tmp_p
     runs["seed: 1"] = 6
     with pytest.raises(ClsplatError, match="1 of 2 cells failed"):
         commands.run(file, out=out, on=execution_file)
-    with pytest.raises(
-        ConfigError, match=r"out: was started with --on; its cells are in .*store: give --on FILE again"
-    ):
+    with pytest.raises(ConfigError, match=r"out: was started with --on; its cells are in .*store; give --on again"):
         commands.resume(out)
 
 
@@ -373,7 +371,7 @@ def test_lost_worker_gets_no_cell(tmp_path):
     cluster = scheduler.Cluster(client, Store(tmp_path))
     assert [slot.worker for slot in cluster.slots()] == ["one"]
     client.info = {"workers": {}}
-    cluster._looked = -scheduler.WORKERS_INTERVAL_S
+    cluster._last_check = -scheduler.WORKERS_INTERVAL_S
     assert cluster.slots() == []
 
 
@@ -405,10 +403,10 @@ def test_local_engine_runs_cells_in_parallel_on_loopback(tmp_path, monkeypatch):
     before = {key: library.dask.config.get(key) for key in library.SETTINGS}
     cluster = scheduler.engine(Execution(engine="local"), store, None)
     try:
-        cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
+        cluster.make_command = lambda device: command(WRITES + f"; print({device!r})")
         cells = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
-        drive = Dispatcher(store, cluster, True, CellOptions(store.now()), ended=lambda *end: ended.append(end))
-        drive.look = lambda: seen.update(listening())
+        drive = Dispatcher(store, cluster, True, CellOptions(store.now()), on_end=lambda *end: ended.append(end))
+        drive.poll = lambda: seen.update(listening())
         drive.run(cells)
     finally:
         cluster.close()

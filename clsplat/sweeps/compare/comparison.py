@@ -25,8 +25,8 @@ from clsplat.viewer.charts import COLORS
 # The settings in which resolved pipelines differ.
 
 
-def flat(settings: dict[str, Any]) -> dict[str, str]:
-    """Return key path -> value as text, in the order of the file.
+def flatten(settings: dict[str, Any]) -> dict[str, str]:
+    """Return the settings as a flat dictionary, key path to value as text, in the order of the file.
 
     A stage appears by its name and a strategy by its type, so that pipelines with different stages can be compared:
     `optimize.densify.clone.gradient_above`.  The second item with the same name gets `#2`.
@@ -37,8 +37,8 @@ def flat(settings: dict[str, Any]) -> dict[str, str]:
     return flattened
 
 
-def differing(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the key paths at which flat settings differ from the first ones."""
+def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
+    """Return the key paths at which any of several flat settings differs from the first."""
     first, *others = settings
     return list(dict.fromkeys(difference.key_path for other in others for difference in differences(first, other)))
 
@@ -52,7 +52,7 @@ def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
     elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
         names: dict[str, int] = {}
         for item in value:
-            name, inner = _named(item)
+            name, inner = _split_item(item)
             names[name] = names.get(name, 0) + 1
             label = name if names[name] == 1 else f"{name}#{names[name]}"
             parent = key_path.removesuffix("during").removesuffix("rules").removesuffix("losses").rstrip(".")
@@ -61,8 +61,8 @@ def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
         flattened[key_path] = value if isinstance(value, str) else json.dumps(value)
 
 
-def _named(item: Any) -> tuple[str, Any]:
-    """Return the name of a list's item, and the item without it."""
+def _split_item(item: Any) -> tuple[str, Any]:
+    """Return the name of a list item, and its settings without the name."""
     if isinstance(item, dict) and "type" in item:
         return str(item["type"]), {key: value for key, value in item.items() if key != "type"}
 
@@ -77,17 +77,17 @@ def _join(key_path: str, name: str) -> str:
 
 MAX_DIFFERENCES = 3  # in the name of a variant
 MAX_FOLDERS = 3  # that a variant lists
-MAX_VALUE = 40  # letters of a value in a name
+MAX_VALUE = 40  # characters of a value in a name
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings that runs share, with a letter and a color that identify them on the whole page."""
+    """Settings that runs share, with a letter and a color that identify them on the page."""
 
     letter: str
     name: str
     color: str
-    settings: dict[str, str]  # key path -> value, without scene and seed, with the device
+    settings: dict[str, str]  # by key path, without scene and seed, with the device
     folders: str  # names of the folders of its runs
 
 
@@ -100,11 +100,11 @@ class VariantRow:
 
     @property
     def downscale(self) -> str:
-        """Divisor of the image size: the largest images of the training."""
+        """The divisor of the image size in training; for several sizes, of the largest."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
-        """Return the divisors of the image sizes at which every run was measured."""
+        """Return the image-size divisors at which every run was measured."""
         measured: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
         return set.intersection(*measured)
 
@@ -118,15 +118,15 @@ class VariantRow:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """All runs, grouped into variants and rows."""
+    """Runs to compare, grouped into variants and rows."""
 
     runs: list[RunFolder]
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> "RunComparison":
-        """Read run folders; the folder of a matrix stands for its finished cells.
+        """Read run folders; a matrix folder is replaced by its finished cells.
 
-        Raises DataError if a folder is missing, unfinished or damaged, and ConfigError if there is no folder, a folder
+        Raises DataError if a folder is missing, unfinished, or damaged, and ConfigError if there is no folder, a folder
         is given twice, or a pipeline.yaml cannot be read.
         """
         if not paths:
@@ -141,7 +141,7 @@ class RunComparison:
 
     @cached_property
     def variants(self) -> list[Variant]:
-        """Variants in the order of the runs."""
+        """The variants, in the order of the runs."""
         by_run = [_settings(run) for run in self.runs]
         distinct: list[dict[str, str]] = []
         for settings in by_run:
@@ -156,7 +156,7 @@ class RunComparison:
 
     @cached_property
     def scenes(self) -> dict[str, list[VariantRow]]:
-        """Rows by the name of the scene, in the order of the runs."""
+        """The rows of each scene, by scene name, in the order of the runs."""
         grouped: dict[str, list[RunFolder]] = {}
         for run in self.runs:
             grouped.setdefault(run.scene.model_dump_json(), []).append(run)
@@ -169,12 +169,12 @@ class RunComparison:
 
     def _rows(self, runs: Sequence[RunFolder]) -> Iterator[VariantRow]:
         for variant in self.variants:
-            if of_variant := [run for run in runs if self.variant(run) is variant]:
-                yield VariantRow(variant, sorted(of_variant, key=lambda run: run.metrics.seed))
+            if selected := [run for run in runs if self.variant(run) is variant]:
+                yield VariantRow(variant, sorted(selected, key=lambda run: run.metrics.seed))
 
 
 def _cells(path: Path) -> list[Path]:
-    """Return the finished runs in the folder of a matrix, or else the folder itself."""
+    """Return the folders of finished cells for a matrix folder, or the folder itself."""
     if not (path / PIPELINE).is_file() or "matrix" not in read_settings(path):
         return [path]
     cells = sorted(file.parent for file in path.glob("*/metrics.json"))
@@ -191,37 +191,39 @@ def _settings(run: RunFolder) -> dict[str, str]:
     settings = {key: value for key, value in run.settings.items() if key not in ("scene", "seed", "adapt")}
     adapt = run.settings.get("adapt") or {}
     decided = [decision["key"] for decision in adapt.get("decisions") or ()]
-    chosen = {path: value for path, value in flat(settings).items() if not any(_is_below(path, key) for key in decided)}
+    chosen = {
+        path: value for path, value in flatten(settings).items() if not any(_is_below(path, key) for key in decided)
+    }
     return {**chosen, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
 
 
 def _is_below(key_path: str, key: str) -> bool:
-    """Return whether a flat key path is a key as `--set` writes it, or below it.
+    """Return whether a flat key path is, or is below, a key in the notation of `--set`.
 
-    `optimize.during.0.per_pixel` is `optimize.densify.per_pixel`: lists of stages have numbers there and names here.
+    `optimize.during.0.per_pixel` is `optimize.densify.per_pixel`: `--set` counts the stages, flat paths name them.
     """
     parts = iter(key_path.split("."))
     return all(part in parts for part in key.split(".") if part != "during" and not part.isdigit())
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """Return the pipeline's name, and in words the settings that it does not share with most variants of it."""
-    alike = [other for other in distinct if other.get("name") == settings.get("name")]
+    """Return the name of a variant: the pipeline's name, and the settings that most of its variants do not share."""
+    siblings = [other for other in distinct if other.get("name") == settings.get("name")]
     words: list[str] = []
-    for key_path in differing(alike):
-        text, *others = (_in_words(key_path, variant, alike) for variant in (settings, *alike))
-        if 2 * others.count(text) <= len(alike) and text not in words:
+    for key_path in differing_keys(siblings):
+        text, *others = (_describe_setting(key_path, variant, siblings) for variant in (settings, *siblings))
+        if 2 * others.count(text) <= len(siblings) and text not in words:
             words.append(text)
     more = [f"and {len(words) - MAX_DIFFERENCES} more"] if len(words) > MAX_DIFFERENCES else []
     return ", ".join([settings.get("name", "unnamed"), *words[:MAX_DIFFERENCES], *more])
 
 
-def _in_words(key_path: str, settings: dict[str, str], alike: Sequence[dict[str, str]]) -> str:
-    """Return a setting in words: "init opacity 0.3"; "with prune large" or "without" it if some variants lack it."""
+def _describe_setting(key_path: str, settings: dict[str, str], siblings: Sequence[dict[str, str]]) -> str:
+    """Describe a setting, such as "init opacity 0.3", or "with prune large" and "without prune large"."""
     parts = key_path.split(".")
     for depth in range(1, len(parts) + 1):
         prefix = ".".join(parts[:depth])
-        below = [{path: v for path, v in values.items() if f"{path}.".startswith(f"{prefix}.")} for values in alike]
+        below = [{path: v for path, v in values.items() if f"{path}.".startswith(f"{prefix}.")} for values in siblings]
         if not all(below):  # a stage, rule or key that only some variants have
             words = " ".join(parts[:depth][-2:]).replace("_", " ")
             if not any(f"{path}.".startswith(f"{prefix}.") for path in settings):
@@ -239,7 +241,7 @@ def _folders(runs: Sequence[RunFolder]) -> str:
 
 
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
-    """Return the folder's name and the image size, and all scene settings if several scenes share both."""
+    """Return a name per scene: its folder and image size, and all scene settings if two names would be equal."""
     names = []
     for run in runs:
         size = f" at 1/{run.scene.downscale:g}" if run.scene.downscale != 1 else ""
@@ -254,7 +256,7 @@ def _letter(index: int) -> str:
     return (_letter(index // 26 - 1) if index >= 26 else "") + chr(ord("A") + index % 26)
 
 
-# Published results, shown next to measured ones: a file of tables, each with its source and protocol.
+# Published results to show next to measured ones: tables, each with its source and protocol.
 
 Text = Annotated[str, Field(min_length=1, max_length=2000)]
 
@@ -268,10 +270,10 @@ class PublishedTable(BaseModel):
     source: Text  # the publication, and how the values were taken from it
     protocol: Text  # data, sizes, steps
     columns: Annotated[list[Text], Field(min_length=1)]
-    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # method -> value of each column; null: none
+    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # by method: a value per column, or null
 
     @model_validator(mode="after")
-    def _whole(self) -> "PublishedTable":
+    def _check_rows(self) -> "PublishedTable":
         for name, values in self.rows.items():
             if len(values) != len(self.columns):
                 raise ValueError(f"expected {len(self.columns)} values of '{name}', one per column; got {len(values)}")
@@ -281,7 +283,7 @@ class PublishedTable(BaseModel):
 
     @property
     def shown(self) -> dict[str, list[str]]:
-        """The values of each method as text, all with the same number of digits."""
+        """The values of each method as text, with the same number of digits."""
         values = [value for row in self.rows.values() for value in row if value is not None]
         digits = max(len(f"{value:.10g}".partition(".")[2]) for value in values)
         return {
@@ -298,7 +300,7 @@ class Published(BaseModel):
 
 
 def read_published(path: Path) -> list[PublishedTable]:
-    """Read published tables from a YAML file.  Raises ConfigError, with the line, for any other content."""
+    """Read published tables from a YAML file.  Raises ConfigError, with the line, for invalid content."""
     document = read_yaml(path)
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected the key 'tables'")

@@ -30,17 +30,17 @@ class ImageCrop:
     x: int
     y: int
     side: int
-    difference: float  # mean over the square, in gray levels
+    difference: float  # mean over the square, in 8-bit levels
 
     @property
     def photograph(self) -> Image:
         """The crop of the photo."""
-        return self._of(self.whole_photograph)
+        return self._cut(self.whole_photograph)
 
     @property
     def renders(self) -> list[Image]:
         """The crop of each run's render."""
-        return [self._of(image) for image in self.whole_renders]
+        return [self._cut(image) for image in self.whole_renders]
 
     @property
     def psnrs(self) -> list[float]:
@@ -49,7 +49,7 @@ class ImageCrop:
 
     @property
     def frame(self) -> dict[str, float]:
-        """The square's left, top, width and height in percent of the image."""
+        """The left, top, width, and height of the square, in percent of the image."""
         height, width = self.whole_photograph.shape[:2]
         parts = {
             "left": self.x / width,
@@ -66,22 +66,22 @@ class ImageCrop:
         size = (OVERVIEW_WIDTH, max(1, round(OVERVIEW_WIDTH * height / width)))
         return cv2.resize(self.whole_photograph, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
-    def _of(self, image: Image) -> Image:
+    def _cut(self, image: Image) -> Image:
         return np.ascontiguousarray(image[self.y : self.y + self.side, self.x : self.x + self.side])
 
 
 def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) -> list[ImageCrop]:
-    """Return crops where the renders of a scene differ most, of the views that all runs rendered.
+    """Return the crops where the renders of a scene differ most, from views that all runs rendered.
 
     Raises DataError if a render or a photo is damaged.
     """
     rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
-    chosen: list[ImageCrop] = []  # keep only these and one more view in memory
+    crops: list[ImageCrop] = []  # at most MAX_CROPS and one more view are in memory
     for view in rendered:
         renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # undistorted
-        chosen.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
-        chosen = sorted(chosen, key=lambda crop: -crop.difference)[:MAX_CROPS]
-    return chosen
+        crops.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
+        crops = sorted(crops, key=lambda crop: -crop.difference)[:MAX_CROPS]
+    return crops
 
 
 def _file(run: RunFolder, view: View) -> Path:

@@ -16,16 +16,16 @@ from clsplat.core.files import write_text
 from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
-from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
+from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing_keys
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import VIEWS, moving_average
 from clsplat.viewer.charts import COLORS, Line, curve
 
 # The tables: metrics and costs, means over scenes, differing settings.
 
-METRICS = {  # name -> heading, digits, function that returns the better one
+METRICS = {  # by name: heading, digits, and the function that selects the best
     "psnr": ("PSNR ↑", 2, max),
-    "psnr_color": ("PSNR in the photographs' colors ↑", 2, max),
+    "psnr_color": ("PSNR in the photos' colors ↑", 2, max),
     "psnr_affine": ("PSNR, colors fitted ↑", 2, max),
     "psnr_held_out_moments": ("PSNR, held-out moments ↑", 2, max),
     "psnr_other_moments": ("PSNR, other moments ↑", 2, max),
@@ -37,7 +37,7 @@ METRICS = {  # name -> heading, digits, function that returns the better one
     "lpips": ("LPIPS ↓", 4, min),
 }
 CONDITIONS = {"lpips_input": "input range of LPIPS", "lpips_model": "LPIPS network"}
-MAX_SEEDS = 3  # that are listed
+MAX_SEEDS = 3  # more are only counted
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class Column:
-    """One value per row."""
+    """A column of a table: one value per row."""
 
     heading: str
     cells: list[TableCell]
@@ -59,7 +59,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Group:
-    """Columns with a common title."""
+    """A group of columns with a common title."""
 
     title: str
     columns: list[Column]
@@ -67,11 +67,11 @@ class Group:
 
 @dataclass(frozen=True)
 class MetricTable:
-    """One row per variant."""
+    """A table of metrics, with one row per variant."""
 
     variants: list[Variant]
     groups: list[Group]
-    seeds: list[str] = field(default_factory=list)  # by row; empty: not shown
+    seeds: list[str] = field(default_factory=list)  # by row; empty to hide the column
 
 
 def main_table(rows: Sequence[VariantRow]) -> MetricTable:
@@ -84,7 +84,7 @@ def main_table(rows: Sequence[VariantRow]) -> MetricTable:
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
-    return _table(rows, [*_trained_on(rows), Group("", costs)])
+    return _table(rows, [*_training_size(rows), Group("", costs)])
 
 
 def _train_seconds(row: VariantRow) -> float:
@@ -92,14 +92,14 @@ def _train_seconds(row: VariantRow) -> float:
 
 
 def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """Return a column of a cost that not all runs record, or none if no run does."""
+    """Return a column of a cost that some runs record, or an empty list if no run does."""
     costs = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in costs]
     return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
 def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
-    """Return the metrics of all other sizes and views, a table per split, so that each fits on the page."""
+    """Return the metrics of all other sizes and views, one table per split, so that each fits on the page."""
     by_split: dict[str, list[Group]] = {}
     for split, downscale in _measured(rows):
         if (split, downscale) != ("test", rows[0].downscale):
@@ -108,16 +108,16 @@ def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
 
 
 def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """Return the divisors of the image sizes at which any row was measured, from full size down."""
+    """Return the image-size divisors at which any row was measured, largest images first."""
     divisors = {downscale for row in rows for downscale in row.downscales(split)}
     return sorted(divisors, key=lambda text: (float(text), text))
 
 
 def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
-    """Return means over the scenes of variants that ran on all of them, or None if no metric has any."""
+    """Return means over scenes, for variants that ran on all scenes; None if no metric was measured on all."""
     scenes = list(comparison.scenes.values())
-    everywhere = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
-    complete = [rows for rows in everywhere if len(rows) == len(scenes)]
+    rows_by_variant = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
+    complete = [rows for rows in rows_by_variant if len(rows) == len(scenes)]
     columns = []
     for name, (heading, digits, best) in METRICS.items():
         means = [
@@ -129,13 +129,13 @@ def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
 
 
 def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
-    """Return the settings that differ between variants: key path -> values by variant."""
-    key_paths = differing([variant.settings for variant in variants])
+    """Return the values of the settings that differ between variants, by key path, in the order of variants."""
+    key_paths = differing_keys([variant.settings for variant in variants])
     return {key_path: [variant.settings.get(key_path, "–") for variant in variants] for key_path in key_paths}
 
 
 def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
-    """Yield sentences about conditions that differ between runs, which makes the values of a column incomparable."""
+    """Yield sentences about measuring conditions that differ between runs, so that their metrics are not comparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
     averages = [average for split in splits for average in split.values()]
     for key, name in CONDITIONS.items():
@@ -146,7 +146,7 @@ def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
         measured = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
         counts = {mean.color_views for mean in measured if mean is not None and mean.figure("psnr_color") is not None}
         if len(counts) > 1:
-            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colors"
+            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photos' colors"
             yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
 
 
@@ -155,7 +155,7 @@ def _measured(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
     return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 
 
-def _trained_on(rows: Sequence[VariantRow]) -> list[Group]:
+def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
     """Return the test metrics at the training size, if they were measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
@@ -185,7 +185,7 @@ def _seeds(row: VariantRow) -> str:
 
 
 def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[TableCell]:
-    """Return a cell per list of values; marks the best of the means, as rounded for display."""
+    """Return a cell with the mean of each list of values; the best of the rounded means is marked."""
     means = [round(fmean(row), digits) if row else None for row in values]
     present = [mean for mean in means if mean is not None]
     top = best(present) if best and len(present) > 1 else None
@@ -201,48 +201,51 @@ def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> T
 
 # The charts: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
 
-MAX_LINES = len(COLORS)  # with more runs, a line per variant
+MAX_LINES = len(COLORS)  # of a chart; with more runs, there is one line per variant
 
 
 def curves(rows: Sequence[VariantRow]) -> list[Markup]:
-    """Draw PSNR and Gaussians over steps, a line per run, or per variant if there are many runs; then over sizes."""
+    """Draw PSNR and Gaussians over steps, then over sizes: one line per run, or per variant if there are many runs."""
     downscale = rows[0].runs[0].scene.downscale
     are_many = sum(len(row.runs) for row in rows) > MAX_LINES
     means = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
 
-    def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
+    def lines(get_points: Callable[[RunFolder], Points]) -> list[Line]:
         if are_many:
-            of_rows = [_mean([points_of(run) for run in row.runs]) for row in rows]
+            row_means = [_mean([get_points(run) for run in row.runs]) for row in rows]
             return [
                 Line(points, row.variant.letter, row.variant.color, i // len(COLORS))
-                for i, (row, points) in enumerate(zip(rows, of_rows, strict=True))
+                for i, (row, points) in enumerate(zip(rows, row_means, strict=True))
                 if len(dict(points)) > 1
             ]
         return [
             Line(points, name, row.variant.color, i)
             for row in rows
             for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
-            if len(dict(points := points_of(run))) > 1  # a single step is no line
+            if len(dict(points := get_points(run))) > 1  # a single point is not a line
         ]
 
-    def tested(run: RunFolder) -> Points:
+    def test_points(run: RunFolder) -> Points:
         return run.points("evaluate", "psnr", split="test", downscale=downscale)
 
-    def trained(run: RunFolder) -> Points:
+    def training_points(run: RunFolder) -> Points:
         points = run.points("train", "psnr")
         return list(zip([step for step, _ in points], moving_average([psnr for _, psnr in points]), strict=True))
 
     drawings = [
-        curve(f"test PSNR over steps, dB{means}", lines(tested)),
-        curve(f"test PSNR over CPU seconds of training, dB{means}", lines(lambda run: run.by_cpu_seconds(tested(run)))),
-        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(trained)),
+        curve(f"test PSNR over steps, dB{means}", lines(test_points)),
+        curve(
+            f"test PSNR over CPU seconds of training, dB{means}",
+            lines(lambda run: run.by_cpu_seconds(test_points(run))),
+        ),
+        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(training_points)),
         curve(f"Gaussians over steps{means}", lines(lambda run: run.points("train", "gaussians"))),
     ]
     return safe_charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
 def _mean(lines: Sequence[Points]) -> Points:
-    """Return the mean of lines, point by point, up to the end of the shortest."""
+    """Return the pointwise mean of lines, up to the end of the shortest."""
     return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
 
 
@@ -261,7 +264,7 @@ def _names(row: VariantRow) -> list[str]:
 
 
 def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """Draw PSNR and SSIM over image sizes, a line per variant."""
+    """Draw PSNR and SSIM over image sizes, one line per variant."""
     sizes = downscales(rows, split)
     if len(sizes) < 2:
         return []
@@ -277,7 +280,7 @@ def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
 
 
 LOG = logging.getLogger("clsplat")
-MAX_NAMES = 4  # of pipelines, in the title
+MAX_NAMES = 4  # pipelines in the title
 
 
 def write_comparison(
@@ -287,12 +290,12 @@ def write_comparison(
     remarks: Sequence[str] = (),
     published: Sequence[PublishedTable] = (),
 ) -> int:
-    """Write the page for run folders and return the number of runs.  Raises what `RunComparison.read` raises."""
+    """Write the page for run folders; return the number of runs.  Raises the errors of `RunComparison.read`."""
     comparison = RunComparison.read(paths)
-    faults = [fault for run in comparison.runs for fault in run.missing_plugins]
-    for fault in faults:
-        LOG.warning("%s", fault)
-    write_text(out, comparison_page(comparison, title, [*remarks, *faults], out.parent, published))
+    warnings = [warning for run in comparison.runs for warning in run.missing_plugins]
+    for warning in warnings:
+        LOG.warning("%s", warning)
+    write_text(out, comparison_page(comparison, title, [*remarks, *warnings], out.parent, published))
     return len(comparison.runs)
 
 
@@ -303,7 +306,7 @@ def comparison_page(
     folder: Path,
     published: Sequence[PublishedTable] = (),
 ) -> str:
-    """Return the page, with links relative to `folder` and `remarks` at the top.
+    """Return the HTML of the page, with links relative to `folder` and `remarks` at the top.
 
     title: by default the names of the pipelines.
     """
@@ -327,7 +330,7 @@ def comparison_page(
 
 
 def _links(run: RunFolder, folder: Path) -> dict[str, str]:
-    """Return the addresses of a run's pages, relative to a folder."""
+    """Return the links to a run's pages, relative to a folder."""
     files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
     return {
         stage: quote(Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
@@ -337,7 +340,7 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 
 
 def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
-    """Return the values of the page's section about a scene."""
+    """Return the template values for the section of a scene."""
     crops, no_crops = _crops(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
@@ -356,20 +359,20 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
 
 
 def _sizes(scene: SceneSettings) -> list[str]:
-    """Explain image sizes if the training used others than full size, or several."""
+    """Return an explanation of image sizes, unless all training images had full size."""
     first, *more = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
     if first == "full size" and not more:
         return []
-    return [f"sizes are relative to the original photographs; trained at {', '.join([first, *more])}"]
+    return [f"sizes are relative to the original photos; trained at {', '.join([first, *more])}"]
 
 
 def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
-    """Return crops of each row's first run, or the reason if there are none, such as missing photos."""
+    """Return crops of each row's first run, and if there are none, the reason, such as missing photos."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
-        photographs, background = settings.read(runs[0].photographs)
-        scene = photographs.downscaled(settings.downscale)
+        original, background = settings.read(runs[0].photographs)
+        scene = original.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
         return [], str(error)
@@ -378,7 +381,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
 
 
 def _figure(crop: ImageCrop) -> dict[str, Any]:
-    """Return the crop for the page, with images as data URLs; the crops are PNG, which is lossless."""
+    """Return the template values of a crop, with images as data URLs; crops are PNG, because it is lossless."""
     return dict(
         view=crop.view,
         overview=data_url(crop.overview),
