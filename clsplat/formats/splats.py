@@ -82,7 +82,8 @@ def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 STORED_DEGREE = 4  # of some formats; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
-NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: near plane and screen filter of 3DGS
+VARIANCE = 0.3  # px²: screen filter of 3DGS
+NEAR_SHARE = 0.04  # of the median distance of the means from their middle, for a near plane that no file or scene gives
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
@@ -247,6 +248,15 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
     for table in parameters.values():
         found |= ~np.isfinite(table).all(axis=1)
     return found
+
+
+def usual_near(means: NDArray[np.floating]) -> float:
+    """Return the near plane of Gaussians with these means, [N, 3], if no file or scene gives one, scene units."""
+    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
+    if not len(finite):
+        return NEAR_SHARE
+    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
+    return NEAR_SHARE * (float(np.median(distances)) or float(distances.max()) or 1.0)
 
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from clsplat.formats.sog import META, looks_like_sog, read_sog, sog_folder_files
 from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_ksplat, read_splat, write_splat
 from clsplat.formats.splats import (
     MIP_VARIANCE,
-    NEAR,
     VARIANCE,
     Reading,
     SplatFile,
@@ -26,6 +26,7 @@ from clsplat.formats.splats import (
     clamp_limits,
     not_finite,
     require_static,
+    usual_near,
 )
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.streamed_sog import LOD_META, lod_files, looks_like_lod, read_lod
@@ -284,9 +285,13 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
         )
 
 
+USUAL = 10  # x the near plane of a file without one, and a share of it: between them, a file needs none
+
+
 def _unusual(splats: SplatFile) -> str:
     """Describe the numbers for rendering that differ from the defaults of files without them."""
-    usual = {"near": NEAR, "screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None}
-    usual["pixel_box"] = 0
+    near, own = splats.rendering.get("near"), usual_near(splats.parameters["means"])
+    usual: dict[str, Any] = {} if near and own / USUAL < near < own * USUAL else {"near": near and own}
+    usual |= {"screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None, "pixel_box": 0}
     given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
     return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])

@@ -408,13 +408,16 @@ def _rotations_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 # Gaussians from points.
 
-MIN_DISTANCE2 = 1.0e-7  # scene units², so that coincident points still get a size
+MIN_DISTANCE2 = 4.0e-9  # extents², so that coincident points still get a size: 1e-7 in 3DGS, at an extent of 5
 
 
-def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
-    """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors."""
+def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0, extent: float = 1.0) -> Parameters:
+    """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors.
+
+    extent: of the scene, scene units, for points without a distance.
+    """
     count = len(points)
-    log_scales = 0.5 * np.log(neighbor_distance2(points.positions)) + math.log(scale)
+    log_scales = 0.5 * np.log(neighbor_distance2(points.positions, extent)) + math.log(scale)
     quats = np.zeros((count, 4))
     quats[:, 0] = 1
     return {
@@ -427,11 +430,14 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
     }
 
 
-def neighbor_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the exact mean squared distance to the three nearest neighbors, [N] scene units²."""
+def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
+    """Return the exact mean squared distance to the three nearest neighbors, [N] scene units².
+
+    extent: of the scene, the distance if there is one point, scene units.
+    """
     neighbors = min(4, len(positions))
     if neighbors < 2:
-        return np.full(len(positions), 1.0)
+        return np.full(len(positions), extent**2)
     distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbors, workers=-1)[0]
     squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
-    return np.maximum(squared, MIN_DISTANCE2)
+    return np.maximum(squared, MIN_DISTANCE2 * extent**2)

@@ -20,7 +20,6 @@ from clsplat.formats.splats import (
     MAX_LOG,
     MAX_VALUE,
     MIP_VARIANCE,
-    NEAR,
     PARAMETERS,
     SH_C0,
     VARIANCE,
@@ -33,13 +32,15 @@ from clsplat.formats.splats import (
     sh_coefficients,
     sh_degree_of,
     transform,
+    usual_near,
 )
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.motion import evaluate_at, transformed_motion
 from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
-from clsplat.scene.scene import far_origin, position_text
+from clsplat.scene.quality import near_plane
+from clsplat.scene.scene import Scene, far_origin, position_text
 
 # The numbers for rendering a model, as stored in its file.
 
@@ -48,7 +49,7 @@ from clsplat.scene.scene import far_origin, position_text
 class Rendering:
     """The numbers for rendering a model."""
 
-    near: float = NEAR  # scene units; nearer Gaussians are not rendered
+    near: float = 0.0  # scene units; nearer Gaussians are not rendered; 0: as the scene or the model gives it
     screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: opacities are reduced to conserve energy under that variance
     background: Literal["black", "white"] | None = None  # None: the background of the scene
@@ -71,7 +72,8 @@ class Rendering:
 
     def comment(self) -> dict[str, Any]:
         """Return the values for a model file's comment."""
-        numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
+        numbers = {"screen_variance": self.screen_variance, "compensate": self.compensate}
+        numbers = {"near": self.near, **numbers} if self.near else numbers
         optional: dict[str, Any] = {"background": self.background} if self.background else {}
         if self.pixel_box or "pixel_box" in self.notes:  # leaves files of other models unchanged
             optional["pixel_box"] = self.pixel_box
@@ -158,7 +160,7 @@ class Model:
         gaussians = Gaussians(device, self.tables())
         screen = numbers.screen_variance, numbers.compensate, numbers.pixel_box
         sky = self.sky.upload(device) if self.sky else None
-        return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen, sky=sky)
+        return DeviceModel(gaussians, self.sh_degree, self.near, *screen, sky=sky)
 
     def tables(self) -> dict[str, Floats]:
         """Return the arrays by name, including filter_variance and motion if present."""
@@ -186,6 +188,11 @@ class Model:
     def sh_degree(self) -> int:
         """The SH degree."""
         return sh_degree_of(self.sh_rest.shape[1])
+
+    @property
+    def near(self) -> float:
+        """The near plane, scene units: that of `rendering`, or else a share of the size of the model."""
+        return self.rendering.near or usual_near(self.means)
 
     @property
     def scales(self) -> Floats:
@@ -233,6 +240,13 @@ class Model:
             raise ValueError("the result does not fit in a model file; use a smaller scale and translation")
         sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
         return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky, origin=origin)
+
+    def in_scene(self, scene: Scene) -> "Model":
+        """Return the model relative to the scene's origin, with the scene's near plane unless its file gives one."""
+        model = self.with_origin(scene.origin)
+        if model.rendering.near:
+            return model
+        return replace(model, rendering=replace(model.rendering, near=near_plane(scene)))
 
     def with_origin(self, origin: NDArray[np.floating]) -> "Model":
         """Return the model with its means relative to another origin, [3] world coordinates.

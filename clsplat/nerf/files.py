@@ -23,6 +23,7 @@ from clsplat.nerf.field import Field
 from clsplat.nerf.shape import FieldShape, WrittenShape
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import BACKGROUNDS
+from clsplat.scene.scene import Scene
 from clsplat.training import archive
 
 FORMAT: Final = 1
@@ -59,6 +60,10 @@ class FieldModel:
             raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
         if self.origin.shape != (3,):
             raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
+
+    def in_scene(self, scene: Scene) -> "FieldModel":
+        """Return the field.  Raises DataError for a scene with another origin."""
+        return self.with_origin(scene.origin)
 
     def with_origin(self, origin: NDArray[np.floating]) -> "FieldModel":
         """Return the field, which cannot be moved.  Raises DataError for an origin other than its own."""

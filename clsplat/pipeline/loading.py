@@ -223,6 +223,8 @@ def without_auto(data: Any) -> Any:
         return [without_auto(item) for item in data]
     if not isinstance(data, dict):
         return data
+    if (near := data.get("near_auto")) is not None:
+        data = {**data, "near": "auto" if data["near"] == near else data["near"], "near_auto": None}
     is_auto = all(key in data for key in AUTO)
     return {key: without_auto(value) for key, value in data.items() if not (is_auto and key in AUTO)}
 

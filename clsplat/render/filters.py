@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from clsplat.core.settings import OneOf, Settings
+from clsplat.core.settings import OneOf, Settings, in_one_sentence
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, motion_width
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
@@ -176,10 +176,18 @@ class Motion(Settings):
 class ModelSettings(Settings):
     """How Gaussians are rendered."""
 
+    output_keys: ClassVar[frozenset[str]] = frozenset({"near_auto"})
+
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Highest degree of the spherical harmonics."""
-    near: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] = 0.2
-    """Smallest depth in scene units that is drawn."""
+    near: Annotated[
+        Literal["auto"] | Annotated[float, Field(gt=0, lt=MAX_NUMBER)],
+        in_one_sentence(f"expected 'auto' or a depth above 0 and below {MAX_NUMBER:g}"),
+    ] = "auto"
+    """Smallest depth in scene units that is drawn; `auto`: 4% of the scene's extent, or half of the depth that 1% of
+    the observed points are nearer than, if that is less.  A run writes the number."""
+    near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
+    """Written by a run: the number that `auto` chose.  Other photos choose again while `near` is that number."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()
@@ -196,6 +204,7 @@ class ModelSettings(Settings):
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
+        assert self.near != "auto"  # a run chooses it before its first stage
         screen = self.screen_filter
         numbers = screen.variance, float(screen.compensate), float(screen.pixel_box)
         return DeviceModel(gaussians, degree, self.near, *numbers)

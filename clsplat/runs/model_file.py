@@ -338,7 +338,7 @@ class ModelFile:
         loaded = read(self.source.file)
         self.device = open_verified(device)
         original = self.source.scene(loaded)
-        self.loaded = loaded.with_origin(original.origin)
+        self.loaded = loaded.in_scene(original)
         self.photographs = apply_side_files(self.source.file, original) if scene is None else original
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)

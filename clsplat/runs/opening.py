@@ -26,7 +26,7 @@ from clsplat.runs.run_folder import Start
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity, decode_all, require_decodable
-from clsplat.scene.quality import Measures, measure_scene, near_depth
+from clsplat.scene.quality import Measures, measure_scene, near_depth, near_plane
 from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import MissingViewError
@@ -215,6 +215,7 @@ def undistorted_folder(out: Path) -> Path:
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
     """Return the run of a pipeline on a scene, in the state before its first stage."""
+    pipeline = with_near(pipeline, scene.scene)
     settings = pipeline.settings
     budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
     return Run(
@@ -257,9 +258,18 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
         return pipeline
 
 
-def _warn_of_near(near: float, nearest: float | None) -> None:
+def with_near(pipeline: Pipeline, scene: Scene) -> Pipeline:
+    """Return the pipeline with the near plane that `auto` chooses by the scene."""
+    model = pipeline.settings.model
+    if model.near != "auto":
+        return pipeline
+    changed = model.model_copy(update=dict.fromkeys(("near", "near_auto"), near_plane(scene)))
+    return replace(pipeline, settings=pipeline.settings.model_copy(update={"model": changed}))
+
+
+def _warn_of_near(near: float | str, nearest: float | None) -> None:
     """Warn if the nearest points are in front of the near plane; both in scene units."""
-    if nearest is not None and nearest < near:
+    if isinstance(near, float) and nearest is not None and nearest < near:
         LOG.warning(
             "nothing nearer than model.near=%g scene units is drawn, but the nearest points of the training photos are "
             "at %.3g; set model.near to %.2g",
@@ -276,5 +286,6 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
 
     settings = map_trainings(pipeline.settings, Optimize, with_choices)
     modules = [module for stage in settings.stages if isinstance(stage, Optimize) for module in stage.modules]
-    settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules)})
+    near = {key: getattr(run.model_settings, key) for key in ("near", "near_auto")}
+    settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules).model_copy(update=near)})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

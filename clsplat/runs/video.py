@@ -92,7 +92,7 @@ def make_video(
     loaded = _read(model)
     used_scene = _scene(model, scene, loaded, downscale, needed=not request.is_file or extras.side == PHOTOGRAPH)
     origin = used_scene.origin if used_scene else loaded.origin
-    loaded = loaded.with_origin(origin)
+    loaded = loaded.in_scene(used_scene) if used_scene else loaded
     plan = plan_video(request, used_scene, points_of(loaded, used_scene), moves=is_moving(loaded), origin=origin)
     background = loaded.rendering.background or (used_scene.background if used_scene else "black")
     opened_device = open_verified(device)
@@ -141,7 +141,8 @@ def _side(
     if name is None:
         return None
     if name != PHOTOGRAPH:
-        other = _read(Path(name)).with_origin(origin)
+        other = _read(Path(name))
+        other = other.in_scene(scene) if scene else other.with_origin(origin)
         return Canvas(make_painter(other, device, other.rendering.background or background)).picture
     assert scene is not None
     photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
@@ -201,7 +202,9 @@ def view(
     used_scene = source.scene(first).downscaled(source.settings.downscale) if source else None
     background = first.rendering.background or (used_scene.background if used_scene else "black")
     origin = used_scene.origin if used_scene else first.origin
-    loaded = {name: model.with_origin(origin) for name, model in loaded.items()}
+    loaded = {
+        name: model.in_scene(used_scene) if used_scene else model.with_origin(origin) for name, model in loaded.items()
+    }
 
     def read_photo(view: View) -> NDArray[np.uint8]:
         return load_photograph(view, BACKGROUNDS[background])[:, :, :3]

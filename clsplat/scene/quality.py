@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from clsplat.scene.images import read_gray
 from clsplat.scene.reprojection import reprojection_errors
-from clsplat.scene.scene import Scene
+from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_mask, load_transparency, sample_views
 
 NEAREST = 0.01  # quantile of the depths of observed points: a few nearer ones are wrong
+NEAR_SHARE = 0.04  # of the extent
+MAX_POINTS = 10_000  # of a cloud, for depths
 
 
 @dataclass
@@ -45,18 +47,43 @@ def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda
 def near_depth(scene: Scene) -> float | None:
     """Return the depth in scene units below which 1 % of all observed points are, over the training views.
 
-    Validation views count as training views.  None when the dataset does not say which views observe which points.
+    Validation views count as training views.  When the dataset does not say which views observe which points, a view
+    observes those inside its image.  None without points.
     """
-    if scene.tracks is None:
-        return None
-    shown = [
-        (view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])])
-        for view in scene.merge_validation().split("train")
-    ]
+    views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file
-        depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
-    ahead = [depth[(depth > 0) & (depth < np.inf)] for depth in depths]
+        ahead = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
     return float(np.quantile(np.concatenate(ahead), NEAREST)) if any(map(len, ahead)) else None
+
+
+def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
+    """Return the depths of the points that a view observes, scene units."""
+    if scene.tracks is None:
+        return points_in_image(view, scene.points)
+    points = scene.tracks.positions[scene.tracks.seen.get(view.name, [])]
+    depths = points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
+    return np.asarray(depths[depths > 0])
+
+
+def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]:
+    """Return the depths of points that project into a view's image, scene units; of a large cloud, of a sample."""
+    points = np.zeros((0, 3)) if cloud is None else cloud.positions
+    points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
+    x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
+    z = np.where(z > 0, z, np.inf)
+    column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
+    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
+    return np.asarray(z[inside])
+
+
+def near_plane(scene: Scene) -> float:
+    """Return the near plane of `model.near: auto`, scene units.
+
+    It is 4% of the extent, 0.2 where that is 5, or half of `near_depth` if that is less.  With three digits, it is the
+    same number on every machine.
+    """
+    nearest = near_depth(scene)
+    return float(f"{min(NEAR_SHARE * scene.extent, np.inf if nearest is None else nearest / 2):.3g}")
 
 
 # Sharpness of photographs.

@@ -50,6 +50,7 @@ HOLDOUT = 8  # every 8th view is a test view if the dataset has no split: the de
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_OFFSET = 100  # x the median distance of the points; float32 then places them to 1e-5 of that distance
 MAX_OUTLIERS = 0.2  # fraction of the cameras
+ROUNDING = 1e-6  # of the largest coordinate: cameras that are nearer to each other have one center
 MAX_THUMBNAILS = 4
 SPLITS = ("train", "test", "validation")
 
@@ -212,7 +213,7 @@ def make_scene(
         points = points and replace(points, positions=points.positions - origin)
     views = [replace(view, camera_to_world=None) if view.camera_to_world is not None else view for view in views]
     points = points and replace(points, positions=np.asarray(points.positions, np.float32))
-    extent = camera_extent([views[i] for i in train])
+    extent = camera_extent([views[i] for i in train], None if points is None else points.positions)
     return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background, origin=origin)
 
 
@@ -249,14 +250,21 @@ def position_text(position: Floats) -> str:
     return f"({', '.join(f'{value:.15g}' for value in position)})"
 
 
-def camera_extent(views: list[View]) -> float:
+def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None) -> float:
     """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
 
-    Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.
+    Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
+    have one center, it is the median distance of the points, or without points the depth of the coordinates' zero.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
-    radius = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    return radius if radius > 0 else 1.0
+    middle = centers.mean(axis=0)
+    radius = 1.1 * float(np.linalg.norm(centers - middle, axis=1).max())
+    if radius > ROUNDING * float(np.abs(middle).max()):
+        return radius
+    around = np.zeros((0, 3)) if points is None else points.astype(np.float64)
+    around = around[np.isfinite(around).all(axis=1)]
+    distances = np.linalg.norm(around - middle, axis=1) if len(around) else np.abs([views[0].world_to_camera[2, 3]])
+    return float(np.median(distances)) or 1.0
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:

@@ -317,7 +317,8 @@ class Split:
 def _with_test(scene: Scene, test: set[int]) -> Scene:
     """Return the scene with other test views, and with the extent of its training views."""
     train = other_views(scene.path, len(scene.views), test)
-    extent = camera_extent([scene.views[i] for i in train])
+    points = None if scene.points is None else scene.points.positions
+    extent = camera_extent([scene.views[i] for i in train], points)
     return replace(scene, train=train, test=tuple(sorted(test)), extent=extent)
 
 

@@ -81,7 +81,7 @@ class Evaluate(Scheduled):
             return run.painter()
         return SplatPainter(
             run.rasterizer,
-            load(run.out / self.file).with_origin(run.scene.origin).upload(run.device),
+            load(run.out / self.file).in_scene(run.scene).upload(run.device),
             run.photographs.background,
         )
 

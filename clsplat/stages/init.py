@@ -204,7 +204,7 @@ class Init(Stage):
         if source == "points" and self._is_joined(run.scene):
             points, source = points.joined(swept(run, self.sweep_points)), "points+sweep"
         self._require_memory(run, len(points))
-        parameters = from_points(points, self.opacity, degree, self.scale)
+        parameters = from_points(points, self.opacity, degree, self.scale, run.scene.extent)
         seen = points.times if self.times == "per_frame" else None
         return moving(parameters, run.model_settings.time, seen, (self.duration, self.min_duration), run.seed), source
 

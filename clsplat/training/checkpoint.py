@@ -431,6 +431,8 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
     for difference in differences(old, run.pipeline, run.settings):
         if difference.kind == "output" or difference.is_moved_file(state.file_hashes, run.file_hashes):
             continue
+        if difference.key_path == "model.near" and state.inputs != run.inputs:
+            continue  # the scene's; its change is an error of its own
         if difference.kind is None:
             raise ConfigError(f"{path} was saved with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:

@@ -88,7 +88,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
         "faint": faint,  # Gaussians too faint to draw: without a limit, a valid model loses only these
         **({"sky": sky} if sky else {}),
         "degree": model.sh_degree,
-        "near": model.rendering.near,
+        "near": model.near,
         "variance": model.rendering.screen_variance,
         "compensate": model.rendering.compensate,
         **({"box": 1} if model.rendering.pixel_box else {}),

@@ -42,7 +42,7 @@ from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.runs.estimate import MAX_PER_PIXEL, max_gaussians, minutes_text, step_seconds
 from clsplat.runs.failures import Failures
 from clsplat.runs.model_file import path_setting, photo_folder, require_model
-from clsplat.runs.opening import read_run_scene
+from clsplat.runs.opening import read_run_scene, with_near
 from clsplat.runs.status import status_text
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
@@ -143,6 +143,7 @@ class Blocks:
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
         self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
+        self.pipeline = with_near(self.pipeline, self.scene.scene)  # a block has other photos, and would choose another
         if len(self.scene.original.downscales) > 1:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
@@ -164,7 +165,7 @@ class Blocks:
             LOG.info("training the coarse model")
             file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
-        model = load_model(file).with_origin(self.scene.scene.origin)
+        model = load_model(file).in_scene(self.scene.scene)
         photographs = Photographs(self.device, self.scene.background, budget=0)  # each photo is used once per pass
         partitioner = Partitioner(model, self.scene.scene, self.device, photographs)
         partition = partitioner.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)

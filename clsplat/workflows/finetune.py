@@ -88,7 +88,7 @@ class Tuning:
         sky = self.model.sky and {"type": "envmap", "side": self.model.sky.side}
         return {
             "model.sh_degree": self.model.sh_degree,
-            "model.near": numbers.near,
+            "model.near": self.model.near,
             "model.screen_filter": screen,
             **({"model.background": sky} if sky else {}),
         }
@@ -223,7 +223,7 @@ class Measurer:
 
     def figures(self, model: Model) -> tuple[float, float]:
         """Return the mean PSNR in dB and the mean SSIM of a model."""
-        views, shifted = self.opened.scene.split(self.split), model.with_origin(self.opened.scene.origin)
+        views, shifted = self.opened.scene.split(self.split), model.in_scene(self.opened.scene)
         painter = SplatPainter(self.rasterizer, shifted.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)

@@ -297,10 +297,11 @@ def test_lost_render_settings_are_reported(tmp_path, rng, caplog):
     for name in ("a.ply", "a.sog", "a.glb"):
         assert round_trip(tmp_path / name, source).rendering == source.rendering
     assert "does not store" not in caplog.text
+    source.rendering["near"] = 5
     write(tmp_path / "a.spz", source)
-    assert "SPZ does not store near = 0.05; PLY, SOG, and GLB do" in caplog.text
+    assert "SPZ does not store near = 5; PLY, SOG, and GLB do" in caplog.text
     caplog.clear()
-    source.rendering["near"] = 0.2
+    source.rendering["near"] = 0.05  # a file without a near plane is drawn with a similar one
     write(tmp_path / "a.spz", source)
     assert "does not store" not in caplog.text
 

@@ -1,6 +1,8 @@
 """Scenes with a transforms.json."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +10,7 @@ import numpy as np
 
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.points import write_points_ply
+from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.transforms_json import opengl_matrix
 from clsplat.scene.view import View
@@ -71,3 +73,19 @@ def write_shifted(folder, shift=0.0):
     (folder / "transforms.json").write_text(json.dumps(LENS | {"frames": frames, "ply_file_path": "p.ply"}))
     write_points_ply(folder / "p.ply", PointCloud(SHIFTED_POINTS + shift, np.full((3, 3), 0.5)))
     return read_scene(folder, holdout=0)
+
+
+def scaled(scene: Path, folder: Path, factor: float) -> Path:
+    """Copy a synthetic scene in another unit of length."""
+    shutil.copytree(scene, folder)
+    for file in folder.glob("transforms*.json"):
+        table = json.loads(file.read_text())
+        for frame in table["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] *= factor
+            frame["transform_matrix"] = pose.tolist()
+        file.write_text(json.dumps(table))
+    for file in folder.glob("*.ply"):
+        points = read_points_ply(file)
+        write_points_ply(file, replace(points, positions=points.positions * factor))
+    return folder

@@ -262,13 +262,13 @@ def test_earlier_file_stays_if_none_meets_the_new_target(few_steps, tmp_path):
 def test_spz_losses_are_reported_once_per_search(few_steps, tiny_scene, tmp_path, caplog):
     caplog.set_level("INFO")
     model = clsplat.load(few_steps / "point_cloud.ply")
-    model = replace(model, rendering=replace(model.rendering, near=0.05))
+    model = replace(model, rendering=replace(model.rendering, near=0.001))
     model.save(tmp_path / "a.ply")
     ask = {"out": tmp_path / "out", "format": "spz", "keep": KEEP, "steps": STEPS}
     clsplat.compress_model(tmp_path / "a.ply", tiny_scene, target="-90dB", **ask)
     assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
     (told,) = [text for text in caplog.messages if "does not store" in text]
-    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not store near = 0.05")
+    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not store near = 0.001")
     assert "read with the axes of SPZ" not in caplog.text
 
 

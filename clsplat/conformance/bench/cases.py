@@ -28,6 +28,7 @@ from clsplat.render.camera import upload_camera
 from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.scene.camera import Camera
 from clsplat.scene.points import read_points_ply
+from clsplat.scene.quality import near_plane
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan
@@ -267,13 +268,16 @@ def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
+NEAR = 0.2  # scene units, of the synthetic scene
+
+
 def case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> BenchCase:
     """Return a synthetic scene with a noise image as its photograph."""
     parameters, view = synthetic(width, height, count)
     camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    return BenchCase(device, parameters, Photograph(camera, device.upload(pixels)), "black", settings)
+    return BenchCase(device, parameters, Photograph(camera, device.upload(pixels)), "black", with_near(settings, NEAR))
 
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
@@ -281,4 +285,11 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
-    return BenchCase(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
+    near = with_near(settings, near_plane(opened))
+    return BenchCase(device, parameters, photographs.get(opened.split("train")[0]), background, near)
+
+
+def with_near(settings: PipelineFile, near: float) -> PipelineFile:
+    """Return settings with this near plane, scene units, if theirs is `auto`."""
+    model = settings.model.model_copy(update={"near": near})
+    return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

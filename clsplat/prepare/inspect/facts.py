@@ -280,7 +280,13 @@ def measure_dataset(parts: Parts) -> Facts:
     known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
     centers = np.stack([view.position for view in views]) if views else np.empty((0, 3))
-    extent = parts.scene.extent if parts.scene else camera_extent(views) if views else None
+    extent = (
+        parts.scene.extent
+        if parts.scene
+        else camera_extent(views, parts.points and parts.points.positions)
+        if views
+        else None
+    )
     return Facts(
         path=str(parts.path),
         kind=parts.kind,

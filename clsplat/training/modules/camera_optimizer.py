@@ -23,6 +23,7 @@ from clsplat.photos.appearance import ViewTable, adam_step
 from clsplat.render.camera import moved_camera
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.render.workspace import Workspace
+from clsplat.scene.quality import points_in_image
 from clsplat.scene.reprojection import replace_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, can_zoom
@@ -40,7 +41,7 @@ ROTATION_RATIO = 0.3  # ours; a rotation about the pivot changes the image littl
 REACH = 0.01  # translation, relative to the depth, to which the rates of all visits must add up
 FOCAL_RATE, MAX_FOCAL_RATE = 1e-4, 1e-3  # likewise, for the logarithms of focal lengths
 FOCAL_REACH = 0.2  # likewise; noise uses up most of it, and changes are a few hundredths
-MIN_POINTS, MAX_POINTS = 10, 10_000  # points whose median depth is used
+MIN_POINTS = 10  # whose median depth is used
 MAX_ZOOM = 10.0  # largest factor of a focal length in a side file
 LOG = logging.getLogger("clsplat")
 
@@ -320,13 +321,8 @@ def require_zoom(scene: Scene) -> None:
 
 def median_depth(view: View, scene: Scene) -> float:
     """Return the median depth of the scene's points in a view's frustum, or the extent if there are too few points."""
-    points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
-    points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
-    x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
-    z = np.where(z > 0, z, np.inf)
-    column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
-    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
-    return float(np.median(z[inside])) if np.count_nonzero(inside) >= MIN_POINTS else float(scene.extent)
+    depths = points_in_image(view, scene.points)
+    return float(np.median(depths)) if len(depths) >= MIN_POINTS else float(scene.extent)
 
 
 def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:

@@ -1,0 +1,101 @@
+"""A scene in any unit of length gives the same model: the near plane and all other lengths follow the scene."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.gaussians.model import Rendering, load
+from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.runs.model_file import evaluate
+from clsplat.scene.detect import read_scene
+from clsplat.scene.quality import near_plane
+from clsplat.scene.scene import PointCloud, Scene, camera_extent
+from tests.support.commands import clsplat
+from tests.support.transforms_scene import scaled
+
+FACTORS = 1e-4, 1e5
+STEPS = "optimize.steps=50", "optimize.checkpoint.every=25", "optimize.checkpoint.keep=2"
+
+
+@pytest.fixture(scope="module")
+def runs(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
+    """Finished runs of a scene in several units of length, by its factor."""
+    folder, runs = tmp_path_factory.mktemp("units"), dict[float, Path]()
+    for factor in (1.0, *FACTORS):
+        scene, runs[factor] = scaled(tiny_scene, folder / f"scene_{factor:g}", factor), folder / f"run_{factor:g}"
+        settings = [part for setting in STEPS for part in ("--set", setting)]
+        clsplat("run", "smoke", "--scene", scene, "--out", runs[factor], *settings)
+    return runs
+
+
+def trained_psnr(run: Path) -> float:
+    return json.loads((run / "metrics.json").read_text())["test"]["1"]["psnr"]
+
+
+def near_of(run: Path) -> float | str:
+    return load_pipeline(str(run / "pipeline.yaml")).settings.model.near
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_scene_trains_alike_in_any_unit_of_length(runs, factor):
+    assert trained_psnr(runs[factor]) == pytest.approx(trained_psnr(runs[1]), abs=0.1)
+    assert near_of(runs[factor]) == pytest.approx(factor * near_of(runs[1]), rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, *FACTORS])
+def test_a_file_of_another_program_is_drawn_in_any_unit(runs, factor, tmp_path):
+    model = load(runs[factor])
+    replace(model, rendering=Rendering()).save(tmp_path / "foreign.ply")
+    assert not load(tmp_path / "foreign.ply").rendering.near
+    metrics = evaluate(tmp_path / "foreign.ply", runs[factor].with_name(f"scene_{factor:g}"))
+    assert metrics["test"]["1"]["psnr"] == pytest.approx(trained_psnr(runs[1]), abs=0.2)
+    assert 0 < load(tmp_path / "foreign.ply").near < 0.1 * factor, "without a scene, by the size of the model"
+
+
+@pytest.mark.slow
+def test_a_resumed_run_keeps_its_near_plane(runs):
+    run, file = runs[1], runs[1] / "pipeline.yaml"
+    assert (
+        "up to date"
+        in clsplat(
+            "run",
+            "smoke",
+            "--scene",
+            run.with_name("scene_1"),
+            "--out",
+            run,
+            "--resume",
+            *(part for setting in STEPS for part in ("--set", setting)),
+        ).stdout
+    )
+    number = near_of(run)
+    assert f"near: {number}" in file.read_text()
+    clsplat("resume", run, "--steps", "60")
+    assert near_of(run) == number
+
+
+def test_the_near_plane_is_a_share_of_the_scene(tiny_scene):
+    scene = read_scene(tiny_scene)
+    assert near_plane(replace(scene, points=None)) == pytest.approx(0.04 * scene.extent, rel=0.005)
+    view = scene.split("train")[0]
+    close = view.position + 0.1 * view.world_to_camera[2, :3]
+    points = PointCloud(np.tile(close, (99, 1)).astype(np.float32), np.zeros((99, 3), np.float32))
+    assert near_plane(replace(scene, points=points)) == pytest.approx(0.05, rel=0.01), "half of where points begin"
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e5])
+def test_cameras_with_one_center_have_an_extent(tiny_scene, factor):
+    def extent(scene: Scene, count: int, *, with_points: bool) -> float:
+        views = [replace(view, world_to_camera=view.world_to_camera * [1, 1, 1, factor]) for view in scene.views[:1]]
+        points = scene.points.positions.astype(float) * factor if with_points and scene.points else None
+        return camera_extent(views * count, points)
+
+    scene = read_scene(tiny_scene)
+    assert extent(scene, 2, with_points=True) == extent(scene, 1, with_points=True)
+    assert extent(scene, 1, with_points=True) / factor == pytest.approx(3.8, rel=0.1), "the distance of the points"
+    assert extent(scene, 1, with_points=False) / factor == pytest.approx(3.8, rel=0.1), "the depth of zero"
