@@ -354,14 +354,15 @@ class ColmapReader(Reader):
         parts.expect(files)
         for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
             if view := parts.attempt(view_of, image, cameras, file, mask):
-                parts.views.append(view)
+                parts.views.append(fit_to_photograph(view) if file in files.reduced else view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = image.observed
 
     def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
         """Return images with the names of their files, the files, and masks."""
         folder = image_folder(path, self.root)
-        files = FileLookup(self.root or folder.parent, folder, [image.name for image in images])
+        root = self.root if self.root and folder.is_relative_to(self.root) else folder.parent
+        files = FileLookup(root, folder, [image.name for image in images])
         images = [image._replace(name=name) for image, name in zip(images, files.names, strict=True)]
         return images, files, find_masks(folder.with_name("masks"), files.names)
 

@@ -21,11 +21,12 @@ Missing = Literal["refuse", "skip"]  # what to do about missing photographs
 Parts = tuple[str, ...]  # of a path
 MAX_DEPTH = 6  # folders below that of the scene
 MAX_COMPARED = 5000  # file names, to find the nearest one
-RESULTS = {STATUS, "record.json"}  # files that mark the folders of runs and of prepared photographs
+RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs, ours and 3DGS's, and of preparation
 CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)")
 OTHER_CONTENT = re.compile(  # folders whose images are photographs only where a name contains the folder
-    r"mask|depth|normal|segment|semantic|label|render|output|thumb|preview|^(train|test|val|validation|eval)$"
+    r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
+SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph of one is none of another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
 ELSEWHERE = "…"  # stands for folders outside of the scene
 logger = logging.getLogger("clsplat")
@@ -145,8 +146,10 @@ class FileLookup:
                 by_key[key].add(target)
         for i in lost:
             ranked = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
-            for parts, path in (file for key in _keys(targets[i]) for file in self._files.get(key, ())):
-                if path not in taken and (rank := self._rank(self.given[i], targets[i], parts, path)):
+            files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in taken]
+            near = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
+            for parts, path in near or files:
+                if rank := self._rank(self.given[i], targets[i], parts, path):
                     ranked[rank].append((parts, path))
             best = ranked[max(ranked)] if ranked else []
             if len(best) > 1:
@@ -162,11 +165,12 @@ class FileLookup:
     def _rank(self, given: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return how well a file fits a name, or None if it does not."""
         length, name = _common_end(target, parts), PureWindowsPath(given)
-        if self.strict and length < min(len(parts), len(target), len(name.parts)):
+        above = {*parts[:-length]}
+        is_other = any(map(OTHER_CONTENT.search, above)) or (SPLITS & above and SPLITS.intersection(target))
+        if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
             return None
-        if not self.strict and any(map(OTHER_CONTENT.search, parts[:-length])):
-            return None
-        return length, -_divisor(parts[:-length]), path.name == name.name, path.stem == name.stem
+        same = parts[-1] == target[-1], path.name == name.name, path.stem == name.stem
+        return length, -_divisor(parts[:-length]), *same
 
     @property
     def note(self) -> str:
@@ -207,7 +211,8 @@ class FileLookup:
             return f" ({first_few(fit)} fit {quote(self.given[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
-        free = {_stem(path.name): name for path, name in relative.items() if path not in {*self.paths}}
+        used = {*self.paths}
+        free = {_stem(path.name): name for path, name in relative.items() if path not in used}
         near = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
         nearest = f"the nearest file is {free[near[0]].as_posix()}, " if near else ""
         folders = Counter(path.parent.as_posix() for path in relative.values())

@@ -65,6 +65,8 @@ MATCHES = {  # the kind of dataset, the names in it, and the files on disk in th
     "a longer end decides": (JSON, ["/x/cam1/1.jpg", "/x/cam2/1.jpg"], ["images/cam1/1.png", "images/cam2/1.png"]),
     "the case decides": ("colmap", ["a.JPG"], ["images/a.jpg", "images/A.jpg"]),
     "other images": (JSON, ["rgb/a.jpg"], ["images/a.jpg", "masks/a.jpg", "depth/a.png", "renders/a.jpg"]),
+    "the suffix decides": ("colmap", ["a.jpg"], ["images/a.JPG", "images/a.png"]),
+    "the folder of a split": (JSON, ["r_0"], ["train/r_0.jpg"]),
     "full size first": (JSON, ["rgb/a.jpg"], ["input/a.jpg", "images_2/a.jpg"]),
 }
 
@@ -93,6 +95,7 @@ REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is s
     "another camera": ("colmap", ["l/a.jpg", "r/a.jpg"], ["images/l/a.jpg", "x/a.jpg"], "1 of 2 image files are miss"),
     "a mask": (JSON, ["images/a.jpg"], ["masks/a.jpg"], "1 of 1 image files are missing"),
     "a letter less": (JSON, ["images/IMG_01.jpg"], ["images/IMG_1.jpg"], "nearest file is images/IMG_1.jpg, searched"),
+    "another split": (BLENDER, ["./test/r_0"], ["val/r_0.png"], "1 of 1 image files are missing"),
     "nothing": (JSON, ["images/a.jpg"], [], "no images in that folder"),
     "outside": (JSON, ["../other/a.jpg"], ["../other/a.jpg"], "'../other/a.jpg' is not a path below"),
     "an absolute path": ("colmap", ["/x/a.jpg"], ["images/b.jpg"], "/x/a.jpg' is not a path below"),
@@ -138,6 +141,12 @@ def test_cameras_are_scaled_to_reduced_photographs(tmp_path: Path, caplog: pytes
     assert load_image(view).shape == (24, 32, 3)
     assert "2 of 2 photographs matched" in caplog.text
     assert "cameras scaled to these smaller photographs" in caplog.text
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse"])
+def test_photographs_of_a_model_folder_are_next_to_it(tmp_path: Path, place: str) -> None:
+    scene = made(tmp_path, "colmap", ["C:\\x\\a.jpg"], ["photos/a.jpg"])
+    assert read_scene(scene / place, 0).views[0].image_path == scene / "photos" / "a.jpg"
 
 
 def test_splits_name_photographs_as_frames_do(tmp_path: Path) -> None:
