@@ -78,7 +78,8 @@ def resume(
         typer.Option(
             min=1,
             metavar="N",
-            help="Train up to this step, to train longer than before.",
+            help="Train up to this step, to train longer than before; equal to a run planned as long, unless a reset "
+            "or pruning was due at the old last step.",
         ),
     ] = None,
     set_: SetOption = None,

@@ -6,12 +6,13 @@ filter is three numbers of the model.  Rendering only reads these numbers and do
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from clsplat.core.errors import ConfigError
 from clsplat.core.settings import OneOf, Settings, in_one_sentence
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, motion_width
@@ -97,13 +98,24 @@ def measure_intervals(
 
 
 class ScreenFilter(Settings):
-    """A blur of splats in the image."""
+    """A blur of splats in the image; a subclass with further keys overrides `numbers`."""
 
     pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the two numbers are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1]
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **values: Any) -> None:
+        super().__pydantic_init_subclass__(**values)
+        unused = [name for name in cls.model_fields if name not in (*ScreenFilter.model_fields, "type")]
+        if unused and cls.numbers is ScreenFilter.numbers:
+            raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.numbers")
+
+    def numbers(self) -> tuple[float, float, float]:
+        """Return what rendering reads: variance, compensate, and 1 to integrate over the pixel's box."""
+        return self.variance, float(self.compensate), float(self.pixel_box)
 
 
 class Dilation(ScreenFilter):
@@ -205,6 +217,4 @@ class ModelSettings(Settings):
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
         assert self.near != "auto"  # a run chooses it before its first stage
-        screen = self.screen_filter
-        numbers = screen.variance, float(screen.compensate), float(screen.pixel_box)
-        return DeviceModel(gaussians, degree, self.near, *numbers)
+        return DeviceModel(gaussians, degree, self.near, *self.screen_filter.numbers())

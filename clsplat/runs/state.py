@@ -15,6 +15,7 @@ from clsplat.core.reading import read_json, sha256
 from clsplat.pipeline.loading import Pipeline, load, with_decisions, without_auto
 from clsplat.training import checkpoint
 from clsplat.training.settings_diff import Difference, first_difference
+from clsplat.training.stage import Scheduled
 from clsplat.training.status import read_status
 
 
@@ -105,6 +106,15 @@ class RunState:
         with suppress(ConfigError):  # which the resumed run raises again
             return f"{self.pipeline.settings.training.stage}.steps"
         return "optimize.steps"
+
+    def note_on_longer_training(self) -> str:
+        """Return how training longer differs from a run that was planned as long; '' if it is the same."""
+        training = self.pipeline.settings.training
+        last = training.steps
+        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.due(last)]
+        if not names or self.status.get("step", 0) < last:
+            return ""
+        return f"'{names[0]}' was due at step {last}, the last one, so the result differs from a run planned as long"
 
     @property
     def restart(self) -> str:

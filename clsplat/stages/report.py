@@ -175,7 +175,7 @@ def _measured(run: Run, trial: bool = False) -> list[Line]:
     """
     points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
     for line in run.records.read("evaluate", trial):
-        if line["downscale"] == run.downscale:
+        if line["downscale"] == run.downscale and line["split"] in points:
             points[line["split"]][line["step"]] = line["psnr"]
     colors = dict(zip(NAMES, COLORS, strict=False))
     return [Line(sorted(psnr.items()), NAMES[split], colors[split]) for split, psnr in points.items() if psnr]

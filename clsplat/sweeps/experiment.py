@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -171,6 +171,9 @@ class Job:
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{hint}")
         if steps is not None:
             overrides = [*overrides, f"{state.steps_key}={steps}"]
+            with suppress(ConfigError):  # which opening the run raises again
+                if note := state.note_on_longer_training():
+                    LOG.warning("%s", note)
         return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:

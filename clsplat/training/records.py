@@ -20,6 +20,15 @@ from clsplat.core.reading import read_file
 from clsplat.opencl.device import Timings
 
 LOG = logging.getLogger("clsplat")
+_MEASURED: dict[str, type | tuple[type, ...]] = {"split": str, "downscale": (int, float), "psnr": (int, float)}
+FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # what pages and `clsplat status` read, by kind
+    "train": {"loss": (int, float), "psnr": (int, float)},
+    "evaluate": _MEASURED,
+    "view": {"view": str, **_MEASURED},
+    "densify": {"causes": dict},
+    "distribution": {"size": list, "anisotropy": list, "opacity": list},
+    "snapshot": {"file": str},
+}
 
 
 class Records:
@@ -97,10 +106,15 @@ class Records:
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
         """Return the lines, of one kind or all, without an incomplete last line from a crash.
 
+        Lines of a kind in FIELDS that lack one of its fields are left out: a stage of a plug-in has recorded them.
         trial: return the lines from before a refit.  Raises DataError, with file and line, for any other damage.
         """
-        lines = self._parse(self.trial if trial else self.path)
-        return [line for line in lines if kind in (None, line["kind"])]
+        fields = FIELDS.get(kind or "", {})
+        return [
+            line
+            for line in self._parse(self.trial if trial else self.path)
+            if kind in (None, line["kind"]) and all(isinstance(line.get(key), types) for key, types in fields.items())
+        ]
 
     def _parse(self, path: Path) -> Iterator[dict[str, Any]]:
         if not path.exists():

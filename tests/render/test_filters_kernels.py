@@ -1,6 +1,7 @@
 """filter.cl against the oracle, and what both filters do to the brightness of an image."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.reference import sampling_interval
 from clsplat.conformance.scenes import Case, random_case
+from clsplat.core.errors import ConfigError
+from clsplat.core.settings import Settings
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import upload_camera
-from clsplat.render.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
+from clsplat.render.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, ScreenFilter, Smoothing
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
@@ -123,3 +126,23 @@ def test_specks_keep_their_brightness_when_zoomed_out(device):
             assert grid_of_specks(smooth, screen, scale) == pytest.approx(truth, rel=0.01), (screen.type, scale)
     assert grid_of_specks(smooth, Dilation(), 1) > 2 * truth
     assert grid_of_specks(smooth, Dilation(), 8) > 50 * truth
+
+
+def test_screen_filter_with_a_key_without_effect_is_refused():
+    count = len(Settings.defined)
+    with pytest.raises(ConfigError, match=r"Wide: its key 'radius' has no effect; override ScreenFilter.numbers"):
+
+        class Wide(ScreenFilter):
+            radius: float = 2.0
+
+    class Broad(ScreenFilter):
+        type: Literal["broad"] = "broad"
+        variance: float = 0.0
+        compensate: Literal[0] = 0
+        radius: float = 2.0
+
+        def numbers(self) -> tuple[float, float, float]:
+            return self.radius**2, 0.0, 0.0
+
+    del Settings.defined[count:]
+    assert Broad().numbers() == (4.0, 0.0, 0.0)

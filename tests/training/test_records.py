@@ -64,3 +64,15 @@ def test_unreadable_lines_are_reported(damage, left, tmp_path, caplog):
     assert f"{left} of 4 lines can be read" in caplog.text
     assert records.read() == [json.loads(line) for line in lines[:left]]
     assert records.lines == left
+
+
+def test_lines_of_plugins_without_the_fields_are_left_out(tmp_path):
+    kept = Records(tmp_path)
+    kept.add(1, "evaluate", split="test", downscale=1, psnr=20.0)
+    kept.add(2, "evaluate", score=3.0)
+    kept.add(2, "evaluate", split="test", downscale=1, psnr="high")
+    kept.add(2, "theirs", score=3.0)
+    kept.write()
+    assert [line["step"] for line in kept.read("evaluate")] == [1]
+    assert len(kept.read("theirs")) == 1
+    assert len(kept.read()) == 4
