@@ -1,4 +1,4 @@
-"""Limit the number of Gaussians that an edit may leave, by the progress of training."""
+"""Limit the number of Gaussians after an edit by the progress of training."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from clsplat.density.edit import Edit
 class BudgetContext:
     """The progress of training at an edit."""
 
-    share: float  # of the steps until the last edit that are done, 0 to 1
-    edits: int  # still to come, this one included
+    progress: float  # fraction of the steps until the last edit that are done, 0 to 1
+    edits: int  # that remain, including this one
     divisor: float  # downscale factor of the photographs
 
 
 class Budget(Settings):
-    """The number of Gaussians at which growth stops in an edit."""
+    """A limit on the number of Gaussians, at which growth stops in an edit."""
 
     @property
     def statistics(self) -> set[str]:
-        """Names of the statistics that it reads."""
+        """Names of the statistics that the budget reads."""
         return set()
 
     @abstractmethod
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
-        """Return the number; `numbers` persist from edit to edit, by name, and are in the checkpoint."""
+        """Return the limit.  numbers: by name, kept between edits and in checkpoints."""

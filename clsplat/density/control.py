@@ -19,7 +19,7 @@ from clsplat.render.tiles import Tiler
 def apply_edit(edit: Edit, tiler: Tiler) -> None:
     """Rearrange all tables and move the children of split Gaussians to their positions.
 
-    Raises MemoryLimitError if these are more rows than an index can hold; all tables stay as they are.
+    Raises MemoryLimitError if there are more rows than an index can hold; then all tables are unchanged.
     """
     gaussians, device, count = edit.gaussians, edit.gaussians.device, edit.gaussians.count
     program = device.program("density.cl")
@@ -27,8 +27,8 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     rows = int(row_offset.get_item(count))
     if rows > MAX_ROWS:
         raise MemoryLimitError(
-            f"step {edit.step}: the rules would make more than {MAX_ROWS:,} Gaussians; set densify.max_gaussians, or "
-            "use rules that make fewer copies"
+            f"step {edit.step}: the rules would create more than {MAX_ROWS:,} Gaussians; set densify.max_gaussians, or "
+            "use rules that create fewer copies"
         )
     source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
     program.list_rows(
@@ -67,44 +67,44 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
 
 
 def _set_children(edit: Edit, row_offset: Array) -> None:
-    """Write the values that rules set for children, unless a later rule or limit changed their number."""
+    """Write the values that rules set for children, unless a later rule or limit changed the number of children."""
     copies, first = edit.rows(), row_offset.get()
     for name, sources, values in edit.children:
-        whole = copies[sources] == values.shape[1]
-        rows = first[sources[whole], None] + np.arange(values.shape[1])
-        edit.gaussians.set_rows(name, rows.ravel(), values[whole].reshape(-1, values.shape[2]))
+        is_complete = copies[sources] == values.shape[1]
+        rows = first[sources[is_complete], None] + np.arange(values.shape[1])
+        edit.gaussians.set_rows(name, rows.ravel(), values[is_complete].reshape(-1, values.shape[2]))
 
 
 Corner = Annotated[list[float | None], Field(min_length=3, max_length=3)]
 
 
 class Box(Settings):
-    """An axis-aligned box; adjacent boxes share no point, since it includes only its lower faces."""
+    """An axis-aligned box; it includes only its lower faces, so adjacent boxes share no points."""
 
     low: Corner = Field(default=[None, None, None])
-    """Smallest x, y and z, in the dataset's coordinates, inclusive; null: no bound."""
+    """Smallest x, y, and z, in the dataset's coordinates, inclusive; null: no bound."""
     high: Corner = Field(default=[None, None, None])
-    """Largest x, y and z, in the dataset's coordinates, exclusive; null: no bound."""
+    """Largest x, y, and z, in the dataset's coordinates, exclusive; null: no bound."""
 
     @model_validator(mode="after")
-    def _with_room(self) -> "Box":
+    def _require_volume(self) -> "Box":
         for name, low, high in zip("xyz", self.low, self.high, strict=True):
             if low is not None and high is not None and not low < high:
                 raise ValueError(f"expected 'low' below 'high' on each axis, got {low:g} and {high:g} for {name}")
         return self
 
     def shifted(self, origin: NDArray[np.floating]) -> "Box":
-        """Return the box in coordinates whose zero is at `origin`, [3] in the present coordinates."""
+        """Return the box in coordinates relative to `origin`, [3]."""
         if not origin.any():
             return self
         low, high = (
-            [None if one is None else float(one - by) for one, by in zip(corner, origin, strict=True)]
+            [None if value is None else float(value - by) for value, by in zip(corner, origin, strict=True)]
             for corner in (self.low, self.high)
         )
         return self.model_copy(update={"low": low, "high": high})
 
-    def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return which points, [N, 3] scene units, are inside, [N]; NaN never is."""
+    def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return whether each point, [N, 3] scene units, is inside, [N]; points with NaN are not."""
         is_inside = ~np.isnan(points).any(axis=1)
         for axis, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             values = points[:, axis].astype(np.float64)
@@ -119,7 +119,7 @@ class Change:
     before: int
     after: int
     causes: dict[str, int]  # Gaussians whose outcome a rule decided, by the rule's name
-    grown: dict[str, int]  # of these, the ones that became several
+    grown: dict[str, int]  # likewise, only Gaussians that became several
 
 
 def densify(
@@ -141,16 +141,16 @@ def densify(
 
 
 def apply_marks(edit: Edit, tiler: Tiler) -> None:
-    """Rearrange all tables as the rules marked them, and set the statistics to zero."""
+    """Rearrange all tables according to the marks of the rules, and set the statistics to zero."""
     apply_edit(edit, tiler)
     edit.stats.clear()
 
 
 def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Box | None = None) -> Change:
-    """Let the rules mark an edit, in order; return what it will change.
+    """Let the rules mark an edit, in order; return the change that it will make.
 
     inside: the region in which Gaussians grow.  Growth stops at `limit` Gaussians; those with the largest mean of the
-    first statistic grow first.  Rules read the number that they may add from `edit.room`.
+    first statistic grow first.  `edit.room` gives rules the number of Gaussians that they may add.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
@@ -162,7 +162,7 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
         rule.mark(edit)
         decided_by[edit.rows() != rows] = edit.rule
     if inside is not None:
-        edit.undo_growth(~inside.holds(gaussians.get("means")))
+        edit.undo_growth(~inside.contains(gaussians.get("means")))
     if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
         edit.limit(limit)
     rows = edit.rows()
@@ -177,7 +177,7 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Lower opacities, as they are after the 3D filter, to `limit` at most (the opacity reset)."""
+    """Lower opacities after the 3D filter to at most `limit` (the opacity reset)."""
     gaussians.device.program("density.cl").cap_opacity(
         items=gaussians.count,
         log_scales=gaussians["log_scales"],

@@ -1,9 +1,9 @@
-"""Represent an edit of the Gaussians, and the base of the rules that mark it (Kerbl et al. 2023, section 5).
+"""Represent an edit of the Gaussians, and define the base class of density rules (Kerbl et al. 2023, section 5).
 
-A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a range of statistic, size and
-opacity, and one kernel applies them; others choose Gaussians on the host.  A size is the largest standard deviation
-as a share of the scene's extent.  The first growing rule that matches a Gaussian decides.  Pruning rules override
-growth, and compare the size of the children after a split.
+A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a range of a statistic, size,
+and opacity, and one kernel applies them; others choose Gaussians on the host.  A size is the largest standard deviation
+relative to the scene's extent.  The first growing rule that matches a Gaussian decides.  Pruning rules override growth,
+and compare the size of the children after a split.
 """
 
 import math
@@ -38,7 +38,7 @@ def require_rows(copies: int, kept: int) -> None:
 def encode_outcomes(
     chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, count: int
 ) -> NDArray[np.uint32]:
-    """Return copies + 1 for the chosen Gaussians, 0 for the others, [N].  Raises ValueError as `Edit.choose` does."""
+    """Return copies + 1 for the chosen Gaussians, 0 for the others, [N].  Raises ValueError like `Edit.choose`."""
     numbers = np.asarray(copies)
     if chosen.dtype != np.bool_ or chosen.shape != (count,):
         raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
@@ -59,7 +59,7 @@ class Edit:
     """The outcome of each Gaussian: how many rows it becomes, how many of them are the old row, the factor on the
     scales of fresh rows, and whether they share its opacity.
 
-    Random numbers depend only on `seed`, `step` and the rule.
+    Random numbers depend only on `seed`, `step`, and the rule.
     """
 
     def __init__(
@@ -91,9 +91,9 @@ class Edit:
 
     @property
     def survey(self) -> Survey:
-        """The training views, which show the Gaussians as they are before the edit.  Raises ConfigError without any."""
+        """The training views, rendered with the Gaussians before the edit.  Raises ConfigError if there are none."""
         if self._survey is None:
-            raise ConfigError("a rule needs training photographs, and there are none; leave the rule out")
+            raise ConfigError("a rule needs training photographs, and there are none; remove the rule")
         return self._survey
 
     def at(self, schedule: Schedule) -> float:
@@ -101,7 +101,7 @@ class Edit:
         return at_step(schedule, self.step)
 
     def random(self) -> np.random.Generator:
-        """Return a generator that depends only on the seed, the step and the rule."""
+        """Return a random number generator that depends only on the seed, the step, and the rule."""
         return np.random.default_rng([self.seed, self.step, self.rule])
 
     def mark(
@@ -116,9 +116,9 @@ class Edit:
         opacity_below: float = math.inf,
         shared: bool = False,
     ) -> None:
-        """Give an outcome to every Gaussian within the bounds; sizes are shares of the extent.
+        """Give an outcome to every Gaussian within the bounds; sizes are relative to the extent.
 
-        copies, kept, shrink: as for `choose`.  shared: the rows together are as opaque as the Gaussian was.  Raises
+        copies, kept, shrink: as for `choose`.  shared: the rows together are as opaque as the old Gaussian.  Raises
         ValueError for numbers of rows that are negative or too large.
         """
         require_rows(copies, kept)
@@ -142,13 +142,12 @@ class Edit:
             count=gaussians.count,
         )
 
-    def matching(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold of `statistic` that is reached by as many Gaussians as reach `gradient_above` in
-        `other`."""
+    def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
+        """Return the threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
-        share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
-        return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), MIN_BOUND)
+        fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
+        return max(float(np.quantile(self.stats.mean(statistic), 1 - fraction)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
         """Return a threshold on a statistic as a number, at the step of the edit."""
@@ -164,9 +163,9 @@ class Edit:
     ) -> None:
         """Give an outcome to the Gaussians of a mask, [N].
 
-        copies: rows that each becomes, one number or [N].  kept: how many of them are the old row, with its moments
-        and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.  Raises ValueError for a
-        wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
+        copies: number of rows that each becomes, one number or [N].  kept: how many of them are the old row, with its
+        moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.  Raises ValueError
+        for a wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count
         self._program.mark_chosen(
@@ -183,16 +182,16 @@ class Edit:
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
         """Write values, [n, components], into distinct rows, [n], of a table; fresh rows copy them.
 
-        Raises ConfigError in an edit that may only remove.
+        Raises ConfigError in an edit that may only remove Gaussians.
         """
         if not self.may_rewrite:
-            raise ConfigError(f"a rule changes {name} of Gaussians that stay; use it in densify instead")
+            raise ConfigError(f"a rule changes {name} of Gaussians that it does not remove; use it in densify instead")
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
         """Write values, [n, copies, components], of a table into the rows that distinct Gaussians, [n], become.
 
-        Gaussians that end with another number of rows, because growth was undone, stay as they are.  Raises
+        Gaussians that finally become a different number of rows, because growth was undone, are not changed.  Raises
         ValueError for invalid rows (`check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components
@@ -201,7 +200,7 @@ class Edit:
         self.children.append((name, check_rows(rows, self.gaussians.count), values))
 
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] | None = None) -> None:
-        """Set Adam's moments of distinct rows, [n], to zero, for some parameters or for all that are trained."""
+        """Set Adam's moments of distinct rows, [n], to zero, for some parameters or all trained ones."""
         trained = self.gaussians.trained if parameters is None else parameters
         names = [table for parameter in trained for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
@@ -212,35 +211,35 @@ class Edit:
 
     @property
     def room(self) -> int | None:
-        """Rows that rules may still add; negative: too many already; None: no limit."""
+        """The number of rows that rules may still add; negative if there are too many; None if there is no limit."""
         return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
-    def undo_growth(self, refused: NDArray[np.bool_]) -> None:
-        """Leave the Gaussians of a mask, [N], as they are if they were to become several."""
-        refused = refused & (self.rows() > 1)
+    def undo_growth(self, mask: NDArray[np.bool_]) -> None:
+        """Undo the growth of the Gaussians in a mask, [N], which then remain unchanged."""
+        mask = mask & (self.rows() > 1)
         for array, unchanged in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
-            array.set(np.where(refused, unchanged, array.get()))
+            array.set(np.where(mask, unchanged, array.get()))
 
     def limit(self, limit: int) -> None:
-        """Undo growth until at most `limit` rows remain; the smallest means of the first scalar statistic go first."""
+        """Undo growth until at most `limit` rows remain, first for the smallest means of the first scalar statistic."""
         rows = self.rows().astype(np.int64)
         growing = np.flatnonzero(rows > 1)
         scalars = [name for name, column in self.stats.columns.items() if column.components == 1]
         score = self.stats.mean(scalars[0]) if scalars else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
-        refused = np.zeros(len(rows), bool)
-        refused[order[total > limit]] = True
-        self.undo_growth(refused)
+        mask = np.zeros(len(rows), bool)
+        mask[order[total > limit]] = True
+        self.undo_growth(mask)
 
 
 class Rule(Settings):
-    """A condition on Gaussians, and the outcome for Gaussians that meet it."""
+    """A condition on Gaussians, and the outcome of those that meet it."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     grows: ClassVar[bool] = True  # whether it may add Gaussians
-    rewrites: ClassVar[bool] = False  # whether it changes tables as it marks (edit.set_rows), which later rules see
+    rewrites: ClassVar[bool] = False  # whether it changes tables while marking (edit.set_rows), which later rules see
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""
@@ -257,10 +256,10 @@ class Rule(Settings):
 
     @property
     def columns(self) -> list[type[Statistic]]:
-        """The classes of its statistics, and of the statistics that divide them."""
-        known = variants(Statistic)
-        read = [known[name] for name in self.statistics if name in known]
-        return [*read, *(known[kind.divisor] for kind in read if kind.divisor in known)]
+        """The classes of the rule's statistics, and of the statistics that divide them."""
+        classes = variants(Statistic)
+        read = [classes[name] for name in self.statistics if name in classes]
+        return [*read, *(classes[kind.divisor] for kind in read if kind.divisor in classes)]
 
     def excluded(self) -> Mapping[str, str]:
         conflicts = dict(self.conflicts)

@@ -1,4 +1,4 @@
-"""Score how much Gaussians contribute to images, and choose by score: the largest, samples, pruning."""
+"""Score how much Gaussians contribute to images; choose the highest scores, or sample by score."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -23,7 +23,7 @@ class Weights:
     """The weight of each Gaussian in some views."""
 
     total: NDArray[Any]  # [N] blend weight, alpha T, summed over all pixels; 0 if no view sees it
-    views: NDArray[np.int64]  # [N] number of views in which it is useful; 0 if these were not counted
+    views: NDArray[np.int64]  # [N] number of views in which it is useful; 0 if not counted
 
 
 def weights(
@@ -31,7 +31,7 @@ def weights(
 ) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
-    weight_per_view: the share of a view's weight that its useful Gaussians, the heaviest first, add up to; None: do
+    weight_per_view: the fraction of a view's weight to which its useful Gaussians, the heaviest first, add up; None to
     not count views.  dtype: type of the total.
     """
     total, useful_views = np.zeros(count, dtype), np.zeros(count, np.int64)
@@ -43,24 +43,24 @@ def weights(
     return Weights(total, useful_views)
 
 
-def heaviest(weight: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
-    """Return the smallest set of Gaussians, [N], that adds up to this share of the weight; none with a weight of 0."""
+def heaviest(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
+    """Return the mask, [N], of the fewest Gaussians that add up to this fraction of the weight; none of weight 0."""
     order = np.argsort(-weight, kind="stable")
     before = np.cumsum(weight[order]) - weight[order]
     chosen = np.zeros(len(weight), bool)
-    chosen[order] = (before < share * weight.sum()) & (weight[order] > 0)
+    chosen[order] = (before < fraction * weight.sum()) & (weight[order] > 0)
     return chosen
 
 
 def contributions(views: Iterable[RenderedView], count: int) -> NDArray[np.float32]:
-    """Return the blend weights, alpha T, summed over pixels and views, [N], in single precision, which decides ties."""
+    """Return the blend weights, alpha T, summed over pixels and views, [N], in single precision."""
     return weights(views, count, dtype=np.float32).total
 
 
 def sensitivities(views: Iterable[RenderedView], count: int) -> NDArray[np.float32]:
-    """Return the squares of dI/dG summed over pixels, channels and views, [N] (Speedy-Splat, Hanson et al. 2025).
+    """Return the squares of dI/dG summed over pixels, channels, and views, [N] (Speedy-Splat, Hanson et al. 2025).
 
-    I is a value of the image and G the value of the Gaussian at that pixel; alpha is the opacity times G.
+    I is an image value and G the value of the Gaussian at that pixel; alpha is the opacity times G.
     """
     total = np.zeros(count, np.float32)
     for view in views:
@@ -87,9 +87,9 @@ def sampling_order(candidates: Mask, odds: NDArray[np.float64], random: np.rando
 
 
 def largest(score: NDArray[np.floating], limit: int, candidates: Mask | None = None) -> Mask:
-    """Return the at most `limit` candidates with the largest scores, [N]; the lower index wins ties.
+    """Return the mask, [N], of at most `limit` candidates with the largest scores; the lower index wins ties.
 
-    candidates: [N]; None: all.
+    candidates: mask, [N]; None for all.
     """
     indices = np.arange(len(score)) if candidates is None else np.flatnonzero(candidates)
     order = np.argsort(-score[indices], kind="stable")
@@ -99,29 +99,29 @@ def largest(score: NDArray[np.floating], limit: int, candidates: Mask | None = N
 
 
 class SampledPruning(Rule):
-    """Base of rules that remove a random share of the faint and the large Gaussians."""
+    """Base class of rules that remove a random fraction of the faint and the large Gaussians."""
 
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
 
     share: Share = 0.5
-    """Share of the faint and large Gaussians that is removed."""
+    """Fraction of the faint and large Gaussians that is removed."""
     opacity_below: Positive = 0.005
     """Opacity below which a Gaussian is faint; by step."""
     size_above: Positive = 0.1
-    """Size above which a Gaussian is large: largest standard deviation as a share of the extent; by step."""
+    """Size above which a Gaussian is large: largest standard deviation relative to the extent; by step."""
 
     @abstractmethod
     def weights(self, edit: Edit) -> NDArray[np.float64]:
-        """Return the odds that a Gaussian is removed, [N], 0 to infinity."""
+        """Return the odds that each Gaussian is removed, [N], 0 to infinity."""
 
     def mark(self, edit: Edit) -> None:
-        """Remove some; the size of a split Gaussian is that of its children."""
+        """Mark a sample for removal; the size of a split Gaussian is that of its children."""
         gaussians = edit.gaussians
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         size = np.exp(gaussians.get("log_scales").max(axis=1)) * edit.shrink.get()
-        large = size > edit.at(self.size_above) * edit.scene_scale.extent
-        candidates = ((opacity < edit.at(self.opacity_below)) | large) & (edit.rows() > 0)
+        is_large = size > edit.at(self.size_above) * edit.scene_scale.extent
+        candidates = ((opacity < edit.at(self.opacity_below)) | is_large) & (edit.rows() > 0)
         order = sampling_order(candidates, self.weights(edit), edit.random())
         chosen = np.zeros_like(candidates)
         chosen[order[: int(self.share * len(order))]] = True

@@ -1,4 +1,4 @@
-"""Merge pairs of Gaussians: the mean and covariance of their mixture, the mean of their colors, and their mass."""
+"""Merge pairs of Gaussians: keep the mean and covariance of their mixture, their mean color, and their mass."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ def surface(log_scales: Floats) -> Floats:
     return result
 
 
-def mass_of(tables: dict[str, Floats], size: Size = volume) -> Floats:
-    """Return opacity times size, [N]."""
+def masses(tables: dict[str, Floats], size: Size = volume) -> Floats:
+    """Return the mass, opacity times size, of each Gaussian, [N]."""
     mass: Floats = size(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
     return mass
 
@@ -39,22 +39,22 @@ def mass_of(tables: dict[str, Floats], size: Size = volume) -> Floats:
 class Mixtures:
     """The moments of mixtures of two Gaussians, each weighted by its mass."""
 
-    mass: Floats  # [pairs] of both together
-    share: Floats  # [pairs, 1] share of the second in the mass
+    mass: Floats  # [pairs] total of both
+    share: Floats  # [pairs, 1] fraction of the mass in the second Gaussian
     means: Floats  # [pairs, 3] scene units
     covariance: Floats  # [pairs, 3, 3] scene units²
 
     @classmethod
     def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
-        """Compute the mixtures of rows `first` and `second`, [pairs].  mass: of all rows, from `mass_of`."""
+        """Compute the mixtures of rows `first` and `second`, [pairs].  mass: of all rows, from `masses`."""
         total = mass[first] + mass[second]
         share = (mass[second] / total)[:, None]
         means = (1 - share) * tables["means"][first] + share * tables["means"][second]
         covariance = np.zeros((len(first), 3, 3))
         for rows, weight in ((first, 1 - share), (second, share)):
             offset = tables["means"][rows] - means
-            within = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
-            covariance += weight[:, :, None] * (within + offset[:, :, None] * offset[:, None, :])
+            covariances = covariance_matrices(tables["quats"][rows], tables["log_scales"][rows])
+            covariance += weight[:, :, None] * (covariances + offset[:, :, None] * offset[:, None, :])
         return cls(total, share, means, covariance)
 
     def opacity(self, log_scales: Floats, size: Size = volume) -> Floats:
@@ -67,10 +67,10 @@ def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = vol
 
     Each table has the shape [pairs, components].
     """
-    mixtures = Mixtures.from_pairs(tables, mass_of(tables, size), first, second)
+    mixtures = Mixtures.from_pairs(tables, masses(tables, size), first, second)
     share = mixtures.share
     variances, axes = np.linalg.eigh(mixtures.covariance)  # scene units²
-    log_scales = log_scales_of(variances)
+    log_scales = to_log_scales(variances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
     opacity = mixtures.opacity(log_scales, size)
     colors = {name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")}
@@ -83,13 +83,13 @@ def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = vol
     }
 
 
-def log_scales_of(variances: Floats) -> Floats:
-    """Return the log scales for variances along the axes, [N, 3] scene units²."""
+def to_log_scales(variances: Floats) -> Floats:
+    """Convert variances along the axes, [N, 3] scene units², to log scales."""
     return np.asarray(0.5 * np.log(np.maximum(variances, 1e-30)))
 
 
-def covariance_of(quats: Floats, log_scales: Floats) -> Floats:
-    """Return R diag(s²) Rᵀ, [N, 3, 3] scene units²."""
+def covariance_matrices(quats: Floats, log_scales: Floats) -> Floats:
+    """Return the covariances R diag(s²) Rᵀ, [N, 3, 3] scene units²."""
     rotations = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)
     axes = rotations * np.exp(log_scales)[:, None, :]
     covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)

@@ -1,4 +1,4 @@
-"""Define rules that remove Gaussians far outside the scene, or wide on the screen (floaters)."""
+"""Define rules that remove floaters: Gaussians far outside the scene, or large on the screen."""
 
 from typing import ClassVar, Literal
 
@@ -16,8 +16,8 @@ DEVIATIONS = 3  # standard deviations in a radius in pixels (cl_kernels/project.
 class PruneFar(Rule):
     """Remove Gaussians that are far outside the scene.
 
-    The center of the scene is the median of the means on each axis; its size is the median distance from there.  Brush
-    uses the same factor, but takes as size a side of the box around most means.
+    The center of the scene is the median of the means on each axis, and its size the median distance from there.  Brush
+    uses the same factor, but defines the size as a side of the box around most means.
     """
 
     type: Literal["prune_far"] = "prune_far"
@@ -37,9 +37,9 @@ class PruneFar(Rule):
 
 
 def largest_on_screen(survey: Survey) -> NDArray[np.float64]:
-    """Return the largest size of each Gaussian on the screen over the training views that show it, [N]; 0 if none does.
+    """Return the largest size of each Gaussian on the screen in any training view that shows it, [N]; 0 without one.
 
-    The size is its largest standard deviation as a share of the image width.
+    The size is the largest standard deviation as a fraction of the image width.
     """
     largest = np.zeros(survey.count)
     for view in survey.render(survey.views):
@@ -49,10 +49,10 @@ def largest_on_screen(survey: Survey) -> NDArray[np.float64]:
 
 
 class PruneWide(Rule):
-    """Remove Gaussians that are large on the screen in a training view: some are haze in front of its camera.
+    """Remove Gaussians that are large on the screen in a training view; some of them are haze in front of the camera.
 
     The default, half the image, is the limit of on-the-fly-nvs (Meuleman et al. 2025).  Plain walls and skies may
-    consist of large Gaussians, too: let steps follow that close the holes.
+    consist of large Gaussians, too, so train for more steps afterwards to close the holes.
     """
 
     type: Literal["prune_wide"] = "prune_wide"
@@ -60,7 +60,7 @@ class PruneWide(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
 
     size_above: Positive = 0.5
-    """Size on the screen above which a Gaussian is removed: largest standard deviation as a share of the image width;
+    """Size on the screen above which a Gaussian is removed: largest standard deviation relative to the image width;
     by step."""
 
     def mark(self, edit: Edit) -> None:

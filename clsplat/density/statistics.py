@@ -1,8 +1,8 @@
-"""Accumulate statistics of each Gaussian over the views since the last edit, for density rules to read.
+"""Accumulate statistics of each Gaussian over the views since the last edit, for density rules.
 
-A statistic is a table `stats/<name>`: a sum over the views that see the Gaussian, of one number per view or of several.
+A statistic is a table `stats/<name>`: the sum of one or more numbers per view over the views that see the Gaussian.
 Its mean is the sum divided by the number of these views, or by another statistic.  Only statistics that a rule reads
-are summed.
+are accumulated.
 """
 
 from abc import abstractmethod
@@ -36,8 +36,8 @@ class Statistic(Settings):
 
     components: ClassVar[int] = 1  # numbers per Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
-    divisor: ClassVar[str] = "seen"  # what divides the sum: the number of views that see it, or another statistic
-    is_total: ClassVar[bool] = False  # whether the mean is multiplied by the number of training views
+    divisor: ClassVar[str] = "seen"  # divides the sum: the number of views that see the Gaussian, or another statistic
+    is_total: ClassVar[bool] = False  # whether to multiply the mean by the number of training views
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -131,9 +131,9 @@ class SplatStats:
     ) -> None:
         """Add the tables for `names` and their divisors, and drop all others; existing tables keep their sums."""
         self.gaussians, self.training_views = gaussians, training_views
-        known = variants(Statistic)
-        needed = {*names, *(known[name].divisor for name in names)}
-        self.columns = {name: kind() for name, kind in known.items() if name in needed}
+        classes = variants(Statistic)
+        needed = {*names, *(classes[name].divisor for name in names)}
+        self.columns = {name: kind() for name, kind in classes.items() if name in needed}
         tables = {SEEN: 1} | {PREFIX + name: column.components for name, column in self.columns.items()}
         for name in [name for name in gaussians.tables if name.startswith(PREFIX) and name not in tables]:
             del gaussians.tables[name]
@@ -160,7 +160,7 @@ class SplatStats:
         return self.gaussians[PREFIX + self.columns[name].divisor]
 
     def factor(self, name: str) -> int:
-        """Return the factor on the quotient of a statistic and its divisor."""
+        """Return the factor that multiplies a statistic divided by its divisor."""
         return self.training_views if self.columns[name].is_total else 1
 
     @property

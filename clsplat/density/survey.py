@@ -1,6 +1,6 @@
-"""Render training views between two steps, and sum what each Gaussian contributes to their pixels.
+"""Render training views between two steps, and sum the contributions of each Gaussian to their pixels.
 
-The sums are those of the backward pass, in a fixed order: the same bits on the same device.
+The sums are computed by the backward pass in a fixed order, so they are reproducible bit for bit on a device.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class RenderedView:
-    """One view, rendered; valid until the next one is.  Masked pixels do not count."""
+    """A rendered view, valid until the next one is rendered.  Masked pixels do not count."""
 
     rasterizer: Rasterizer
     model: DeviceModel
@@ -35,21 +35,21 @@ class RenderedView:
     frame: Frame
 
     @classmethod
-    def at(
+    def render(
         cls, rasterizer: Rasterizer, model: DeviceModel, photograph: Photograph, background: Array
     ) -> "RenderedView":
         """Render the view of a photograph.  background: [3]."""
         return cls(rasterizer, model, photograph, rasterizer.forward(model, photograph.camera, background))
 
     @classmethod
-    def each(
+    def render_all(
         cls, rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
     ) -> Iterator["RenderedView"]:
         """Render the views of photographs, one after another.  background: [3]."""
-        return (cls.at(rasterizer, model, photograph, background) for photograph in photographs)
+        return (cls.render(rasterizer, model, photograph, background) for photograph in photographs)
 
     def counted(self) -> NDArray[np.bool_]:
-        """Return which pixels count, [height, width]."""
+        """Return the mask of pixels that count, [height, width]."""
         camera, mask = self.photograph.camera, self.photograph.counted()
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
@@ -69,14 +69,14 @@ class RenderedView:
         return sum(loss.add(comparison).value() for loss in losses)
 
     def radius(self) -> Floats:
-        """Return the radius of each splat, three standard deviations, [N] px; 0: not visible."""
+        """Return the radius of each splat, three standard deviations, [N] px; 0 if it is not visible."""
         return np.asarray(self.frame.radius.get()[: self.model.gaussians.count])
 
     def sum(self, number: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
         """Return a sum over pixels (`SUM_*` in cl_kernels/splat.h) for each Gaussian, [N]; 0 if it is not visible.
 
-        plane: the texture, [height, width], 0 or more; None: 0.  channel: the loss that is differentiated is the sum
-        of this channel over the image; None: no loss.
+        plane: the texture, [height, width], 0 or more; None for 0.  channel: the differentiated loss is the sum of this
+        channel over the image; None for no loss.
         """
         camera, counted = self.photograph.camera, self.counted()
         texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
@@ -101,12 +101,12 @@ class RenderedView:
 
 
 def _computed(number: int) -> int:
-    """Return how many sums the backward pass must compute to include this one: up to the texture's, or all."""
+    """Return how many sums the backward pass must compute to include sum `number`."""
     return SQUARE + 1 if number >= BLENDED else BLENDED
 
 
 class Survey:
-    """The training views for the rules of one edit, rendered with the Gaussians as they are before it."""
+    """The training views for the rules of one edit, rendered with the Gaussians before the edit."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class Survey:
     def render(self, views: Iterable[View]) -> Iterator[RenderedView]:
         """Render views, one after another."""
         photographs = (self._photographs.get(view) for view in views)
-        return RenderedView.each(self._rasterizer, self._model, photographs, self._photographs.background)
+        return RenderedView.render_all(self._rasterizer, self._model, photographs, self._photographs.background)
 
     @property
     def count(self) -> int:
@@ -133,13 +133,13 @@ class Survey:
         return self._model.gaussians.count
 
     def sample_views(self, number: int) -> list[View]:
-        """Return a random sample of the views, by seed and step, in their order; all views if there are not more."""
+        """Return a random sample of at most `number` views, in their order; it depends on seed and step."""
         count = len(self.views)
         indices = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
         return [self.views[index] for index in np.sort(indices)]
 
     def cached(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        """Return function(survey, *arguments), computed once for all rules of the edit."""
+        """Return function(survey, *arguments), computed only once for all rules of the edit."""
         key = function, arguments
         if key not in self._cache:
             self._cache[key] = function(self, *arguments)
@@ -148,7 +148,7 @@ class Survey:
 
 
 def normalize(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Map values linearly so that the smallest that counts is 0 and the largest 1; all 0 if these are equal."""
-    least = float(np.min(values[counted], initial=np.inf))
-    most = float(np.max(values[counted], initial=-np.inf))
-    return (values - least) / (most - least) if most > least else np.zeros_like(values)
+    """Map values linearly so that the smallest counted one is 0 and the largest 1; all 0 if these are equal."""
+    low = float(np.min(values[counted], initial=np.inf))
+    high = float(np.max(values[counted], initial=-np.inf))
+    return (values - low) / (high - low) if high > low else np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""Define thresholds of density rules, a number by step or a quantile of the scene's values, and their units."""
+"""Define thresholds of density rules (numbers by step, or quantiles of the scene's values) and their units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Quantile(Settings):
     """The quantile of a statistic over the Gaussians."""
 
     quantile: Share
-    """Share of the Gaussians that are below the threshold."""
+    """Fraction of the Gaussians that are below the threshold."""
     of: Literal["gaussians"] = "gaussians"
     """Take the quantile over the Gaussians."""
 
@@ -26,7 +26,7 @@ class PixelQuantile(Settings):
     """The quantile of the texture, per px, over the pixels of the training photographs."""
 
     quantile: Share
-    """Share of the pixels that are below the threshold."""
+    """Fraction of the pixels that are below the threshold."""
     of: Literal["pixels"]
     """Take the quantile over the photographs' pixels."""
 
@@ -34,7 +34,7 @@ class PixelQuantile(Settings):
 Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explain_schedule(", or {quantile, of}")]
 
 
-def _no_photographs(share: float) -> float:
+def _no_photographs(q: float) -> float:
     raise ConfigError("a quantile of pixels needs training photographs, and there are none; give a number")
 
 

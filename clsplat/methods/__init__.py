@@ -1,4 +1,4 @@
-"""Methods from papers, one file each: the density rules, losses and stages that only one method uses."""
+"""Methods from papers, one file each: the density rules, losses, and stages that only one method uses."""
 
 from clsplat.core.settings import import_modules
 

@@ -1,4 +1,4 @@
-"""Clone, split and prune Gaussians: adaptive density control (Kerbl et al. 2023, section 5)."""
+"""Clone, split, and prune Gaussians: adaptive density control (Kerbl et al. 2023, section 5)."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -11,30 +11,30 @@ from clsplat.density.statistics import Statistic, StatisticName
 
 
 class Grow(Rule):
-    """Base of rules that turn one Gaussian into several where the mean of a statistic is large.
+    """Base class of rules that turn a Gaussian into several if the mean of a statistic is large.
 
-    With `as_many_as`, the rule selects by `statistic` as many Gaussians as reach `gradient_above` in that other
+    With `as_many_as`, the rule selects as many Gaussians by `statistic` as reach `gradient_above` in that other
     statistic (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})
 
     statistic: StatisticName = "screen_grad"
-    """Column whose mean is compared."""
+    """Statistic whose mean is compared."""
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of the statistic that grows, in its unit."""
+    """Smallest mean of the statistic, in its unit, at which a Gaussian grows."""
     as_many_as: StatisticName | None = None
-    """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
+    """Statistic in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
 
     opacity: Literal["copied", "shared"] = "copied"
-    """`copied`: each result has the same opacity; `shared`: together they are as opaque as the Gaussian was,
+    """`copied`: each child has the parent's opacity; `shared`: together they are as opaque as their parent,
     1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
 
     @model_validator(mode="after")
-    def _with_a_threshold_of_its_unit(self) -> "Grow":
+    def _require_threshold(self) -> "Grow":
         name = self.as_many_as or self.statistic
         if variants(Statistic)[name].is_total and "gradient_above" not in self.model_fields_set:
-            raise ValueError(f"'{name}' has another unit than the default of 'gradient_above'; set it, such as to 200")
+            raise ValueError(f"the default 'gradient_above' is not in the unit of '{name}'; set it, for example to 200")
         return self
 
     @property
@@ -45,7 +45,7 @@ class Grow(Rule):
         """Return the rule's condition, and whether opacity is shared, as arguments of `Edit.mark`."""
         above = edit.at(self.gradient_above)
         if self.as_many_as:
-            above = edit.matching(self.statistic, self.as_many_as, above)
+            above = edit.matching_threshold(self.statistic, self.as_many_as, above)
         return {"statistic": self.statistic, "gradient_above": above, "shared": self.opacity == "shared"}
 
 
@@ -56,20 +56,20 @@ class Clone(Grow):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_below"})
 
     size_below: Positive = 0.01
-    """Largest size that is cloned: largest standard deviation as a fraction of the scene extent."""
+    """Largest size of a Gaussian that is cloned: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
 
 
 class SplitLarge(Grow):
-    """Replace large Gaussians whose statistic is large by smaller ones, sampled from the Gaussian itself."""
+    """Replace large Gaussians whose statistic is large by smaller ones at positions sampled from the Gaussian."""
 
     type: Literal["split"] = "split"
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})
 
     size_above: Positive = 0.01
-    """Smallest size that is split: largest standard deviation as a fraction of the scene extent."""
+    """Smallest size of a Gaussian that is split: largest standard deviation as a fraction of the scene extent."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
     shrink: Annotated[float, Field(ge=1)] = 1.6

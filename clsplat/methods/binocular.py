@@ -1,4 +1,4 @@
-"""Decay opacities between steps, as Binocular3DGS does (Han et al. 2024)."""
+"""Decay opacities between steps, as in Binocular3DGS (Han et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -11,11 +11,11 @@ from clsplat.training.stage import Scheduled
 
 
 class DecayOpacity(Scheduled):
-    """Lower all opacities a little, instead of a reset; training raises those of needed Gaussians (Binocular3DGS, Han
+    """Lower all opacities slightly, instead of a reset; training raises those of needed Gaussians (Binocular3DGS, Han
     et al. 2024).
 
-    The published factor is 0.995 per step, for 3 to 8 images.  Ours applies to a pass over the training images: with
-    many images, a Gaussian is seen less often per step, and its opacity falls as much between two views of it.
+    The published factor is 0.995 per step, for 3 to 8 images.  Ours applies to a pass over the training images, because
+    with more images, a Gaussian is seen in a smaller fraction of steps.
     """
 
     stage: Literal["decay_opacity"] = "decay_opacity"
@@ -24,7 +24,7 @@ class DecayOpacity(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"per_pass"})
 
     per_pass: Annotated[Positive, AfterValidator(Bounded(0, maximum=1))] = 0.975
-    """Factor of the opacities over as many steps as there are training images; 1 changes nothing."""
+    """Factor on the opacities over as many steps as there are training images; 1 changes nothing."""
 
     def run(self, run: Run) -> None:
         factor = at_step(self.per_pass, run.step) ** ((self.every or 1) / len(run.scene.split("train")))

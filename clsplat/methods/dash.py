@@ -1,4 +1,4 @@
-"""Limit the Gaussians while images are small, as DashGaussian does (Chen et al. 2025).
+"""Limit the number of Gaussians while images are small, as in DashGaussian (Chen et al. 2025).
 
 `photos/detail.py` chooses the sizes of the images.
 """
@@ -19,7 +19,7 @@ class Momentum(Budget):
     The final number is the initial number plus a momentum, which starts at `initial_momentum` times the initial number.
     Each edit sets the momentum to `keep` times itself plus the number of Gaussians that could grow, if that is larger.
     During training, the increase is divided by d^(2 - t), with d the divisor of the image size and t the fraction of
-    the steps that are done.  An edit that has reached its number replaces pruned Gaussians.
+    the steps that are done.  Edits at their limit still replace pruned Gaussians.
     """
 
     type: Literal["momentum"] = "momentum"
@@ -28,13 +28,13 @@ class Momentum(Budget):
     )
 
     gaussians: Annotated[int, Field(gt=0)] | None = None
-    """Final number; default: the momentum determines it."""
+    """Final number of Gaussians; default: determined by the momentum."""
     initial_momentum: Annotated[float, Field(gt=0, le=1e6)] = 5.0
-    """First value of the momentum, as a multiple of the initial number of Gaussians."""
+    """Initial momentum, as a multiple of the initial number of Gaussians."""
     keep: Annotated[float, Field(ge=0, lt=1)] = 0.98
-    """Factor of the momentum from one edit to the next."""
+    """Factor on the momentum from one edit to the next."""
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of `screen_grad` of a Gaussian that could grow."""
+    """Smallest mean of `screen_grad` of a Gaussian that could grow."""
     max_added: Annotated[int, Field(gt=0)] = 1_000_000
     """Largest number of Gaussians that one edit adds to the momentum."""
     growth: Annotated[float, Field(gt=0)] = 0.2
@@ -49,7 +49,7 @@ class Momentum(Budget):
         initial = numbers.setdefault("momentum/start", count)
         momentum = numbers.setdefault("momentum/sum", self.initial_momentum * initial)
         end = self.gaussians or initial + momentum
-        target = end if context.edits == 1 else initial + (end - initial) / context.divisor ** (2 - context.share)
+        target = end if context.edits == 1 else initial + (end - initial) / context.divisor ** (2 - context.progress)
         growing = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
         numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, growing))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

@@ -18,45 +18,45 @@ from clsplat.methods.adc import Grow
 
 OFFSET = 0.6  # time from the center to each child, in durations
 SHORTENING = 0.8  # child's duration by its parent's: 0.6² + 0.8² = 1 keeps the variance of both children together
-MAX_DURATION = 0.5  # taken for Gaussians that are always visible: half the scene's duration
+MAX_DURATION = 0.5  # used for Gaussians that are always visible: half of the scene's duration
 MAX_OPACITY = 1 - 1e-6
 
 
 class SplitInTime(Grow):
-    """Split Gaussians in time whose statistic is large and that travel farther than their size (ours).
+    """Split Gaussians in time if their statistic is large and they travel farther than their size (ours).
 
     Two successive Gaussians, each with its own velocity, can follow a curve or a change of color.  At the time of their
-    parent, both together are as opaque as it was.
+    parent, both together are as opaque as the parent.
     """
 
     type: Literal["split_in_time"] = "split_in_time"
     training_keys: ClassVar[frozenset[str]] = frozenset({"travel_above", "duration_above"})
 
     travel_above: Positive = 1.0
-    """Smallest distance traveled during its duration, divided by the Gaussian's largest standard deviation."""
+    """Smallest distance traveled during the duration, divided by the Gaussian's largest standard deviation."""
     duration_above: Annotated[float, Field(gt=0)] = 0.1
-    """Smallest duration that is split, as a fraction of the scene's duration."""
+    """Smallest duration of a Gaussian that is split, as a fraction of the scene's duration."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
         require_motion(self.type, gaussians)
-        steep = edit.stats.mean(self.statistic) >= self.condition(edit)["gradient_above"]
-        rows = np.flatnonzero(steep & (edit.rows() == 1))
+        is_large = edit.stats.mean(self.statistic) >= self.condition(edit)["gradient_above"]
+        rows = np.flatnonzero(is_large & (edit.rows() == 1))
         names = ("means", "quats", "log_scales", "logit_opacity", MOTION)
         tables = {name: gaussians.get(name)[rows].astype(np.float64) for name in names}
         fields = motion_fields(tables[MOTION].shape[1])
         duration = np.minimum(np.exp(np.minimum(tables[MOTION][:, fields["log_duration"]][:, 0], 0)), MAX_DURATION)
         travel = np.linalg.norm(tables[MOTION][:, fields["velocity"]], axis=1) * duration
         size = np.exp(tables["log_scales"]).max(axis=1)
-        far = (travel > edit.at(self.travel_above) * size) & (duration > self.duration_above)
-        rows, duration = rows[far], duration[far]
+        is_split = (travel > edit.at(self.travel_above) * size) & (duration > self.duration_above)
+        rows, duration = rows[is_split], duration[is_split]
         if not len(rows):
             return
-        tables = {name: table[far] for name, table in tables.items()}
+        tables = {name: table[is_split] for name, table in tables.items()}
         children = [shift_time_center(tables, sign * OFFSET * duration) for sign in (-1, 1)]
         for child in children:
             child[MOTION][:, fields["log_duration"]] = np.log(SHORTENING * duration)[:, None]
-            child["logit_opacity"] = shared_in_time(tables["logit_opacity"])
+            child["logit_opacity"] = divide_logits_in_time(tables["logit_opacity"])
         chosen = np.zeros(gaussians.count, bool)
         chosen[rows] = True
         edit.choose(chosen, copies=2, kept=0)
@@ -72,7 +72,7 @@ class PruneInvisible(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
 
     opacity_below: Positive = 0.005
-    """Opacity below which a Gaussian is removed, at the timestamp nearest to its center in time."""
+    """Opacity below which a Gaussian is removed, at the timestamp nearest to its time center."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
@@ -86,15 +86,15 @@ class PruneInvisible(Rule):
         edit.choose(opacity < edit.at(self.opacity_below), copies=0, kept=0)
 
 
-def shared_in_time(logit: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the logits of two children that together are as opaque as their parent, at its time."""
+def divide_logits_in_time(logit: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logits of two children that together are as opaque as their parent at its time center."""
     opacity = (1 - np.sqrt(1 - np.minimum(opacities(logit), MAX_OPACITY))) / np.exp(-0.5 * (OFFSET / SHORTENING) ** 2)
     opacity = np.clip(opacity, 1 - MAX_OPACITY, MAX_OPACITY)
     return np.asarray(np.log(opacity / (1 - opacity)))
 
 
 def require_motion(name: str, gaussians: Gaussians) -> None:
-    """Raise ConfigError if the Gaussians do not move; name: of the rule or loss."""
+    """Raise ConfigError if the Gaussians do not move.  name: of the rule or loss."""
     if not gaussians.is_moving:
         raise ConfigError(f"'{name}' needs Gaussians that move; set `model.time`, or remove '{name}'")
 
@@ -102,7 +102,7 @@ def require_motion(name: str, gaussians: Gaussians) -> None:
 class MotionL2(Penalty):
     """Mean over Gaussians of min(s, 1) |v|, in extents: the distance traveled during the duration s (ours).
 
-    Meant for velocities that the images hardly determine.  On the synthetic scene it cost 0.3 to 0.5 dB together with
+    For velocities that the images hardly determine.  On the synthetic scene it cost 0.3 to 0.5 dB together with
     `short_duration` (docs/moving.md), and no recipe uses it.
     """
 
@@ -119,7 +119,7 @@ class MotionL2(Penalty):
 
 
 class ShortDuration(Penalty):
-    """Mean over Gaussians of max(log(s₀ / s), 0) with s₀ = `below`: against durations of a single frame (ours).
+    """Mean over Gaussians of max(log(s₀ / s), 0) with s₀ = `below`, against durations of a single frame (ours).
 
     No recipe uses it: see `motion_l2`.
     """

@@ -1,4 +1,4 @@
-"""Prune by the rise of the error in training views, and measure how much error a Gaussian can remove (ours)."""
+"""Prune by the increase of the error in training views, and measure how much error a Gaussian can remove (ours)."""
 
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal
@@ -32,8 +32,8 @@ def squared_error(survey: Survey, views: list[View]) -> float:
     return total
 
 
-def without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[], float]) -> float:
-    """Return `function()` evaluated while the Gaussians of some rows are invisible; restores them afterwards."""
+def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[], float]) -> float:
+    """Return `function()` while the Gaussians in `rows` are invisible; restore them afterwards."""
     logits = gaussians.get("logit_opacity")
     hidden = logits.copy()
     hidden[rows] = HIDDEN
@@ -44,8 +44,8 @@ def without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[],
         gaussians.set("logit_opacity", logits)
 
 
-def largest_allowed(allowed: Callable[[int], bool], count: int) -> int:
-    """Return an allowed number from 0 to `count`, by bisection: `count` / RESOLUTION more is not allowed."""
+def find_largest_allowed(allowed: Callable[[int], bool], count: int) -> int:
+    """Find the largest allowed number from 0 to `count` by bisection, up to `count` / RESOLUTION."""
     low, high, step = 0, count + 1, max(1, count // RESOLUTION)
     while high - low > step:
         middle = (low + high) // 2
@@ -54,10 +54,10 @@ def largest_allowed(allowed: Callable[[int], bool], count: int) -> int:
 
 
 class PruneRedundant(Rule):
-    """Remove the Gaussians with the smallest weight in the training views, while the squared error rises little.
+    """Remove the Gaussians with the smallest weights in the training views until the squared error rises too much.
 
     The rule renders some views without the candidates to find how many it can remove.  Training then compensates for
-    the rise.
+    the increase.
     """
 
     type: Literal["prune_redundant"] = "prune_redundant"
@@ -65,7 +65,7 @@ class PruneRedundant(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"error_rise", "views"})
 
     error_rise: Positive = 0.01
-    """Largest relative rise of the squared error: 0.01 is 0.04 dB."""
+    """Largest relative increase of the squared error: 0.01 is 0.04 dB."""
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views on which the error is measured, sampled by seed and step; all if there are fewer."""
 
@@ -76,10 +76,10 @@ class PruneRedundant(Rule):
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 
         def allowed(number: int) -> bool:
-            return without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
+            return evaluate_without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
 
         chosen = np.zeros(len(order), bool)
-        chosen[order[: largest_allowed(allowed, len(order))]] = True
+        chosen[order[: find_largest_allowed(allowed, len(order))]] = True
         edit.choose(chosen, copies=0, kept=0)
 
 
@@ -87,7 +87,7 @@ class ErrorGain(Statistic):
     """Error that a Gaussian can remove, in mean errors of a pixel, over all training views (ours).
 
     It is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does not
-    depend on the exposure, size and number of the images, nor on the weights of the losses.
+    depend on the exposure, size, and number of the images, nor on the weights of the losses.
     """
 
     type: Literal["gain"] = "gain"
@@ -109,7 +109,7 @@ class ErrorGain(Statistic):
 
 
 class ViewError(Statistic):
-    """Error of all views, including views that do not see the Gaussian, as the losses measure it."""
+    """Error of all views, including views that do not see the Gaussian, measured by the losses."""
 
     type: Literal["view_error"] = "view_error"
 

@@ -1,4 +1,4 @@
-"""Grow and prune by the wrong pixels that each Gaussian contributes to, as FastGS does (Ren et al. 2025)."""
+"""Grow and prune by the wrong pixels that each Gaussian contributes to, as in FastGS (Ren et al. 2025)."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -20,46 +20,46 @@ Floats = NDArray[np.float64]
 class WrongPixels:
     """The wrong pixels that each Gaussian contributes to."""
 
-    pixels: NDArray[np.int64]  # [N] mean number in a view, rounded down
+    pixels: NDArray[np.int64]  # [N] mean number per view, rounded down
     score: Floats  # [N] number times the loss of the view, summed over views, scaled to [0, 1]
 
 
-def wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongPixels:
+def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongPixels:
     """Count the wrong pixels that each Gaussian contributes to, over `views` training views."""
-    drawn = survey.sample_views(views)
+    sampled = survey.sample_views(views)
     total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
-    for look in survey.render(drawn):
+    for look in survey.render(sampled):
         error, counted = look.error().astype(np.float64), look.counted()
-        wrong = counted & (normalize(error, counted) > error_above)
-        pixels = look.sum(BLENDED, wrong).astype(np.int64)  # integers below 2^24: exact in float32
+        is_wrong = counted & (normalize(error, counted) > error_above)
+        pixels = look.sum(BLENDED, is_wrong).astype(np.int64)  # integers below 2^24: exact in float32
         total += pixels
         weighted += look.loss(LOSSES) * pixels
-    return WrongPixels(total // max(len(drawn), 1), normalize(weighted, np.ones(len(weighted), bool)))
+    return WrongPixels(total // max(len(sampled), 1), normalize(weighted, np.ones(len(weighted), bool)))
 
 
 class ByWrongPixels(Rule):
-    """Base of rules that count wrong pixels; rules with the same `views` and `error_above` share the counts."""
+    """Base class of rules that count wrong pixels; rules with the same `views` and `error_above` share the counts."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views", "error_above"})
 
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views, sampled by seed and step; all if there are fewer."""
     error_above: Share = 0.1
-    """Error above which a pixel is wrong: mean over the channels, scaled to [0, 1] in each view."""
+    """Error above which a pixel is wrong: mean over channels, scaled to [0, 1] in each view."""
 
     def wrong(self, edit: Edit) -> WrongPixels:
         """Return the counts for the Gaussians before the edit."""
-        return edit.survey.cached(wrong_pixels, self.views, self.error_above)
+        return edit.survey.cached(count_wrong_pixels, self.views, self.error_above)
 
 
 class RevertGrowth(ByWrongPixels):
-    """Undo the growth, by earlier rules, of Gaussians that contribute to few wrong pixels."""
+    """Undo the growth by earlier rules of Gaussians that contribute to few wrong pixels."""
 
     type: Literal["revert_growth"] = "revert_growth"
     training_keys: ClassVar[frozenset[str]] = frozenset({"pixels_above"})
 
     pixels_above: NonNegative = 5
-    """Mean number of wrong pixels in a view, rounded down, above which a Gaussian may grow."""
+    """Mean number of wrong pixels per view, rounded down, above which a Gaussian may grow."""
 
     def mark(self, edit: Edit) -> None:
         edit.undo_growth(self.wrong(edit).pixels <= edit.at(self.pixels_above))

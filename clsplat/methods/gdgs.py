@@ -15,11 +15,11 @@ CENTRAL = (0.01, 0.99)  # the grid spans these quantiles of the means along each
 
 
 class CloneDense(Rule):
-    """Copy small Gaussians with a large gradient twice where they are dense: once in place, once with jitter.
+    """Copy small Gaussians with large gradients in dense regions twice: once in place, once with jitter.
 
-    A grid of `cells`³ covers the central 98 % of the means.  The rule acts if the `extremes` fullest cells together
-    hold `ratio_above` times as many Gaussians with a large gradient as the `extremes` emptiest, and only in the fullest
-    cells.  Put it before `clone`, which then takes the other Gaussians.
+    A grid of `cells`³ covers the central 98 % of the means.  The rule acts only in the `extremes` fullest cells, if
+    they have at least `ratio_above` times as many Gaussians with large gradients as the `extremes` emptiest cells.
+    List it before `clone`, which then copies the other Gaussians.
     """
 
     type: Literal["clone_dense"] = "clone_dense"
@@ -28,15 +28,15 @@ class CloneDense(Rule):
     )
 
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of `screen_grad`."""
+    """Smallest mean of `screen_grad` of a Gaussian that is copied."""
     size_below: Positive = 0.01
-    """Largest size, the largest standard deviation as a fraction of the scene extent."""
+    """Largest size of a Gaussian that is copied: largest standard deviation as a fraction of the scene extent."""
     ratio_above: NonNegative = 400.0
     """Smallest ratio of the counts in the fullest cells to those in the emptiest."""
     jitter: NonNegative = 0.5
     """Standard deviation of the jitter, in standard deviations of the Gaussian along its axes."""
     cells: Annotated[int, Field(ge=1, le=256)] = 4
-    """Cells of the grid along each axis."""
+    """Number of grid cells along each axis."""
     extremes: Annotated[int, Field(ge=1)] = 20
     """Number of fullest cells, and of emptiest cells, that are compared."""
 
@@ -50,15 +50,15 @@ class CloneDense(Rule):
             gaussians.get("means").astype(np.float64),
             np.exp(gaussians.get("log_scales").astype(np.float64)),
         )
-        steep = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
-        cell = cells_of(means, self.cells)
-        counts = np.bincount(cell[steep & (cell >= 0)], minlength=self.cells**3)
+        has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        cell = grid_cells(means, self.cells)
+        counts = np.bincount(cell[has_gradient & (cell >= 0)], minlength=self.cells**3)
         order = np.argsort(-counts, kind="stable")
         fullest, emptiest = order[: self.extremes], order[-self.extremes :]
         if counts[fullest].sum() < edit.at(self.ratio_above) * max(counts[emptiest].sum(), 1):
             return
-        small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
-        chosen = steep & small & np.isin(cell, fullest) & (edit.rows() == 1)
+        is_small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
+        chosen = has_gradient & is_small & np.isin(cell, fullest) & (edit.rows() == 1)
         rows = np.flatnonzero(chosen)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
@@ -67,13 +67,13 @@ class CloneDense(Rule):
         edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + offset], axis=1))
 
 
-def cells_of(means: Floats, cells: int) -> NDArray[np.int64]:
+def grid_cells(means: Floats, cells: int) -> NDArray[np.int64]:
     """Return the index of the grid cell of each mean, [N], or -1 outside the grid."""
-    finite = np.isfinite(means).all(axis=1)
-    if not finite.any():
+    is_finite = np.isfinite(means).all(axis=1)
+    if not is_finite.any():
         return np.full(len(means), -1)
-    low, high = np.quantile(means[finite], CENTRAL, axis=0)
-    inside = finite & np.all((means >= low) & (means <= high), axis=1)
-    position = (np.where(inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
+    low, high = np.quantile(means[is_finite], CENTRAL, axis=0)
+    is_inside = is_finite & np.all((means >= low) & (means <= high), axis=1)
+    position = (np.where(is_inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
     index = np.minimum(position.astype(np.int64), cells - 1)
-    return np.where(inside, np.ravel_multi_index(tuple(index.T), (cells,) * 3), -1)
+    return np.where(is_inside, np.ravel_multi_index(tuple(index.T), (cells,) * 3), -1)

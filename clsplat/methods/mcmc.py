@@ -1,4 +1,4 @@
-"""Relocate faint Gaussians and add noise to the means, as 3DGS-MCMC does (Kheradmand et al. 2024)."""
+"""Relocate faint Gaussians and add noise to the means, as in 3DGS-MCMC (Kheradmand et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -18,7 +18,7 @@ WEIGHT_STEPS = 2**24  # opacities become integer weights, whose sums are exact
 
 
 class Relocate(Rule):
-    """Move faint Gaussians onto opaque ones, sampled by opacity, and keep the opacity there (eqs. 8 and 9).
+    """Move faint Gaussians onto opaque ones, sampled by opacity, and preserve the opacity there (eqs. 8 and 9).
 
     `growth` adds Gaussians in the same way, up to the limit of the edit (`max_gaussians`, `budget`, memory).
     """
@@ -35,44 +35,44 @@ class Relocate(Rule):
         gaussians, rows = edit.gaussians, edit.rows()
         logit, log_scales = (gaussians.get(name).astype(np.float64) for name in ("logit_opacity", "log_scales"))
         opacity = np.minimum(1 / (1 + np.exp(-logit[:, 0])), 1 - 1e-7)
-        faint = opacity < edit.at(self.opacity_below)
-        weights = np.where(faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
+        is_faint = opacity < edit.at(self.opacity_below)
+        weights = np.where(is_faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
         if not weights.any():
             return
-        more = min(int(self.growth * len(rows)) - len(rows), np.inf if edit.room is None else edit.room)
-        drawn = systematic(weights, max(0, int(more) + int(rows[faint].sum())), edit.random())
-        sources = np.flatnonzero(drawn)
-        copies = drawn[sources] + 1
+        added = min(int(self.growth * len(rows)) - len(rows), np.inf if edit.room is None else edit.room)
+        draws = sample_systematically(weights, max(0, int(added) + int(rows[is_faint].sum())), edit.random())
+        sources = np.flatnonzero(draws)
+        copies = draws[sources] + 1
         opacities, factors = divide(opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below))
         logits = np.log(opacities / (1 - opacities))[:, None]
         log_scales = log_scales[sources] + np.log(factors)[:, None]
-        for number in np.unique(copies):  # children: no effect where a later rule or the limit refuses the growth
-            same = copies == number
+        for number in np.unique(copies):  # set_children has no effect if a later rule or the limit undoes the growth
+            has_number = copies == number
             for name, values in (("logit_opacity", logits), ("log_scales", log_scales)):
-                edit.set_children(name, sources[same], np.repeat(values[same, None], number, axis=1))
+                edit.set_children(name, sources[has_number], np.repeat(values[has_number, None], number, axis=1))
         edit.zero_moments(sources)
-        edit.choose(faint | (drawn > 0), copies=np.where(faint, 0, drawn + 1), kept=1)
+        edit.choose(is_faint | (draws > 0), copies=np.where(is_faint, 0, draws + 1), kept=1)
 
 
-def systematic(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
+def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Return how often systematic sampling draws each item, [N]: its expected number, rounded down or up.
 
-    Equidistant points, shifted by one random number, on the cumulative weights; in integers, so exact.
+    Places `draws` equidistant points, shifted by one random number, on the cumulative weights; exact in integers.
     """
     ends = np.cumsum(weights)
     total = int(ends[-1])
-    step, rest = divmod(total, max(draws, 1))
+    step, remainder = divmod(total, max(draws, 1))
     index, start = np.arange(draws, dtype=np.uint64), np.uint64(random.integers(0, total))
-    points = index * np.uint64(step) + (index * np.uint64(rest) + start) // np.uint64(max(draws, 1))
+    points = index * np.uint64(step) + (index * np.uint64(remainder) + start) // np.uint64(max(draws, 1))
     return np.diff(np.searchsorted(points, ends, side="left"), prepend=0)
 
 
 def divide(
     opacity: NDArray[np.float64], rows: NDArray[np.integer], lowest: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor of their scales (eqs. 8, 9).
+    """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor on their scales (eqs. 8, 9).
 
-    Together they have the opacity of the original at its center, and its integral along a line.
+    Together they have the opacity of the original at its center and the same integral along a line.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
     orders = range(1, MAX_COPIES + 1)
@@ -84,7 +84,7 @@ class AddNoise(Scheduled):
     """Add noise to the means, proportional to each Gaussian's covariance; opaque Gaussians do not move.
 
     The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n three standard normal numbers; it
-    is zero 0.1 above that opacity.  Dividing by the extent makes the rate independent of the unit of length.
+    vanishes 0.1 above that opacity.  Dividing by the extent makes the rate independent of the unit of length.
     """
 
     stage: Literal["add_noise"] = "add_noise"

@@ -1,6 +1,6 @@
-"""Split, prune and merge Gaussians as Micro-splatting does (Lee et al. 2025).
+"""Split, prune, and merge Gaussians as in Micro-splatting (Lee et al. 2025).
 
-All rules select Gaussians on the host: comparing Gaussians with each other is a line of NumPy there.
+All rules select Gaussians on the host, where NumPy compares them with each other in a few lines.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative, Positive, explain_schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import largest
-from clsplat.density.mixture import mass_of, merge
+from clsplat.density.mixture import masses, merge
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.formats.splats import SH_C0, inverse_opacities
@@ -48,7 +48,7 @@ class RenderedTexture(Statistic):
 
 
 class Subdivide(Rule):
-    """Base of rules that replace a limited fraction of the Gaussians by smaller ones."""
+    """Base class of rules that replace a limited fraction of the Gaussians by smaller ones."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "max_fraction", "radius_above"})
 
@@ -59,7 +59,7 @@ class Subdivide(Rule):
     max_fraction: Share = 0.05
     """Largest fraction of all Gaussians that one edit splits, starting with the largest scores."""
     radius_above: Annotated[float, Field(ge=0)] = 2.0
-    """Smallest mean radius on the screen that is split: three standard deviations, px."""
+    """Smallest mean radius on the screen of a Gaussian that is split: three standard deviations, px."""
 
     @property
     def statistics(self) -> set[str]:
@@ -78,19 +78,19 @@ class Subdivide(Rule):
 class SplitTextured(Subdivide):
     """Split Gaussians where the photographs are textured.
 
-    With `gradient_above: 0`, only the texture decides.  Above 0, the mean of `screen_grad` must reach it too; choose a
-    threshold below those of the other rules.
+    With `gradient_above: 0`, only the texture decides.  Otherwise, the mean of `screen_grad` must also reach that
+    value; choose a threshold below those of the other rules.
     """
 
     type: Literal["split_textured"] = "split_textured"
     training_keys: ClassVar[frozenset[str]] = frozenset({"texture_above", "gradient_above"})
 
     texture: StatisticName = "texture"
-    """Column whose mean is the texture."""
+    """Statistic whose mean is the texture."""
     texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
-    """Lowest texture that is split: a number, or a quantile."""
+    """Smallest texture of a Gaussian that is split: a number, or a quantile."""
     gradient_above: NonNegative = 1.0e-4
-    """Lowest mean of `screen_grad` that is split."""
+    """Smallest mean of `screen_grad` of a Gaussian that is split."""
 
     @property
     def statistics(self) -> set[str]:
@@ -99,15 +99,15 @@ class SplitTextured(Subdivide):
     def mark(self, edit: Edit) -> None:
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
         above = edit.threshold(self.texture, self.texture_above)
-        seen = edit.gaussians.get(SEEN)[:, 0] > 0
-        candidates = seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
+        is_seen = edit.gaussians.get(SEEN)[:, 0] > 0
+        candidates = is_seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
         self.subdivide(edit, candidates, texture)
 
 
 class SplitOversized(Subdivide):
     """Split Gaussians whose covariance trace is larger than τ = 3 s².
 
-    s is `rms_above`, as a fraction of the scene extent or as a quantile of the rms scales.  With `pixels`, s is the
+    s is `rms_above`, as a fraction of the scene extent or a quantile of the RMS scales.  With `pixels`, s is the
     length of that many pixels in the nearest training view.
     """
 
@@ -115,9 +115,9 @@ class SplitOversized(Subdivide):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rms_above"})
 
     rms_above: Annotated[Quantile | Positive, explain_schedule(", or {quantile}")] = 0.01
-    """Smallest rms scale that is split, as a fraction of the scene extent or as a quantile of all rms scales."""
+    """RMS scale above which a Gaussian is split, as a fraction of the scene extent or a quantile of all RMS scales."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """Smallest rms scale that is split, px in the nearest training view; replaces `rms_above`."""
+    """RMS scale above which a Gaussian is split, px in the nearest training view; replaces `rms_above`."""
 
     @property
     def tables(self) -> set[str]:
@@ -164,7 +164,7 @@ class PruneUnimportant(Rule):
 class MergeNeighbors(Rule):
     """Merge two mutual nearest neighbors that are close and similar in color into one Gaussian.
 
-    The result has the mean, covariance and color of their mixture, weighted by opacity times volume, and the opacity
+    The result has the mean, covariance, and color of their mixture, weighted by opacity times volume, and the opacity
     that preserves the sum of these weights.  It replaces the heavier Gaussian and keeps its statistics and Adam
     moments, except the moments of scales and rotation.
     """
@@ -176,41 +176,41 @@ class MergeNeighbors(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "color_below"})
 
     distance_below: Positive = 0.5
-    """Largest distance that is merged, as a fraction of the sum of the two mean scales."""
+    """Distance below which two Gaussians are merged, as a fraction of the sum of their mean scales."""
     color_below: Positive = 0.05
-    """Largest difference in any channel of the base colors, in [0, 1]."""
+    """Difference of base colors below which two Gaussians are merged: maximum over channels, in [0, 1]."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
         names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
         tables = {name: gaussians.get(name).astype(np.float64) for name in names}
         first, second = self._pairs(edit, tables)
-        unchanged = edit.rows() == 1
-        usable = unchanged[first] & unchanged[second]
+        is_unchanged = edit.rows() == 1
+        usable = is_unchanged[first] & is_unchanged[second]
         first, second = first[usable], second[usable]
         if not len(first):
             return
         for name, values in merge(tables, first, second).items():
             edit.set_rows(name, first, values)
-        edit.zero_moments(first, ("log_scales", "quats"))  # the merged Gaussian has other axes
+        edit.zero_moments(first, ("log_scales", "quats"))  # the axes have changed
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
         edit.choose(absorbed, copies=0, kept=0)
 
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rows of mutual nearest neighbors to merge, the heavier one of each pair first."""
-        means, mass = tables["means"], mass_of(tables)
+        means, mass = tables["means"], masses(tables)
         if len(means) < 2 or not np.isfinite(means).all():  # training stops at its next report
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
         distances, neighbors = scipy.spatial.cKDTree(means).query(means, k=2)
         other = np.where(neighbors[:, 0] == rows, 1, 0)  # with equal means, a row may be its own second neighbor
         distance, nearest = distances[rows, other], neighbors[rows, other]
-        mutual = (nearest[nearest] == rows) & (rows < nearest)
+        is_mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
-        close = distance < edit.at(self.distance_below) * (size + size[nearest])
+        is_close = distance < edit.at(self.distance_below) * (size + size[nearest])
         color = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
-        first = rows[mutual & close & (color < edit.at(self.color_below))]
+        first = rows[is_mutual & is_close & (color < edit.at(self.color_below))]
         second = nearest[first]
         is_heavier = mass[first] >= mass[second]
         return np.where(is_heavier, first, second), np.where(is_heavier, second, first)

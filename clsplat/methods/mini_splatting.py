@@ -25,16 +25,16 @@ Floats = NDArray[np.float64]
 def sampled_weights(survey: Survey, weight_per_view: float | None = None, number: int | None = None) -> Weights:
     """Return the weights in training views.
 
-    weight_per_view: as in `weights`.  number: the number of sampled views; None: all views.
+    weight_per_view: as in `weights`.  number: of sampled views; None for all views.
     """
     views = survey.views if number is None else survey.sample_views(number)
     return weights(survey.render(views), survey.count, weight_per_view)
 
 
-def unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
-    """Return for each view the Gaussians that it sees but does not need, [V, N].
+def find_unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
+    """Return a mask of the Gaussians that each view sees but does not need, [V, N].
 
-    A view needs its heaviest Gaussians, which together make up the share `weight_per_view` of its weight.
+    A view needs its heaviest Gaussians, which together make up the fraction `weight_per_view` of its weight.
     """
     hidden = np.zeros((len(survey.views), survey.count), bool)
     for row, look in zip(hidden, survey.render(survey.views), strict=True):
@@ -45,7 +45,7 @@ def unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
 class PruneUseless(Rule):
     """Remove Gaussians that are useful in few training views, and the Gaussians with the smallest weights.
 
-    The weight of a Gaussian in a view is the sum of alpha T over the pixels.  The heaviest ones that together make up
+    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The heaviest ones that together make up
     `weight_per_view` of the view's weight are useful in it.
     """
 
@@ -58,7 +58,7 @@ class PruneUseless(Rule):
     views: Annotated[int, Field(ge=1)] | None = None
     """Number of training views, sampled by seed and step; default: all."""
     views_below: Annotated[int, Field(ge=0)] = 2
-    """A Gaussian that is useful in fewer views is removed."""
+    """Smallest number of views in which a Gaussian must be useful; others are removed."""
     weight_total: Share = 0.999
     """Fraction of the weight in all views that is kept; the smallest weights are removed."""
 
@@ -69,12 +69,12 @@ class PruneUseless(Rule):
 
 
 class HideUseless(Scheduled):
-    """Skip, in the steps on each training view, the Gaussians that contribute little to it, to save time
+    """Skip the Gaussians that contribute little to a training view in the steps on that view, to save time
     (Mini-Splatting2, Fang and Wang 2024).
 
-    The heaviest Gaussians that together make up `weight_per_view` of a view's weight, alpha T over all pixels, stay.
-    New Gaussians are hidden in the views in which their source was.  Other renders, and all renders after the training,
-    show every Gaussian.
+    The heaviest Gaussians that together make up `weight_per_view` of a view's weight, alpha T over all pixels, are
+    kept.  New Gaussians are hidden in the same views as their source.  Other renders, and all renders after the
+    training, show every Gaussian.
     """
 
     stage: Literal["hide_useless"] = "hide_useless"
@@ -90,4 +90,4 @@ class HideUseless(Scheduled):
             run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
 
     def run(self, run: Run) -> None:
-        hide(run.model.gaussians, unneeded(run.survey(), self.weight_per_view))
+        hide(run.model.gaussians, find_unneeded(run.survey(), self.weight_per_view))

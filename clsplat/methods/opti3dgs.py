@@ -1,4 +1,4 @@
-"""Train on images whose finest details return as a wavelet filter is learned (AutoOpti3DGS, Nguyen et al. 2025)."""
+"""Train on photos whose finest details return while a wavelet filter is learned (AutoOpti3DGS, Nguyen et al. 2025)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,14 +21,14 @@ NAMES = {"filter": ("haar/scale", "haar/leak"), "scale": ("haar/scale",)}
 
 
 class Haar(TrainingModule):
-    """Remove the finest details of the photo and restore them as a filter is learned (AutoOpti3DGS, Nguyen et al.
+    """Remove the finest details of the photo, and restore them while a filter is learned (AutoOpti3DGS, Nguyen et al.
     2025).
 
     The photo passes through one level of the Haar transform and its inverse.  The high-pass analysis filter is
     h = s (1, -1) / √2 + l (1, 1) / √2 with learned scale s and leak l.  Both start at zero, which averages squares of
-    2 x 2 px.  The losses on images train them, and the loss weight · 2 ((1 - s)² + l²) pulls h to Haar's filter, which
-    leaves the photo unchanged.  A masked pixel becomes the mean of the unmasked ones in its square.  All losses on
-    images must be symmetric in render and photo.
+    2 x 2 px.  They are trained by the losses on images and by the loss weight · 2 ((1 - s)² + l²), which pulls h to
+    Haar's filter, with which the photo is unchanged.  A masked pixel becomes the mean of the unmasked pixels in its
+    square.  All losses on images must be symmetric in render and photo.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
@@ -38,7 +38,7 @@ class Haar(TrainingModule):
 
     type: Literal["haar"] = "haar"
     learn: Literal["filter", "scale"] = "filter"
-    """`filter`: scale and leak, which together are any filter with two taps; `scale`: only the scale."""
+    """`filter`: scale and leak, which can represent any filter with two taps; `scale`: only the scale."""
     rate: NonNegative = 1.0e-4
     """Learning rate of the filter (Adam); it determines how fast details return."""
     weight: NonNegative = 0.05
@@ -52,8 +52,8 @@ class Haar(TrainingModule):
             if isinstance(loss, ImageLoss) and loss.reads_photograph and not loss.symmetric:
                 name = getattr(loss, "type", getattr(loss, "name", type(loss).__name__))
                 raise ConfigError(
-                    f"the loss '{name}' is not symmetric in render and photo, as '{self.type}' requires; use l1, l2 or "
-                    "dssim, or set `symmetric = True` in the class of a loss that is"
+                    f"the loss '{name}' is not symmetric in render and photo, as '{self.type}' requires; use l1, l2, "
+                    "or dssim, or set `symmetric = True` in the class if the loss is symmetric"
                 )
 
     def penalty(self, scalars: Scalars, step: int) -> tuple[float, ByNumber]:
@@ -83,20 +83,20 @@ class HaarState(ModuleState):
         step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: TrainingStep) -> None:
-        """Compute the gradient with respect to the photo first: a loss keeps the sums of its last call."""
+        """Compute the gradient with respect to the photo first, since a loss keeps the sums of its last call."""
         self.settings.check_losses(step.loss_settings)
-        gradient = gradient_by_photograph(step.loss_settings, step.comparison)
+        gradient = photograph_gradient(step.loss_settings, step.comparison)
         if step.planes.mask is not None:
             apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
-        of_images = filter_gradients(step.saved(self), self.filter, gradient)
-        value, of_filter = self.settings.penalty(self.filter, step.number)
+        image_gradients = filter_gradients(step.saved(self), self.filter, gradient)
+        value, penalty_gradients = self.settings.penalty(self.filter, step.number)
         step.module_losses.append(LossValue(self.settings.type, lambda: value))
-        step.save(self, (of_images, of_filter))
+        step.save(self, (image_gradients, penalty_gradients))
 
     def update(self, step: TrainingStep) -> None:
-        of_images, of_filter = step.saved(self)
-        by_images = of_images()
-        self.learn({name: by_images[name] + gradient for name, gradient in of_filter.items()}, step.number)
+        wait_for_gradients, penalty_gradients = step.saved(self)
+        gradients = wait_for_gradients()
+        self.learn({name: gradients[name] + value for name, value in penalty_gradients.items()}, step.number)
 
     def learn(self, gradients: ByNumber, step: int) -> None:
         """Update the filter with Adam."""
@@ -104,7 +104,7 @@ class HaarState(ModuleState):
 
 
 def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
-    """Return the photo after the transform; the colors of `planes` do not change."""
+    """Return the planes with the filtered photo; the colors of `planes` do not change."""
     camera, workspace = planes.camera, planes.workspace
     filtered = workspace.array("haar", planes.colors.shape)
     workspace.device.program("haar.cl").haar_forward(
@@ -117,10 +117,10 @@ def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
 
 
 def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
-    """Start computing the gradient of the filter; the returned function waits for it.
+    """Start computing the gradient of the filter's parameters; return a function that waits for it.
 
     planes: the arguments of `apply_filter`.  gradient: with respect to the filtered colors, [3, rows, stride], zero
-    outside the image and where masked.
+    outside the image and in masked pixels.
     """
     columns, strips = planes.camera.stride // 2, -(-planes.camera.rows // (2 * STRIP))
     sums = planes.workspace.array("haar sums", (2, strips, columns))
@@ -131,33 +131,33 @@ def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Call
         sums=sums,
         **_arguments(planes, scalars, sums),
     )
-    copied = sums.get_later()
+    group_sums = sums.get_later()
 
     def derivatives() -> ByNumber:
-        by_u, by_v = (float(part.sum(dtype=np.float64)) for part in copied())
-        return dict(zip(NAMES["filter"], (by_u - by_v, by_u + by_v), strict=True))
+        grad_u, grad_v = (float(part.sum(dtype=np.float64)) for part in group_sums())
+        return dict(zip(NAMES["filter"], (grad_u - grad_v, grad_u + grad_v), strict=True))
 
     return derivatives
 
 
 def _arguments(planes: Planes, scalars: ByNumber, unread: Array) -> dict[str, Any]:
-    """Return arguments of both kernels; `unread` is passed instead of a mask where there is none."""
+    """Return the arguments of both kernels.  unread: any array, passed if there is no mask."""
     scale, leak = scalars["haar/scale"], scalars.get("haar/leak", 0.0)
     masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()
     return {"mask": planes.mask or unread, "masked": masked, "u": leak + scale, "v": leak - scale, **sizes}
 
 
-def gradient_by_photograph(losses: Sequence[Loss], comparison: Comparison) -> Array:
+def photograph_gradient(losses: Sequence[Loss], comparison: Comparison) -> Array:
     """Return the gradient of symmetric losses with respect to the photo, [3, rows, stride].
 
-    The gradient with respect to the render is not touched.
+    The gradient with respect to the render does not change.
     """
     gradient = comparison.workspace.array("grad_photograph", comparison.photograph.shape)
     image, photograph = comparison.photograph, comparison.image
-    exchanged = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
-    compared = [loss for loss in losses if isinstance(loss, ImageLoss) and loss.reads_photograph]
-    if not compared:
+    swapped = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
+    image_losses = [loss for loss in losses if isinstance(loss, ImageLoss) and loss.reads_photograph]
+    if not image_losses:
         gradient.fill(0)
-    for loss in compared:
-        loss.add(exchanged)
+    for loss in image_losses:
+        loss.add(swapped)
     return gradient

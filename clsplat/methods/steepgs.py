@@ -1,8 +1,8 @@
-"""Split Gaussians where a split lowers the loss at once, as SteepGS does (Wang et al. 2025).
+"""Split Gaussians where a split immediately lowers the loss, as in SteepGS (Wang et al. 2025).
 
-That is where the splitting matrix S has a negative eigenvalue.  If a Gaussian's weight in the pixels is replaced by the
-mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians with part of its opacity are
-such a mean, up to the product of their alphas.
+This is the case if the splitting matrix S has a negative eigenvalue.  If a Gaussian's weight in the pixels is replaced
+by the mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians with a part of its
+opacity form such a mean, except for the product of their alphas.
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -14,7 +14,7 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative, Positive, Schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import largest
-from clsplat.density.mixture import covariance_of
+from clsplat.density.mixture import covariance_matrices
 from clsplat.density.statistics import NEEDS_CONIC, Statistic
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
@@ -50,7 +50,7 @@ class Splitting(Statistic):
 class SplitSteepest(Rule):
     """Replace a Gaussian by two, moved apart in the direction that lowers the loss most.
 
-    A Gaussian splits where the smallest eigenvalue of its splitting matrix, averaged over views, is low enough; the
+    A Gaussian is split if the smallest eigenvalue of its splitting matrix, averaged over views, is low enough; the
     children move along the eigenvector.  If the edit has a limit (`max_gaussians`, `budget`, memory), the lowest
     eigenvalues come first.
     """
@@ -61,16 +61,16 @@ class SplitSteepest(Rule):
     )
 
     eigenvalue_below: Schedule = -1.0e-6
-    """Largest eigenvalue that splits, extents⁻²."""
+    """Eigenvalue below which a Gaussian is split, extents⁻²."""
     gradient_above: NonNegative = 2.0e-4
-    """Lowest mean of `screen_grad` that splits.  Almost all matrices have a negative eigenvalue: 0 splits most of
-    them."""
+    """Smallest mean of `screen_grad` of a Gaussian that is split.  Almost all matrices have a negative eigenvalue, so 0
+    splits most Gaussians."""
     distance: Positive = 0.5
     """Offset of each child, in standard deviations of the Gaussian in that direction."""
     shrink: Annotated[float, Field(ge=1)] = 1.6
     """Divisor of the children's scales."""
     opacity: Literal["halved", "shared"] = "halved"
-    """`halved`: each child has half the opacity; `shared`: both together are as opaque as the Gaussian was,
+    """`halved`: each child has half the opacity; `shared`: both together are as opaque as their parent,
     1 − √(1 − o) each."""
 
     @property
@@ -79,42 +79,42 @@ class SplitSteepest(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians, extent = edit.gaussians, edit.scene_scale.extent
-        steep = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
-        rows = np.flatnonzero(steep & (edit.rows() == 1))
-        least, axes = least_axes(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
+        has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        rows = np.flatnonzero(has_gradient & (edit.rows() == 1))
+        values, axes = smallest_eigenvectors(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
         room = len(rows) if edit.room is None else max(edit.room, 0)
-        lowest = largest(-least, room, least < edit.at(self.eigenvalue_below))
+        lowest = largest(-values, room, values < edit.at(self.eigenvalue_below))
         rows, axes = rows[lowest], axes[lowest]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)
             for name in ("means", "quats", "log_scales", "logit_opacity")
         }
-        covariance = covariance_of(tables["quats"], tables["log_scales"])
+        covariance = covariance_matrices(tables["quats"], tables["log_scales"])
         deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes, covariance, axes))
         offset = edit.at(self.distance) * deviation[:, None] * axes
         chosen = np.zeros(gaussians.count, bool)
         chosen[rows] = True
         edit.choose(chosen, copies=2, kept=0, shrink=1 / self.shrink)
         edit.set_children("means", rows, np.stack([tables["means"] + offset, tables["means"] - offset], axis=1))
-        logits = divided_logits(tables["logit_opacity"], self.opacity)
+        logits = divide_logits(tables["logit_opacity"], self.opacity)
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))
 
 
-def least_axes(columns: Floats) -> tuple[Floats, Floats]:
+def smallest_eigenvectors(columns: Floats) -> tuple[Floats, Floats]:
     """Return the smallest eigenvalue of symmetric matrices, [N], and its unit eigenvector, [N, 3], from [N, 6] columns.
 
     The component of the eigenvector with the largest magnitude is positive.  Rows that are not finite give 0.
     """
-    finite = np.isfinite(columns).all(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.where(finite, columns, 0)[:, UPPER])
+    is_finite = np.isfinite(columns).all(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.where(is_finite, columns, 0)[:, UPPER])
     axes = vectors[:, :, 0]
-    longest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
-    return values[:, 0], axes * np.where(longest < 0, -1, 1)
+    dominant = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
+    return values[:, 0], axes * np.where(dominant < 0, -1, 1)
 
 
-def divided_logits(logits: Floats, opacity: Literal["halved", "shared"]) -> Floats:
+def divide_logits(logits: Floats, opacity: Literal["halved", "shared"]) -> Floats:
     """Return the logit of the opacity of each of two children, given their parent's, without overflow."""
     if opacity == "halved":  # o/2 = 1 / (2 + 2 e^-l) has the logit -log(1 + 2 e^-l)
         return np.asarray(-np.logaddexp(0, np.log(2) - logits))
-    rest = np.logaddexp(0, logits) / 2  # -log of the transmittance of each
-    return np.asarray(rest + np.log(-np.expm1(-rest)))
+    depth = np.logaddexp(0, logits) / 2  # optical depth of each: -log of its transmittance
+    return np.asarray(depth + np.log(-np.expm1(-depth)))

@@ -1,4 +1,4 @@
-"""Grow within a budget and prune by a score of each Gaussian, as Taming 3DGS does (Mallick et al. 2024)."""
+"""Grow within a budget and prune by a score of each Gaussian, as in Taming 3DGS (Mallick et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -16,14 +16,14 @@ from clsplat.formats.splats import inverse_opacities
 Floats = NDArray[np.float64]
 
 
-def by_median(values: NDArray[np.floating]) -> Floats:
-    """Return values divided by the median of the positive ones, or zeros if none is positive."""
+def normalize_by_median(values: NDArray[np.floating]) -> Floats:
+    """Divide values by the median of the positive ones; return zeros if none is positive."""
     positive = values[values > 0]
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 
 
 def pixel_weights(look: RenderedView) -> Floats:
-    """Return the error of a view's pixels plus the edges of its image, each scaled to [0, 1], [height, width]."""
+    """Return the error of a view's pixels plus the edges of its photograph, each scaled to [0, 1], [height, width]."""
     counted = look.counted()
     edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
     return normalize(look.error().astype(np.float64), counted) + normalize(edges, counted)
@@ -32,25 +32,25 @@ def pixel_weights(look: RenderedView) -> Floats:
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
     """Return for each Gaussian, [N], the sum of the losses of the views that see it, and of its terms times the loss.
 
-    The terms are its depth, its radius, and, over the pixels where it is blended, their weights, their number and its
-    blend weight.
+    The terms are its depth, its radius, and three sums over the pixels where it is blended: of the pixels' weights,
+    their number, and its blend weight.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
-    drawn = survey.sample_views(views)
-    for view, look in zip(drawn, survey.render(drawn), strict=True):
+    sampled = survey.sample_views(views)
+    for view, look in zip(sampled, survey.render(sampled), strict=True):
         radius = look.radius()
         row = view.world_to_camera[2]
-        depth = (look.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # no BLAS: bits of any thread count
+        depth = (look.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
         pixels = look.sum(BLENDED, pixel_weights(look)), look.sum(BLENDED, np.ones(look.counted().shape))
         values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, look.sum(WEIGHT))
         loss = look.loss(LOSSES) * (radius > 0)
         losses += loss
-        terms += loss * sum(factor * by_median(np.where(radius > 0, value, 0)) for factor, value in values)
+        terms += loss * sum(factor * normalize_by_median(np.where(radius > 0, value, 0)) for factor, value in values)
     return losses, terms
 
 
 class ByScore(Rule):
-    """Base of rules that sample Gaussians by score; rules with the same `views` share the score."""
+    """Base class of rules that sample Gaussians by score; rules with the same `views` share the score."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
 
@@ -67,12 +67,12 @@ class ByScore(Rule):
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         volume = np.exp(gaussians.get("log_scales").astype(np.float64).sum(axis=1))
         values = (25, edit.stats.mean("screen_grad")), (100, opacity), (25, volume)
-        score: Floats = terms + losses * sum(factor * by_median(value) for factor, value in values)
+        score: Floats = terms + losses * sum(factor * normalize_by_median(value) for factor, value in values)
         return score
 
 
 class GrowScored(ByScore):
-    """Keep as much of the growth by earlier rules as the edit's limit allows (`max_gaussians`, `budget`, memory).
+    """Keep only as much growth by earlier rules as the edit's limit allows (`max_gaussians`, `budget`, memory).
 
     Gaussians are sampled by score.  Clones and splits share the limit in proportion to their numbers.
     """
@@ -83,19 +83,19 @@ class GrowScored(ByScore):
         if edit.room is None or edit.room >= 0:
             return
         rows, keep = edit.rows().astype(np.int64), edit.kept.get() > 0
-        refused = rows > 1
-        if not refused.any():
+        is_undone = rows > 1
+        if not is_undone.any():
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
-        # first the clones, which keep the original, with their part of the room; then the splits with the rest
-        for kind, part in ((keep, (refused & keep).sum() / refused.sum()), (~keep, 1.0)):
+        # first the clones, which keep the original, with their part of the room; then the splits with what remains
+        for kind, part in ((keep, (is_undone & keep).sum() / is_undone.sum()), (~keep, 1.0)):
             order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
-            grown = added <= round(part * room)
-            refused[order[grown]] = False
-            room -= int(added[grown][-1]) if grown.any() else 0
-        edit.undo_growth(refused)
+            grows = added <= round(part * room)
+            is_undone[order[grows]] = False
+            room -= int(added[grows][-1]) if grows.any() else 0
+        edit.undo_growth(is_undone)
 
 
 class PruneScored(SampledPruning, ByScore):
@@ -112,8 +112,8 @@ class Parabola(Budget):
     """Grow to a given number, fast at first: P0 + (B - P0) (2x/S - x²/S²) after x of S edits (Taming 3DGS, Mallick et
     al. 2024).
 
-    Each edit plans the rest of the parabola from the current number, so that no P0 is needed and pruned Gaussians are
-    replaced.
+    Each edit plans the remainder of the parabola from the current number, so that no P0 is needed and pruned Gaussians
+    are replaced.
     """
 
     type: Literal["parabola"] = "parabola"
@@ -124,5 +124,5 @@ class Parabola(Budget):
 
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
         missing = self.gaussians - edit.gaussians.count
-        left = (context.edits - 1) / context.edits
-        return self.gaussians - int(missing * left**2) if missing > 0 else self.gaussians
+        remaining = (context.edits - 1) / context.edits
+        return self.gaussians - int(missing * remaining**2) if missing > 0 else self.gaussians

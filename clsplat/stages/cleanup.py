@@ -93,7 +93,7 @@ class Crop(Stage):
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
-        kept = np.flatnonzero(self.inside.shifted(run.scene.origin).holds(gaussians.get("means")))
+        kept = np.flatnonzero(self.inside.shifted(run.scene.origin).contains(gaussians.get("means")))
         if not len(kept):
             raise EmptyRegionError(f"crop: none of {gaussians.count:,} Gaussians is inside the box; give a larger one")
         change = keep_rows(gaussians, kept, self.stage)

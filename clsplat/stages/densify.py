@@ -132,7 +132,7 @@ class Densify(Scheduled):
     def _outside(self, run: Run, edit: Edit) -> int:
         """Return the number of Gaussians outside that box."""
         box = self._box(run)
-        return int((~box.holds(edit.gaussians.get("means"))).sum()) if box else 0
+        return int((~box.contains(edit.gaussians.get("means"))).sum()) if box else 0
 
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
         """Yield the numbers of Gaussians at which the settings stop growth."""

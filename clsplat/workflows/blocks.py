@@ -234,7 +234,7 @@ class Blocks:
 
         def check(number: int, means: NDArray[np.float32]) -> None:
             block, path = parts[number]
-            if not block.box.shifted(block.origin).holds(means).all():  # as the stage crop does
+            if not block.box.shifted(block.origin).contains(means).all():  # as the stage crop does
                 raise DataError(f"{path}: has Gaussians outside its cell; remove its folder and train it again")
 
         count = join_plys(file, [path for _, path in parts], check)

@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
-from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, mass_of, merge, surface
+from clsplat.density.mixture import Floats, Mixtures, Rows, masses, merge, surface, to_log_scales
 from clsplat.formats.splats import not_finite, require_in_range, require_static, unit
 from clsplat.formats.streamed_sog import LOD_META, write_lod
 from clsplat.formats.table import model_bytes, model_file
@@ -146,7 +146,7 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
     """Return the cost of merging each pair, [pairs]; symmetric up to rounding."""
-    mass, log_volume = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
+    mass, log_volume = masses(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
     return np.concatenate([_block_cost(tables, mass, log_volume, first[block], second[block]) for block in blocks])
 
@@ -156,7 +156,7 @@ def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, s
     fraction = mixtures.share[:, 0]
     variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
     cost: Floats = (
-        log_scales_of(variances).sum(axis=1) - (1 - fraction) * log_volume[first] - fraction * log_volume[second]
+        to_log_scales(variances).sum(axis=1) - (1 - fraction) * log_volume[first] - fraction * log_volume[second]
     )
     for name in ("sh_base", "sh_rest"):
         cost += np.square(tables[name][first] - tables[name][second]).sum(axis=1)

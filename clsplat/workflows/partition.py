@@ -63,7 +63,7 @@ def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) ->
     """
     owner = np.full(len(means), -1)
     for number, cell in enumerate(partition):
-        owner[cell.box.holds(means)] = number
+        owner[cell.box.contains(means)] = number
     if (owner < 0).any():
         count = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
         raise DataError(f"{count} of the coarse model have positions that are not finite; train it again")
@@ -277,7 +277,7 @@ class Partitioner:
     ) -> tuple[Membership, Bits]:
         """Return the views of each block, and the Gaussians visible in its views or in no view, [B, N]."""
         positions = np.stack([view.position for view in self.views])
-        inside = np.stack([cell.extended(NEAR_CELL).holds(positions) for cell in partition], axis=1)
+        inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
         coverage, visible_in_block = np.zeros(inside.shape), np.zeros((len(partition), len(owner)), bool)
         for view, render in enumerate(self._render(self.views)):
             coverage[view], visible = view_coverage(render, owner, len(partition))
@@ -292,7 +292,7 @@ class Partitioner:
 
     def _render(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
-        return RenderedView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
+        return RenderedView.render_all(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
     def _view_entries(self, members: Membership, block: int) -> list[dict[str, Any]]:
         """Return the manifest entries of a block's views, in scene order."""

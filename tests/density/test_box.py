@@ -17,8 +17,8 @@ EASY = "densify.rules=[{type: clone, gradient_above: 1.0e-5, size_below: 10}]"
 def test_box_includes_its_lower_faces_only():
     box = Box(low=[0, None, None], high=[1, None, 2])
     points = np.array([[0, 9, 0], [1, 0, 0], [-1e-9, 0, 0], [0.5, -9, 2], [0.5, np.nan, 0], [0.5, np.inf, -np.inf]])
-    assert box.holds(points).tolist() == [True, False, False, False, False, True]
-    assert Box().holds(points).tolist() == [True] * 4 + [False, True]
+    assert box.contains(points).tolist() == [True, False, False, False, False, True]
+    assert Box().contains(points).tolist() == [True] * 4 + [False, True]
 
 
 @pytest.mark.parametrize("high", [0.0, -1.0])

@@ -14,7 +14,7 @@ from tests.support.devices import on_devices, on_one_setting
 
 
 def weights(rasterizer, model, photographs):
-    views = RenderedView.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
+    views = RenderedView.render_all(rasterizer, model, photographs, rasterizer.device.zeros(3))
     return contributions(views, model.gaussians.count)
 
 

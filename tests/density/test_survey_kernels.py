@@ -28,7 +28,7 @@ def look_at(
     colors = np.zeros((3, height, width)) if rng is None else rng.integers(0, 256, (3, height, width))
     uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
     photograph = Photograph(camera, device.upload(colors.astype(np.uint8)), uploaded)
-    return RenderedView.at(
+    return RenderedView.render(
         Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND)
     )
 
@@ -56,7 +56,7 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
 def test_squares_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
-    views = RenderedView.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
+    views = RenderedView.render_all(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
     found = sensitivities(views, look.model.gaussians.count)
     assert found.shape == (count,)
     expected = 2 * squares(case)

@@ -16,7 +16,7 @@ from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import check_not_run_file
 from clsplat.core.harmonics import basis
-from clsplat.density.mixture import mass_of
+from clsplat.density.mixture import masses
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import flip_axes, inverse_opacities, opacities
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
@@ -121,7 +121,7 @@ def test_extreme_values_raise_no_numpy_warnings(name, tmp_path, rng):
     assert model.opacities.min() >= 0
     assert pack(model).count > 0
     assert np.isfinite(
-        mass_of({n: t.astype(np.float64) for n, t in one.parameters.items()}, lambda logs: logs[:, 0])
+        masses({n: t.astype(np.float64) for n, t in one.parameters.items()}, lambda logs: logs[:, 0])
     ).all()
 
 

@@ -153,7 +153,7 @@ def test_few_gaussians(device, count):
 def test_threshold_in_another_unit_is_refused():
     """The default belongs to the gradient: with it, everything would grow."""
     for keys in ({"statistic": "gain"}, {"statistic": "screen_grad", "as_many_as": "gain"}):
-        with pytest.raises(ValidationError, match="'gain' has another unit than the default of 'gradient_above'"):
+        with pytest.raises(ValidationError, match="the default 'gradient_above' is not in the unit of 'gain'"):
             Clone(**keys)
         assert Clone(gradient_above=200, **keys).gradient_above == 200
     assert Clone(statistic="gain", as_many_as="screen_grad").gradient_above == 2e-4

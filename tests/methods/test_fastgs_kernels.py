@@ -16,7 +16,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey, normalize
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, SplitLarge
-from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, WrongPixels, wrong_pixels
+from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, WrongPixels, count_wrong_pixels
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
@@ -75,7 +75,7 @@ def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, mas
     case = safe_case(rng, count, width, height, MARGIN)
     photographs = photo_folder(rng, case, 4)
     masks = [rng.random((height, width)) < 0.7 if masked else None for _ in photographs]
-    found = wrong_pixels(surveyed(device, case, photographs, masks), 10, 0.1)
+    found = count_wrong_pixels(surveyed(device, case, photographs, masks), 10, 0.1)
     pixels, score = expected_wrong(case, photographs, masks, 0.1)
     np.testing.assert_array_equal(found.pixels, pixels)
     np.testing.assert_allclose(found.score, score, atol=1e-4)
@@ -84,12 +84,12 @@ def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, mas
 @on_one_setting
 def test_no_gaussians_or_errors_give_no_wrong_pixels(device, rng):
     case = random_case(rng, 0)
-    found = wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
+    found = count_wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
     assert found.pixels.shape == found.score.shape == (0,)
     case = random_case(rng, 3)
     case.parameters["logit_opacity"][:] = -30
     black = surveyed(device, case, [np.round(255 * BACKGROUND[:, None, None] * np.ones((3, 30, 40))).astype(np.uint8)])
-    assert not wrong_pixels(black, 10, 0.1).score.any()
+    assert not count_wrong_pixels(black, 10, 0.1).score.any()
 
 
 @on_one_setting
@@ -98,7 +98,7 @@ def test_number_of_rendered_views_is_limited(device, rng):
     survey = surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)] * 12)
     held = survey._photographs.get
     survey._photographs.get = lambda view: (asked.append(view), held(view))[1]
-    wrong_pixels(survey, 7, 0.1)
+    count_wrong_pixels(survey, 7, 0.1)
     assert asked == survey.sample_views(7)
 
 

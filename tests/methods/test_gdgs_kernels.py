@@ -10,7 +10,7 @@ from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.methods.adc import Clone
-from clsplat.methods.gdgs import CloneDense, cells_of
+from clsplat.methods.gdgs import CloneDense, grid_cells
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -119,13 +119,13 @@ def test_growth_stops_at_the_limit(device, rng):
 
 
 def test_cells_of_flat_and_broken_scenes():
-    assert cells_of(np.zeros((0, 3)), 4).shape == (0,)
-    assert (cells_of(np.ones((5, 3)), 4) == 0).all()
+    assert grid_cells(np.zeros((0, 3)), 4).shape == (0,)
+    assert (grid_cells(np.ones((5, 3)), 4) == 0).all()
     flat = np.stack([np.linspace(0, 1, 101), np.zeros(101), np.zeros(101)], axis=1)
-    found = cells_of(flat, 4)
+    found = grid_cells(flat, 4)
     assert (found[[0, 100]] == -1).all()
     assert found[1:100].tolist() == sorted(found[1:100])
     assert set(found[1:100]) == {0, 16, 32, 48}
     flat[50] = np.nan, 0, np.inf
-    assert cells_of(flat, 4)[50] == -1
-    assert (cells_of(np.full((3, 3), np.nan), 4) == -1).all()
+    assert grid_cells(flat, 4)[50] == -1
+    assert (grid_cells(np.full((3, 3), np.nan), 4) == -1).all()

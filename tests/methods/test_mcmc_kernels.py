@@ -13,7 +13,7 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.methods.mcmc import Relocate, add_noise, divide, systematic
+from clsplat.methods.mcmc import Relocate, add_noise, divide, sample_systematically
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -183,7 +183,7 @@ def test_systematic_draws_are_equally_spaced(rng, count, draws):
     """Against places on the line of weights one by one, in Python's whole numbers."""
     weights = rng.integers(0, 2**24, count).astype(np.uint64)
     weights[0], weights[-1] = 2**24, 1
-    found = systematic(weights, draws, np.random.default_rng(5))
+    found = sample_systematically(weights, draws, np.random.default_rng(5))
     start, total, ends = (
         int(np.random.default_rng(5).integers(0, int(weights.sum()))),
         int(weights.sum()),
@@ -201,7 +201,7 @@ def test_systematic_draws_are_equally_spaced(rng, count, draws):
 def test_positions_of_many_draws_do_not_overflow():
     """A hundred million weights of 2^24: their products are beyond 64 bits."""
     weights = np.full(3, 2**24 * 33_333_333, np.uint64)
-    found = systematic(weights, 2_000_003, np.random.default_rng(1))
+    found = sample_systematically(weights, 2_000_003, np.random.default_rng(1))
     assert sorted(found) == [666667, 666668, 666668]
 
 

@@ -7,7 +7,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import largest
-from clsplat.density.mixture import covariance_of, mass_of, merge
+from clsplat.density.mixture import covariance_matrices, masses, merge
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
 from clsplat.gaussians.gaussians import INTERVAL2
@@ -194,16 +194,16 @@ def test_merged_neighbors_keep_mean_and_covariance(device, rng):
     moments = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
     assert case.apply(MergeNeighbors()).after == 3
     tables = {**before, "means": means.astype(np.float64)}
-    mass = mass_of(tables)[:2]
+    mass = masses(tables)[:2]
     weights = mass / mass.sum()
     mean = weights @ tables["means"][:2]
-    own = covariance_of(before["quats"][:2], before["log_scales"][:2])
+    own = covariance_matrices(before["quats"][:2], before["log_scales"][:2])
     offset = tables["means"][:2] - mean
     covariance = np.einsum("n,nij->ij", weights, own + offset[:, :, None] * offset[:, None, :])
     got = {name: case.gaussians.get(name).astype(np.float64) for name in (*before, "means", "sh_base")}
     np.testing.assert_allclose(got["means"][0], mean, atol=1e-6)
-    np.testing.assert_allclose(covariance_of(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
-    np.testing.assert_allclose(mass_of(got)[0], mass.sum(), rtol=1e-4)
+    np.testing.assert_allclose(covariance_matrices(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
+    np.testing.assert_allclose(masses(got)[0], mass.sum(), rtol=1e-4)
     np.testing.assert_allclose(got["sh_base"][0], weights @ colors[:2], rtol=1e-5)
     after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in moments}
     np.testing.assert_array_equal(after["means"][0], moments["means"][0])  # the heavier one's

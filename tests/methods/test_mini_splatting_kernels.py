@@ -14,7 +14,7 @@ from clsplat.density.importance import Weights, heaviest
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.methods.mini_splatting import PruneUseless, sampled_weights, unneeded
+from clsplat.methods.mini_splatting import PruneUseless, find_unneeded, sampled_weights
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
 
@@ -64,7 +64,7 @@ def test_each_view_needs_its_heaviest_gaussians(device, rng, count, width, heigh
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0)
     for share in (0.0, 0.9, 1.0):
-        found = unneeded(survey, share)
+        found = find_unneeded(survey, share)
         for here, mask in zip(found, masks, strict=True):
             splats = case.project()
             weight = ref.contribution(splats, width, height, mask)

@@ -10,13 +10,13 @@ from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.mixture import covariance_of
+from clsplat.density.mixture import covariance_matrices
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint
-from clsplat.methods.steepgs import UPPER, SplitSteepest, divided_logits, least_axes
+from clsplat.methods.steepgs import UPPER, SplitSteepest, divide_logits, smallest_eigenvectors
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
@@ -178,7 +178,7 @@ def test_the_schedules_agree(device, rng):
 def test_smallest_axes_belong_to_each_matrix(rng):
     columns = rng.normal(size=(200, 6)) * 10.0 ** rng.integers(-9, 9, (200, 1))
     columns[0], columns[1], columns[2, 4], columns[3, 0] = 0, [1, 0, 0, 1, 0, 1], np.nan, -np.inf
-    values, axes = least_axes(columns)
+    values, axes = smallest_eigenvectors(columns)
     for n in (0, 2, 3):
         assert values[n] == 0
     assert (axes[np.arange(200), np.abs(axes).argmax(axis=1)] > 0).all()
@@ -194,7 +194,7 @@ def test_smallest_axes_belong_to_each_matrix(rng):
 def test_opacities_of_two_children_follow_from_the_parents():
     logits = np.array([[-200.0], [-30.0], [-2.0], [0.0], [3.0], [40.0], [300.0]])
     opacity = 1 / (1 + np.exp(-logits[1:5]))
-    halves, shared = (divided_logits(logits, kind) for kind in ("halved", "shared"))
+    halves, shared = (divide_logits(logits, kind) for kind in ("halved", "shared"))
     np.testing.assert_allclose(1 / (1 + np.exp(-halves[1:5])), opacity / 2, rtol=1e-12)
     np.testing.assert_allclose(1 / (1 + np.exp(-shared[1:5])), -np.expm1(np.log1p(-opacity) / 2), rtol=1e-9)
     for found in (halves, shared):
@@ -244,7 +244,7 @@ def test_children_are_along_the_axis_and_share_opacity(device, rng):
     change = case.apply(SplitSteepest(distance=0.7, shrink=1.5, eigenvalue_below=-1e-6))
     chosen = least < -1e-6
     assert (change.before, change.after, change.grown) == (65, 65 + chosen.sum(), {"split_steepest": chosen.sum()})
-    own = covariance_of(*(case.before[name].astype(np.float64) for name in ("quats", "log_scales")))
+    own = covariance_matrices(*(case.before[name].astype(np.float64) for name in ("quats", "log_scales")))
     way = 0.7 * np.sqrt(np.einsum("ni,nij,nj->n", axis, own, axis))[:, None] * axis
     opacity = 1 / (1 + np.exp(-case.before["logit_opacity"].astype(np.float64)))
     for source in range(65):

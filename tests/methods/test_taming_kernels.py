@@ -16,7 +16,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, SplitLarge
-from clsplat.methods.taming import GrowScored, Parabola, PruneScored, by_median, view_scores
+from clsplat.methods.taming import GrowScored, Parabola, PruneScored, normalize_by_median, view_scores
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
@@ -64,9 +64,9 @@ def test_scores_follow_the_formula(device, rng):
 
 
 def test_values_are_divided_by_their_median():
-    assert by_median(np.array([0.0, 1, 2, 4])).tolist() == [0, 0.5, 1, 2]
-    assert by_median(np.zeros(3)).tolist() == [0, 0, 0]
-    assert by_median(np.zeros(0)).tolist() == []
+    assert normalize_by_median(np.array([0.0, 1, 2, 4])).tolist() == [0, 0.5, 1, 2]
+    assert normalize_by_median(np.zeros(3)).tolist() == [0, 0, 0]
+    assert normalize_by_median(np.zeros(0)).tolist() == []
 
 
 def edit_of(device, rng, sizes, opacity=0.5, losses=1.0, gradient=1.0) -> Edit:
@@ -134,7 +134,7 @@ def test_low_scores_are_pruned_first(device, rng):
 def limit(most: int, count: int, edits: int) -> int:
     """What the budget allows to an edit of `count` Gaussians, the first of so many."""
     edit = SimpleNamespace(gaussians=SimpleNamespace(count=count))
-    return Parabola(gaussians=most).limit(edit, BudgetContext(share=0.5, edits=edits, divisor=1.0), {})
+    return Parabola(gaussians=most).limit(edit, BudgetContext(progress=0.5, edits=edits, divisor=1.0), {})
 
 
 @pytest.mark.parametrize(("first", "most", "edits"), [(100, 1500, 28), (1000, 1001, 5), (10, 10**6, 1), (7, 8, 100)])

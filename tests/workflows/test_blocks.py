@@ -44,7 +44,7 @@ def boxes(found: dict) -> list:
 
 def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
     """A model with its Gaussians in the order of the blocks that own them."""
-    held = np.stack([box.holds(model.means) for box in boxes(found)])
+    held = np.stack([box.contains(model.means) for box in boxes(found)])
     assert (held.sum(axis=0) == 1).all()
     return model[np.argsort(held.argmax(axis=0), kind="stable")]
 
@@ -67,7 +67,7 @@ def test_merged_model_equals_an_undivided_run_with_all_cameras(tiny_scene, few_s
 def test_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
     out, found = trained
     starts = [clsplat.load(out / f"block_{i:02d}.ply") for i in range(COUNT)]
-    own = [start[box.holds(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
+    own = [start[box.contains(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
     assert [len(model) for model in own] == [block["gaussians"] for block in found["blocks"]]
     whole = by_owner(clsplat.load(few_steps), found)
     for table, values in whole.tables().items():
@@ -91,7 +91,7 @@ def test_block_trains_with_the_full_extent_and_grows_in_its_cell(trained, tiny_s
         (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
         assert densify.inside.model_dump() == block["growth"]
         model = clsplat.load(out / block["name"])
-        assert boxes(found)[int(block["name"][-2:])].holds(model.means).all()
+        assert boxes(found)[int(block["name"][-2:])].contains(model.means).all()
 
 
 @pytest.mark.parametrize("most", [16_000, "[[0, 15000], [8, 16000]]"])

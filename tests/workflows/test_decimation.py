@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.density import mixture
-from clsplat.density.mixture import covariance_of, mass_of, merge, surface, volume
+from clsplat.density.mixture import covariance_matrices, masses, merge, surface, volume
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.workflows import lod
@@ -71,7 +71,7 @@ def test_a_mixture_is_symmetric_in_its_pair(rng, size):
     one, two = np.arange(10), np.arange(10, 20)
     there, back = merge(tables, one, two, size), merge(tables, two, one, size)
     for found in (there, back):
-        found["covariance"] = covariance_of(found.pop("quats"), found["log_scales"])
+        found["covariance"] = covariance_matrices(found.pop("quats"), found["log_scales"])
     for name in there:
         np.testing.assert_allclose(there[name], back[name], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(pair_cost(tables, one, two), pair_cost(tables, two, one), rtol=1e-9)
@@ -83,7 +83,7 @@ def test_mass_and_mean_are_preserved(rng, count):
     found = decimate(source)
     assert len(found) == (count + 1) // 2
     before, after = float64_tables(source), float64_tables(found)
-    mass = [mass_of(tables, surface) for tables in (before, after)]
+    mass = [masses(tables, surface) for tables in (before, after)]
     np.testing.assert_allclose(mass[1].sum(), mass[0].sum(), rtol=1e-5)
     mean = [(one[:, None] * tables["means"]).sum(axis=0) for one, tables in zip(mass, (before, after), strict=True)]
     np.testing.assert_allclose(mean[1], mean[0], rtol=1e-4, atol=1e-4 * mass[0].sum())
@@ -136,9 +136,9 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
     """Masses are those of all rows once, and not again for each block of pairs."""
     rows: list[int] = []
     monkeypatch.setattr(
-        mixture, "mass_of", lambda tables, size: rows.append(len(tables["means"])) or mass_of(tables, size)
+        mixture, "masses", lambda tables, size: rows.append(len(tables["means"])) or masses(tables, size)
     )
-    monkeypatch.setattr(lod, "mass_of", mixture.mass_of, raising=False)
+    monkeypatch.setattr(lod, "masses", mixture.masses, raising=False)
     source = float64_tables(model(rng, 300))
     whole = match_pairs(source)
     monkeypatch.setattr(lod, "BLOCK", 50)

@@ -250,7 +250,8 @@ def _render_views(
     device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]
 ) -> Iterator[RenderedView]:
     """The views of photographs, by a new rasterizer and model."""
-    return RenderedView.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
+    rasterizer = Rasterizer(device, "radix")
+    return RenderedView.render_all(rasterizer, case.model(device), photographs, device.upload(background))
 
 
 def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
