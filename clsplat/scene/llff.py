@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError
+from clsplat.core.errors import DataError, one_line
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
 from clsplat.scene.images import is_image, read_header
+from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import Scene, every_nth, make_scene
 from clsplat.scene.view import View
@@ -58,13 +59,13 @@ def read_poses(path: Path) -> NDArray[np.float64]:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"it has more than {MAX_BYTES} bytes")
         with path.open("rb") as file:
-            rows = np.load(file, allow_pickle=False)
+            rows = np.lib.format.read_array(file, allow_pickle=False)
         if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
             raise ValueError(f"it has shape {rows.shape}, {rows.dtype}")
-        if not np.isfinite(rows).all():
-            raise ValueError("it has numbers that are not finite")
-    except (ValueError, EOFError, MemoryError, OSError) as error:
-        raise DataError(f"{path}: {error}; expected finite numbers [N, 17]: export it again") from error
+        if not (np.abs(rows) < MAX_VALUE).all():
+            raise ValueError(f"it has numbers that are not finite, or beyond {MAX_VALUE:g}")
+    except Exception as error:  # of many kinds, as NumPy parses the header as Python
+        raise DataError(f"{path}: {one_line(error)}; expected finite numbers [N, 17]: export it again") from error
     return np.asarray(rows, np.float64)
 
 
@@ -82,8 +83,8 @@ def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
     """Return the view of a row, with the focal length scaled to the image file.  Raises DataError."""
     matrix, header = row[:15].reshape(3, 5), read_header(image)
     height, width, focal = matrix[:, 4]
-    scale = header.width / width if width > 0 else 0.0
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and focal * scale >= MIN_FOCAL):
+    scale = header.width / max(width, 1.0)
+    if not (1 <= width <= MAX_SIDE and 0 < height <= MAX_SIDE and focal * scale >= MIN_FOCAL):
         raise DataError(
             f"{path}: {image.name}: invalid camera, {width:g} x {height:g} px, focal length {focal:g}; export it again"
         )

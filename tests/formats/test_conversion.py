@@ -88,7 +88,7 @@ def test_merging_reports_each_dropped_setting(tmp_path, rng, caplog):
     caplog.clear()
     clsplat.convert([b, a], tmp_path / "d.ply")
     assert (
-        "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; the values of"
+        "has near = 0.2, screen_variance = 0.3, background = not set, alpha = transparency; the values of"
         in caplog.text
     )
 

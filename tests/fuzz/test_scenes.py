@@ -153,3 +153,22 @@ def test_damaged_video_cameras_are_read_or_refused(folder):
         read_and_inspect(path)
 
     reads()
+
+
+def test_damaged_poses_of_llff_are_read_or_refused(folder):
+    path, seeds = folder / "llff", []
+    for name in "ab":
+        photo(path / "images" / f"{name}.png")
+    row = np.concatenate([np.hstack([np.eye(3, 4), [[48], [64], [50]]]).ravel(), [1, 9]])
+    for kind in ("<f8", "<f4", ">f8"):
+        np.save(path / "poses_bounds.npy", np.array([row, row], kind))
+        seeds.append((path / "poses_bounds.npy").read_bytes())
+
+    @fuzzed(
+        data=damaged(seeds, ["(2, 17)", "(99999999999, 17)", "True", "'|O'", "'descr'", "'<f2'", "(2, 17, )", "PK"])
+    )
+    def reads(data):
+        (path / "poses_bounds.npy").write_bytes(data)
+        read_and_inspect(path)
+
+    reads()
