@@ -72,6 +72,7 @@ class Gltf:
         self.left = self.unpacked = 0  # bytes that may still be read, and bytes of unpacked SPZ data
         self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
         self.notes: set[str] = set()  # about the file, for the user
+        self.is_mip = False
         primitives = [
             (primitive, matrix) for mesh, matrix in self._meshes() for primitive in tree["meshes"][mesh]["primitives"]
         ]
@@ -130,6 +131,7 @@ class Gltf:
         """
         data, start, length, _ = self._view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])
+        self.is_mip |= splats.mode == "mip"
         self.unpacked += sum(table.nbytes for table in splats.parameters.values())
         if self.unpacked > 4 * max(RATIO * sum(map(len, self.files.values())), ALIKE):  # as much as a single SPZ
             raise DataError(f"{self.path}: its SPZ data unpack to {self.unpacked} bytes; export it again")
@@ -352,7 +354,9 @@ def read_gltf(path: Path) -> SplatFile:
     if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
         rendering["origin"] = placement[:3, 3].tolist()
         placement[:3, 3] = 0
-    return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", placement)
+    return SplatFile(
+        parameters, rendering, "mip" if rendering.get("compensate") or found.is_mip else "default", placement
+    )
 
 
 def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:

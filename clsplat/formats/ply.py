@@ -145,7 +145,8 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
         table = np.loadtxt(lines, header.dtype, comments=None, ndmin=1)
     except (ValueError, OverflowError) as error:
         raise DataError(
-            f"{path}: {shorten(str(error), 200)} after the header; expected one number for each property"
+            f"{path}: {shorten(str(error).partition(';')[0], 200)} after the header; expected one number for each "
+            "property: export it again"
         ) from error
     if len(table) < header.count:
         raise DataError(

@@ -406,13 +406,15 @@ def test_parts_of_other_degrees_and_transforms_are_joined(tmp_path, rng):
 
 def test_an_spz_in_a_glb_has_the_axes_that_its_bounds_show(tmp_path, rng):
     """Its axes are x left, y up, z front; some programs keep those of SPZ."""
-    write(tmp_path / "a.spz", splats(rng, 30, 1))
+    write(tmp_path / "a.spz", splats(rng, 30, 1, "mip"))
     data, plain = (tmp_path / "a.spz").read_bytes(), read(tmp_path / "a.spz")
     as_gltf = flip_axes(plain.parameters)["means"]
     half = flip_axes(plain.parameters, (-1.0, 1.0, -1.0))
     for bounds, expected in ((None, half), (as_gltf * [-1, 1, -1], half), (as_gltf, plain.parameters)):
         (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data, bounds), data))
-        for name, table in read(tmp_path / "b.glb").parameters.items():
+        found = read(tmp_path / "b.glb")
+        assert found.mode == "mip"
+        for name, table in found.parameters.items():
             np.testing.assert_array_equal(table, expected[name], err_msg=name)
     (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data[:-9]), data[:-9]))
     with pytest.raises(DataError, match=r"b\.glb: is truncated before the checksum"):
