@@ -167,7 +167,7 @@ def info() -> DeviceInfo:
 
 @pytest.fixture
 def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A folder where no device is known to compute rightly."""
+    """An empty cache of device checks."""
     monkeypatch.setattr(quick, "cache_folder", lambda: tmp_path)
     return tmp_path
 
@@ -234,7 +234,7 @@ def cache_parsed_yaml() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def skip_fsync() -> Iterator[None]:
-    """No test pulls the plug: what is written need not reach the disk. Processes that tests start do wait."""
+    """Tests need not sync files to disk. Child processes still do."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", os.fstat)
         yield
@@ -256,7 +256,7 @@ def without_plugins() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def python_interrupts() -> None:
-    """Interrupts arrive, also where the suite runs in the background of a shell, which ignores them."""
+    """Enable interrupts, which background jobs of a shell ignore."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -276,7 +276,7 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of twelve steps; nothing is changed in it."""
+    """A finished run of twelve steps; tests do not modify it."""
 
     out = tmp_path_factory.mktemp("runs") / "few"
     train(tiny_scene, out, *FEW)
@@ -285,7 +285,7 @@ def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture
 def killed_run(few_steps: Path, tmp_path: Path) -> Path:
-    """That run as it was killed after step 8 and its checkpoints."""
+    """The same run, killed after step 8."""
     return killed(few_steps, tmp_path / "run")
 
 
@@ -297,5 +297,5 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture
 def options(store: Store) -> CellOptions:
-    """How a cell is run in it now."""
+    """Options for running a cell."""
     return CellOptions(store.now())

@@ -1,4 +1,4 @@
-"""The package's front door: what its import loads, which names it has, and views that are made by hand."""
+"""The public package: what its import loads, its names, and hand-made views."""
 
 import ast
 import importlib
@@ -25,7 +25,7 @@ CAMERA = clsplat.Camera(48, 32, 40.0, 42.0, 23.0, 17.0)
 
 
 def loaded_after(code: str) -> set[str]:
-    """The modules of a new process after some lines of Python."""
+    """Return the modules that a new process has loaded after running some Python code."""
     command = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"]
     return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.split())
 

@@ -1,4 +1,4 @@
-"""Commands and the functions of the API: equal bytes."""
+"""Commands and API functions write equal bytes."""
 
 import json
 import re

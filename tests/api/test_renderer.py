@@ -1,4 +1,4 @@
-"""Pictures and their gradients, NumPy in and out."""
+"""Renders and their gradients, in NumPy."""
 
 import threading
 import time
@@ -55,7 +55,7 @@ def test_depth_changes_neither_image_nor_alpha(device, rng):
 @on_one_setting
 @pytest.mark.parametrize(("array", "values"), [("image", np.nan), ("image", -np.inf), ("transmittance", np.nan)])
 def test_nonfinite_render_is_an_error(device, rng, monkeypatch, array, values):
-    """Of a device, or a model, that gives them, as `clsplat render` says; one pixel is enough."""
+    """From a faulty device or model; one pixel is enough, as in `clsplat render`."""
     case = random_case(rng, 20, *SIZE)
     renderer = Renderer(model_of(case), device)
     forward = renderer.rasterizer.forward

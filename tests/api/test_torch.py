@@ -1,4 +1,4 @@
-"""Rendering inside torch, where torch is present."""
+"""Rendering in torch, if it is installed."""
 
 from dataclasses import replace
 

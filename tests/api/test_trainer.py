@@ -1,4 +1,4 @@
-"""Training step by step: the bits of the command, going on, a loss of one's own."""
+"""Training step by step: the bits of the command, resume, and custom losses."""
 
 import gc
 import inspect

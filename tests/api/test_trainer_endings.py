@@ -1,4 +1,4 @@
-"""How a trainer ends: an error, an interrupt, `close()`, or nobody holds it any more."""
+"""How a trainer ends: by an error, an interrupt, `close()`, or garbage collection."""
 
 import gc
 import json

@@ -1,4 +1,4 @@
-"""The command line as scripts see it: outputs, one-line errors, exit codes."""
+"""The command line for scripts: outputs, one-line errors, exit codes."""
 
 import json
 import re

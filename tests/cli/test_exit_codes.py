@@ -1,4 +1,4 @@
-"""Each exit code, from a cause as it happens to users: the code, one sentence, and what status.json says."""
+"""Each exit code from a realistic cause: the code, the message, and status.json."""
 
 import dataclasses
 import json
@@ -37,7 +37,7 @@ class Faulty(Penalty):
 
 @pytest.fixture
 def tiny_copy(tiny_scene: Path, tmp_path: Path) -> Path:
-    """The tiny scene, to be damaged."""
+    """A copy of the tiny scene, to be damaged."""
     return shutil.copytree(tiny_scene, tmp_path / "scene")
 
 

@@ -1,4 +1,4 @@
-"""The command line's own manners: help, completion, near misses, options before the command, JSON on stdout alone."""
+"""Usability of the command line: help, completion, suggestions, option order, and pure JSON on stdout."""
 
 import json
 import os

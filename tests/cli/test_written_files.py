@@ -1,4 +1,4 @@
-"""Commands that write where they are told: no photograph, no model and no file of a run is replaced."""
+"""Commands with an output path: no photograph, model, or file of a run is replaced."""
 
 import shutil
 from pathlib import Path

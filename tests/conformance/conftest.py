@@ -1,4 +1,4 @@
-"""What several tests of the checks share."""
+"""Fixtures of the conformance tests."""
 
 import pickle
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Timed cases: whole steps with all that a pipeline names, which change nothing; and measurements compared."""
+"""Benchmark cases, which time whole steps and change nothing, and comparisons of measurements."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The checks of `clsplat doctor` hold on the devices of the tests, and every kernel has a test."""
+"""The checks of `clsplat doctor` pass on the tested devices, and every kernel has a test."""
 
 import io
 import itertools
@@ -51,7 +51,7 @@ def test_a_check_passes(device, check):
 
 
 def test_every_kernel_was_launched(launched):
-    """With each schedule, but for those that are written for one of them."""
+    """With each schedule, except kernels for one schedule."""
     for schedule, other in (("wide", "simt"), ("simt", "wide")):
         kernels = {
             f"{path.name}:{name}"

@@ -106,7 +106,7 @@ def test_hanging_runtime_is_stopped(monkeypatch, info):
     ],
 )
 def test_worker_gets_time_to_exit(monkeypatch, info, end, fault):
-    """Its output closes before it has one."""
+    """Its output closes before the process ends."""
     monkeypatch.setattr(supervision, "EXIT_TIMEOUT_S", 5, raising=False)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
     assert [one.fault for one in run_checks(info, "simt", checks("rows"))] == [fault]
@@ -138,7 +138,7 @@ def test_a_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
 
 
 def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
-    """Killed, it can say nothing to the other, which may hang in a check."""
+    """A killed parent cannot stop its child, which may hang in a check."""
     note = tmp_path / "process"
     hangs = (
         "import os, sys, time; from pathlib import Path; from clsplat.conformance import worker\n"
@@ -162,7 +162,7 @@ def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
 
 
 def within(seconds: float, condition) -> bool:
-    """Whether a condition holds before so many seconds are over."""
+    """Return whether a condition becomes true within some seconds."""
     end = time.monotonic() + seconds
     while time.monotonic() < end and not condition():
         time.sleep(0.05)
@@ -226,7 +226,7 @@ def test_page_shows_every_comparison_and_the_build_log(info):
 
 
 def memory_of(monkeypatch, largest: int, deviation: Deviation = RIGHT) -> tuple[list[str], DeviceReport]:
-    """What the memory check finds wrong on a device that gives no larger buffer, and its report."""
+    """Return the failures of the memory check on a device with limited buffers, and its report."""
 
     def buffer(device, size):
         if -(-size // 64) * 64 > largest:
@@ -313,7 +313,7 @@ def test_verdict_is_printed_although_the_page_fails(monkeypatch, capsys, info, e
 
 @pytest.mark.slow
 def test_correct_device_is_not_refused(info, empty_cache, monkeypatch):
-    """By some checks in processes of their own; each of them is run in tests/conformance/test_checks_kernels.py."""
+    """Runs some checks in child processes; tests/conformance/test_checks_kernels.py runs all of them."""
     monkeypatch.setattr(doctor, "KERNELS", [BY_NAME["blur"], KERNELS[-1]])
     monkeypatch.setattr(doctor, "SPEED", SPEED[:1])
     report = examine(Device(info))

@@ -1,4 +1,4 @@
-"""Check the oracle of fields itself: finite differences, integrals and values worked out by hand."""
+"""The reference for fields, against finite differences, integrals, and hand-computed values."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def rng() -> np.random.Generator:
 
 
 def some_cones(rng: np.random.Generator, count: int = 3) -> np.ndarray:
-    """Rays of a camera that is turned and moved."""
+    """Rays of a rotated and translated camera."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     pose = np.column_stack([turn * np.linalg.det(turn), [0.3, -0.2, 4.0]])
     return nerf.cones(PinholeCamera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))

@@ -1,4 +1,4 @@
-"""Check the oracle of grids itself: finite differences, hand-made tables, and integrals; and the shape of a grid."""
+"""The reference for grids, against finite differences, hand-made tables, and integrals; and grid shapes."""
 
 import math
 
@@ -55,7 +55,7 @@ def test_grid_and_network_gradient_matches_differences(rng, level):
 
 
 def test_interpolation_reproduces_a_linear_function(rng):
-    """Where a level tells all: entries that are the coordinates give the place, also at the faces of the cube."""
+    """Entries that are the coordinates give the position, also at the faces of the cube."""
     level = HashLevel(5, 6**3)
     corners = np.stack(np.meshgrid(*3 * [np.arange(6)], indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
     at = np.concatenate([rng.random((20, 3)), [[0, 0, 0], [1, 1, 1], [1, 0, 0.5]]])

@@ -1,4 +1,4 @@
-"""peak.cl: the yardsticks compute what they are counted as."""
+"""peak.cl: the benchmark kernels compute what they are counted as."""
 
 import numpy as np
 import pytest

@@ -267,7 +267,7 @@ CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
 
 
 def kernel_names() -> set[str]:
-    """Names of all kernels, with their schedule where each has its own."""
+    """Names of all kernels, with the schedule if each schedule has a separate kernel."""
     found = set()
     for path in resource_dir("cl_kernels").glob("*.cl"):
         own = re.search("_(wide|simt)$", path.stem)
@@ -304,7 +304,7 @@ def first_failure(device: Device, planted: str, checks: list[Check]) -> str | No
 
 @pytest.mark.parametrize("planted", [*FAULTS, *MORE, *OPTIONAL])
 def test_a_planted_fault_is_caught(monkeypatch, planted):
-    """The sources on disk stay as they are: the text is changed on its way to the compiler."""
+    """The source is changed in memory only."""
     file, text, wrong = {**FAULTS, **MORE, **OPTIONAL}[planted]
     assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"
     flatten = program.flatten

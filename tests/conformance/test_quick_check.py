@@ -1,4 +1,4 @@
-"""The check before a device renders or trains: it runs once, and a wrong device is refused everywhere."""
+"""The check before a device renders or trains: it runs once, and a faulty device is refused everywhere."""
 
 import io
 from collections.abc import Callable
@@ -182,7 +182,7 @@ def test_quick_check_passes_and_is_recorded(info, empty_cache):
 
 @pytest.fixture
 def model(rng, tmp_path) -> Path:
-    """The file of a small model."""
+    """A small model file."""
     model_of(random_case(rng, 3)).save(tmp_path / "model.ply")
     return tmp_path / "model.ply"
 

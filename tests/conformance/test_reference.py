@@ -1,4 +1,4 @@
-"""Check the oracle itself: finite differences, closed forms and values worked out by hand."""
+"""The reference, against finite differences, closed forms, and hand-computed values."""
 
 from dataclasses import replace
 
@@ -246,7 +246,7 @@ def test_harmonics_are_orthonormal():
 
 
 def test_harmonics_signs():
-    """Orthonormality does not see signs and order: the values at one direction, from the table's formulas by hand."""
+    """Orthonormality does not determine signs and order, so compare with hand-computed values for one direction."""
     basis = ref.sh_basis(np.array([2.0, 3.0, 6.0]) / 7, 3)
     # Numerators over 7^l: -y, z, -x | xy, -yz, 2z²-x²-y², -xz, x²-y² | -y(3x²-y²), xyz, ...
     numerators = [1, -3, 6, -2, 6, -18, 59, -12, -5, -9, 36, -393, 198, -262, -30, 46]

@@ -1,4 +1,4 @@
-"""The folder of caches, and where it goes when the user's cannot be written."""
+"""The cache folder, and its fallback if the user's folder is not writable."""
 
 import logging
 import os
@@ -29,7 +29,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the fol
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A home and a temporary folder of the test's own, and no variables that name caches."""
+    """A temporary home and temporary folder, without cache variables."""
     for name in ("home", "tmp"):
         (tmp_path / name).mkdir()
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -150,7 +150,7 @@ def test_error_without_writable_folder_names_the_variable(machine, monkeypatch):
 @linux
 @pytest.mark.slow
 def test_device_works_without_a_home(tmp_path):
-    """As in a container: a user without a name, a home that is not there, nothing that can be written but /tmp."""
+    """As in a container: no user name, no home folder, and only /tmp is writable."""
     (tmp_path / "file").write_text("")
     variables = {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-m", "clsplat", "devices"]
@@ -188,7 +188,7 @@ def kernel(base: str, name: str) -> str:
 
 @linux
 def test_only_truncated_kernels_are_removed(machine, caplog):
-    """Nor those that another process writes now, nor what others keep in the folder."""
+    """Kernels being written by another process, and foreign files, stay."""
     pocl, pytools = (machine / "home" / ".cache" / name for name in ("pocl", "pytools"))
     whole, database = library(3), b"SQLite format 3\0" + bytes(84)
     files = {
@@ -224,13 +224,13 @@ def test_only_truncated_kernels_are_removed(machine, caplog):
 
 @linux
 def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
-    """Also where another folder is used than before."""
+    """Also after a change of the folder."""
     first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
     start = {"now": "1"}
     monkeypatch.setattr("clsplat.core.machine._boot", lambda: start["now"])
 
     def cut(file: Path) -> bool:
-        """Whether a kernel that is cut off is found by a process that starts now."""
+        """Return whether a new process finds a truncated kernel."""
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
         remove_cut_kernels.cache_clear()

@@ -1,4 +1,4 @@
-"""Messages: one line of limited length, with the values of the input cut."""
+"""Messages are one line of limited length, with shortened input values."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""Only `clsplat.core.reading` reads files, and only regular ones; what happens to others."""
+"""Only `clsplat.core.reading` reads files, and only regular ones."""
 
 import ast
 import json
@@ -52,7 +52,7 @@ ALLOWED = {  # module and function -> why it reads by itself
 
 
 def read_by(call: ast.Call) -> bool:
-    """Whether a call opens a file for reading."""
+    """Return whether a call opens a file for reading."""
     name = ast.unparse(call.func)
     if name in FUNCTIONS or (isinstance(call.func, ast.Attribute) and call.func.attr in METHODS):
         return True

@@ -1,4 +1,4 @@
-"""What killed processes leave: temporary files are swept, and those in use are not."""
+"""Leftovers of killed processes: temporary files are removed unless they are in use."""
 
 import errno
 import os
@@ -85,7 +85,7 @@ def test_temporary_files_of_a_killed_write_are_swept_next(tmp_path):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """What the disk is told, in order: sync, replace or unlink, and the name of the file or folder."""
+    """Calls to the disk, in order: sync, replace, or unlink, and the name of the file or folder."""
     found: list[tuple[str, str]] = []
     real = {name: getattr(os, name) for name in ("fsync", "replace", "rename", "unlink")}
 

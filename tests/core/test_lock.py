@@ -144,7 +144,7 @@ def test_removed_lock_file_is_no_lock(tmp_path, monkeypatch):
 
 
 def test_second_run_in_a_folder_is_refused(tiny_scene, tmp_path):
-    """The second is refused while the first goes on, with and without --resume; the first ends undisturbed."""
+    """With and without --resume; the first run is not disturbed."""
     out = tmp_path / "run"
     arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out), "--set", "optimize.steps=1000000"]
     slow = {**os.environ, **ONE_CORE}
@@ -212,7 +212,7 @@ def test_killed_start_does_not_change_the_default_folder(tmp_path):
 
 
 def test_a_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
-    """Where there are no locks, it would be taken for one that an earlier process of this number has left."""
+    """Without locks, it would look like a leftover of an earlier process with the same ID."""
     locked, waiting, go_on = lock._locked, threading.Event(), threading.Event()
 
     def slow(path, folder):
@@ -252,7 +252,7 @@ known_boot = pytest.mark.skipif(Owner.current().boot is None, reason="the system
     ],
 )
 def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, monkeypatch):
-    """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
+    """As with NFS and `local_lock`, where the lock is free locally.  A negative age means a fast clock."""
     (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": name}))
     before = (tmp_path / LOCK).read_text()
     (tmp_path / "status.json").write_text(json.dumps({**status, "time": time.time() - status["time"]}))
@@ -275,7 +275,7 @@ def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, 
 
 @pytest.mark.parametrize("ahead", [-2, 86400])
 def test_run_silent_for_a_minute_is_taken_over_despite_clocks(ahead, tmp_path, monkeypatch, caplog):
-    """As a job that is started again on another machine right after the first was killed."""
+    """As for a job restarted on another machine right after a kill."""
     caplog.set_level("INFO", "clsplat")
     start = time.time()
     (tmp_path / LOCK).write_text(json.dumps(ELSEWHERE))
@@ -317,7 +317,7 @@ def test_lock_of_a_run_that_ended_elsewhere_is_taken_over(owner, status, tmp_pat
 
 
 def test_run_that_wakes_up_notices_the_takeover(tmp_path, monkeypatch):
-    """As one that was suspended for a minute, where locks count on each machine alone."""
+    """As after a suspension of a minute, with machine-local locks."""
     monkeypatch.setattr(lock, "_system_lock", lambda file: True)
     own = lock.owner_record
     with monkeypatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Who runs something, and whether that process is alive."""
+"""Owners of files and folders, and whether their process is alive."""
 
 import sys
 from dataclasses import asdict, replace

@@ -1,4 +1,4 @@
-"""How far work on the host is: who hears it, and the time that is left."""
+"""Progress of work on the host: listeners, and the remaining time."""
 
 import io
 import threading
@@ -17,7 +17,7 @@ from clsplat.training.status import StatusFile
 
 @pytest.fixture
 def now(monkeypatch):
-    """The time, which stands still but for the test."""
+    """The time, which only the test advances."""
     clocked = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: clocked[0])
     return clocked

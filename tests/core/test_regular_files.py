@@ -25,7 +25,7 @@ from tests.support.timeouts import failing
 
 @pytest.fixture(autouse=True)
 def bounded() -> Iterator[None]:
-    """A reader that waits fails its test after some seconds."""
+    """Fail a test whose reader blocks for some seconds."""
     with failing("the reader waits", seconds=20):
         yield
 
@@ -103,7 +103,7 @@ def test_file_larger_than_expected_is_not_read(tmp_path):
 
 
 def test_only_the_vertices_of_a_model_are_read(tmp_path):
-    """What follows them may be long."""
+    """The data after them may be long."""
     path = tmp_path / "x.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     with path.open("r+b") as file:

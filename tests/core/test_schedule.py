@@ -1,4 +1,4 @@
-"""Numbers that change over training: one notation, wherever a pipeline takes one."""
+"""Schedules: one notation for every number that can change over training."""
 
 import math
 from pathlib import Path

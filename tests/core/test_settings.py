@@ -1,4 +1,4 @@
-"""Variants: known as soon as their class is defined, named by a word or by a mapping, and explained when misspelled."""
+"""Variants: available once their class is defined, given as a name or a mapping, and suggested if misspelled."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,7 +42,7 @@ def loaded(tmp_path: Path):
 
 @pytest.fixture
 def forget_variants(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Forget afterwards the variants that a test defines."""
+    """Remove the variants that a test defines."""
     load("smoke")  # the first pipeline of a process makes all variants known that there are
     with monkeypatch.context() as patch:
         patch.setattr(Settings, "defined", list(Settings.defined))

@@ -1,4 +1,4 @@
-"""stdout, stderr and log.txt may be closed, full or gone: the screen may fail, the work does not."""
+"""stdout, stderr, and log.txt may be closed, full, or missing: output may fail, but the work continues."""
 
 import json
 import logging
@@ -187,7 +187,7 @@ def test_end_of_a_command_without_a_run_is_one_line(name, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_sigterm_is_an_interrupt_for_every_command(tmp_path):
-    """The command waits for a file that nobody writes."""
+    """The command waits for a file that never appears."""
     code = "import time, clsplat.api.commands as c, clsplat.cli as m; c.check = lambda p: print('x') or time.sleep(60)"
     code += "; import sys; sys.argv[1:] = ['check', 'smoke']; m.main()"
     process = subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -1,4 +1,4 @@
-"""A file system without locks: whoever makes run.lock holds the folder, and a dead owner is replaced."""
+"""A file system without locks: creating run.lock reserves the folder, and a dead owner is replaced."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""The city from the air: its views show it from all sides, and any number of them lies evenly above it."""
+"""The synthetic city: views from all sides, evenly spaced above it."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The small tools: frames of a video, image pyramids."""
+"""Tools for frames of videos and image pyramids."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ from tests.support.refusals import refusal
 
 @pytest.fixture
 def video(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """Thirty frames whose gray level is their number; only every third is not blurred."""
+    """Thirty frames with their number as gray level; only every third is sharp."""
     path = tmp_path / "v.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
     noise = rng.integers(0, 60, (64, 96, 1))
@@ -41,7 +41,7 @@ def test_sharp_frames_of_a_video(video, tmp_path):
 
 
 def test_still_camera_gives_one_frame(tmp_path, rng):
-    """It rests, passes a wall in the middle third of the video, and rests again."""
+    """It is still, passes a wall in the middle third of the video, and is still again."""
     wall = cv2.GaussianBlur(rng.integers(0, 255, (90, 300, 3)).astype(np.uint8), (0, 0), 2)
     writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (120, 90))
     for i in range(60):

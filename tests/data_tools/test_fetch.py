@@ -1,4 +1,4 @@
-"""Data sets from the web: checked, gone on with, unpacked in their folder alone."""
+"""Datasets from the web: verified, resumed, and unpacked only in their folder."""
 
 import functools
 import hashlib
@@ -20,7 +20,7 @@ from tests.support.refusals import refusal
 
 
 class Server(http.server.SimpleHTTPRequestHandler):
-    """Serves a folder, with ranges if `ranges`, and breaks off after some bytes, `breaks` times."""
+    """Serve a folder, with ranges if `ranges`, and break off after some bytes, `breaks` times."""
 
     ranges, breaks, after = True, 0, 1000
     asked: list[str]

@@ -1,4 +1,4 @@
-"""The demo scene: closed forms of its shapes, exact cameras, all-or-nothing output."""
+"""The demo scene: closed forms of its shapes, exact cameras, and atomic output."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""A box: what lies in it, growth inside of it alone, and a model cropped to it."""
+"""A box: containment, growth only inside it, and a model cropped to it."""
 
 import json
 

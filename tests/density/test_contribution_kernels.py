@@ -1,4 +1,4 @@
-"""The sum of blend weights by which Gaussians are pruned, against the reference, at the edges of tiles and groups."""
+"""The sum of blend weights for pruning, against the reference, at the edges of tiles and groups."""
 
 import numpy as np
 

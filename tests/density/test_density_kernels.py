@@ -1,4 +1,4 @@
-"""density.cl and gather.cl: statistics, rules, edits and the bookkeeping of every table."""
+"""density.cl and gather.cl: statistics, rules, edits, and the rearrangement of every table."""
 
 import numpy as np
 import pytest

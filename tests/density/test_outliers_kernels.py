@@ -1,4 +1,4 @@
-"""Rules for what is far outside or wide on the screen (outliers.py), on constructed cases."""
+"""Rules for distant or large Gaussians (outliers.py), on constructed cases."""
 
 from types import SimpleNamespace
 

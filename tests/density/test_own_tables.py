@@ -1,4 +1,4 @@
-"""A rule of one's own with a table of its own: the table lives with the Gaussians and returns on resume."""
+"""A custom rule with a table: the table follows the Gaussians and is restored on resume."""
 
 from typing import Literal
 

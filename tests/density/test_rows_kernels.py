@@ -1,4 +1,4 @@
-"""gather.cl and density.cl: rows that the host sets or zeroes, and Gaussians that it chooses."""
+"""gather.cl and density.cl: rows that the host sets or zeroes, and Gaussians that it selects."""
 
 import numpy as np
 import pytest

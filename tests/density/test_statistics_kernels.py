@@ -1,4 +1,4 @@
-"""The columns that density rules read, from the sums over pixels to the rules' decisions."""
+"""The statistics that density rules read, from pixel sums to decisions."""
 
 from dataclasses import replace
 from types import SimpleNamespace

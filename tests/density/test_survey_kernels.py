@@ -1,4 +1,4 @@
-"""What Gaussians do in the pixels of training views (clsplat/density/survey.py), at the edges of tiles and groups."""
+"""Effects of Gaussians on the pixels of training views (density/survey.py), at the edges of tiles and groups."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""glTF and OpenUSD: validity, axes, nodes, and what a file may not declare."""
+"""glTF and OpenUSD: validity, axes, nodes, and invalid declarations."""
 
 import base64
 import gzip

@@ -1,4 +1,4 @@
-"""The splat PLY: exact round trips, tolerant reading, refusals in one sentence."""
+"""The splat PLY: exact round trips, tolerant reading, and one-sentence refusals."""
 
 import tracemalloc
 

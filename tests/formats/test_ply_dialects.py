@@ -1,4 +1,4 @@
-"""PLY files of many programs: marks, discs, packed splats."""
+"""PLY files of other programs: mip marks, discs, and compressed splats."""
 
 import re
 

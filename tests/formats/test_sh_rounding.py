@@ -1,4 +1,4 @@
-"""Harmonics rounded by weights and visible errors: against a slow reference, in SPZ and in SOG."""
+"""Rounding of harmonics by weights and visible errors, against a slow reference, in SPZ and SOG."""
 
 import gzip
 from dataclasses import replace
@@ -42,7 +42,7 @@ def one_sided_model(rng: np.random.Generator, count: int, degree: int = 3) -> Sp
 
 
 def visible_error(error: np.ndarray, form: np.ndarray) -> np.ndarray:
-    """What shows of the errors of each Gaussian, e^T G e over its channels, [N]."""
+    """Visible error of each Gaussian, e^T G e summed over channels, [N]."""
     channels = error.astype(np.float64).reshape(len(error), len(form), 3)
     return np.einsum("nkc,kl,nlc->n", channels, form, channels)
 

@@ -1,4 +1,4 @@
-"""SOG: published bytes, both containers, both versions, and what a file may not declare."""
+"""SOG: published bytes, both containers, both versions, and invalid declarations."""
 
 import errno
 import io

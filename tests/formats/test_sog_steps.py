@@ -1,4 +1,4 @@
-"""Tables in fewer values: the same Gaussians, on levels that a SOG holds, in fewer bytes."""
+"""Tables with fewer distinct values, on the levels of SOG, in fewer bytes."""
 
 from pathlib import Path
 

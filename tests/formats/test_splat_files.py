@@ -1,4 +1,4 @@
-"""`.splat` and `.ksplat`: records without a mark."""
+"""`.splat` and `.ksplat` files."""
 
 import numpy as np
 import pytest

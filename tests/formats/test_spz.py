@@ -1,4 +1,4 @@
-"""SPZ: published bytes, every version, and what a file may not declare."""
+"""SPZ: published bytes, every version, and invalid declarations."""
 
 import gzip
 import struct

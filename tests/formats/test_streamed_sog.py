@@ -1,4 +1,4 @@
-"""Streamed SOG: the layout of its JSON, leaves and files, and what a damaged one is."""
+"""Streamed SOG: the layout of its JSON, leaves, and files, and damaged folders."""
 
 import errno
 import json

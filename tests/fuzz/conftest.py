@@ -1,4 +1,4 @@
-"""Bounds on what a reader takes: a second GiB of memory, and some seconds for a small file."""
+"""Limits for readers: one more GiB of memory, and some seconds for a small file."""
 
 from collections.abc import Iterator
 from pathlib import Path

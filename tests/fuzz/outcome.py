@@ -1,4 +1,4 @@
-"""What every reader does with any input: it returns, or says in one line why not."""
+"""Every reader either returns or refuses its input in one line."""
 
 import signal
 from collections.abc import Callable

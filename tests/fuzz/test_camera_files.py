@@ -1,4 +1,4 @@
-"""Damaged camera paths and lists of cameras: read or refused, soon and in little memory."""
+"""Damaged camera paths and lists of cameras are read or refused, quickly and with little memory."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Damaged model files of every format: read or refused, soon and in little memory."""
+"""Damaged model files of every format are read or refused, quickly and with little memory."""
 
 import base64
 import io

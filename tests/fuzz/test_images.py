@@ -1,4 +1,4 @@
-"""Damaged images: decoded or refused; the header tells the size that decoding finds."""
+"""Damaged images are decoded or refused, and the header agrees with the decoded size."""
 
 import itertools
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Damaged pipeline files, and what `--set` may be given."""
+"""Damaged pipeline files and values of `--set`."""
 
 from pathlib import Path
 

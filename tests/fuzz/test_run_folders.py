@@ -1,4 +1,4 @@
-"""Damaged files of a run folder: checkpoints, status, checksums, the identity of its photographs."""
+"""Damaged files of a run folder: checkpoints, status, checksums, and hashes of the input."""
 
 import io
 import json
@@ -36,7 +36,7 @@ stages:
 
 
 def checkpoint() -> bytes:
-    """A small archive, as a run writes it."""
+    """A small checkpoint, as a run writes it."""
     file = io.BytesIO()
     archive.write(file, NOTES, ARRAYS.items())
     return file.getvalue()
@@ -78,7 +78,7 @@ def test_a_damaged_field_is_equal_or_refused(folder: Path):
 
 @pytest.fixture(scope="module")
 def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that is done, with few and small files."""
+    """A finished run with few, small files."""
     file = tmp_path_factory.mktemp("pipeline") / "tiny.yaml"
     file.write_text(TINY)
     return clsplat.run(file, tiny_scene, tmp_path_factory.mktemp("runs") / "run")

@@ -1,4 +1,4 @@
-"""Damaged datasets: COLMAP, binary and text, and transforms.json; each is read, and inspected in pieces."""
+"""Damaged datasets: COLMAP (binary and text) and transforms.json, read and inspected."""
 
 import json
 import warnings

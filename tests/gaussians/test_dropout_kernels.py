@@ -1,4 +1,4 @@
-"""dropout.cl against the float64 oracle."""
+"""dropout.cl against the float64 reference."""
 
 from dataclasses import replace
 

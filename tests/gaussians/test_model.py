@@ -1,4 +1,4 @@
-"""Models on the host: files, views of their tables, choosing rows, and moving them in the world."""
+"""Models on the host: files, properties, row selection, and transforms."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Models that move: their file, a moment of them, and what refuses to lose the motion."""
+"""Moving models: files, snapshots, and formats that refuse motion."""
 
 import errno
 import itertools

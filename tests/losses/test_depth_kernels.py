@@ -1,4 +1,4 @@
-"""The blended inverse depth against float64: the plane, its gradient, and the loss that reads it."""
+"""The blended inverse depth, its gradient, and its loss, against float64."""
 
 from dataclasses import replace
 

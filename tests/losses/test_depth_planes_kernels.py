@@ -1,4 +1,4 @@
-"""A plain wall between two textured ones, begun at the wrong depth: colors do not tell it, its points do."""
+"""A plain wall that starts at the wrong depth, which only its points can correct."""
 
 from dataclasses import replace
 

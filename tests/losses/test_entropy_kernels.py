@@ -1,4 +1,4 @@
-"""The entropy of blend weights: the fourth plane of an image, its gradient, and the loss that reads them."""
+"""The entropy of blend weights: the fourth image plane, its gradient, and its loss."""
 
 from dataclasses import replace
 

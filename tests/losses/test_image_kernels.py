@@ -1,4 +1,4 @@
-"""loss.cl: values and gradients against the oracle, also with a mask in an array of its own."""
+"""loss.cl: values and gradients against the reference, also with a separate mask."""
 
 from dataclasses import replace
 

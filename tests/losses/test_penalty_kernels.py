@@ -1,4 +1,4 @@
-"""penalty.cl against the oracle, and the oracle against finite differences."""
+"""penalty.cl against the reference, and the reference against finite differences."""
 
 import numpy as np
 import pytest

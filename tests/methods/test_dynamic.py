@@ -1,4 +1,4 @@
-"""Training of a scene that moves: the recipe in few steps, what it writes, and what it refuses."""
+"""Training of moving scenes: the recipe in few steps, its outputs, and its refusals."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Rules that divide Gaussians in time, and remove those that no view shows."""
+"""Rules that split Gaussians in time and prune Gaussians that no view shows."""
 
 from dataclasses import replace
 

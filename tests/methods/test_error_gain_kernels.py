@@ -1,4 +1,4 @@
-"""What a Gaussian promises by the views' error (gain): photographs of another exposure, the same choice."""
+"""The predicted gain of a Gaussian: exposure does not change the selection."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pruning by what the training views lose without the Gaussians (error_pruning.py), against the reference."""
+"""Pruning by the error that it causes in training views (error_pruning.py), against the reference."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -42,7 +42,7 @@ def survey_of(device: Device, case: Case, photographs: list, masks: list, exposu
 
 
 def photographs_like(rng, case: Case, count: int) -> list[np.ndarray]:
-    """Pictures of all Gaussians with noise, [3, height, width] of 8 bits, even numbers."""
+    """Images of all Gaussians with noise, [3, height, width], even 8-bit values."""
     image = image_of(case, np.arange(len(case.parameters["means"]))).transpose(2, 0, 1)
     noisy = [image + rng.normal(0, 0.05, image.shape) for _ in range(count)]
     return [(4 * np.round(np.clip(picture, 0, 1) * 60)).astype(np.uint8) for picture in noisy]

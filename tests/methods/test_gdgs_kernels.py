@@ -1,4 +1,4 @@
-"""The rule that copies where Gaussians with a large gradient crowd (gdgs.py), against loops over all of them."""
+"""The rule that clones Gaussians in dense regions (gdgs.py), against loops over all of them."""
 
 import numpy as np
 

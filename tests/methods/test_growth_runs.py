@@ -1,4 +1,4 @@
-"""Whole runs with rules and losses: what they decide, and that runs resume and repeat to the bit."""
+"""Whole runs with rules and losses: their decisions, and bitwise resume and repetition."""
 
 import json
 import shutil

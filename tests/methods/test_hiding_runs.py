@@ -1,4 +1,4 @@
-"""Whole runs in which training views leave out what matters little in them."""
+"""Whole runs in which training views omit their least important Gaussians."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""Whole runs with changing weights, penalties and subdividing rules: bits, resume, and what the report says of them."""
+"""Whole runs with changing weights, penalties, and split rules: bits, resume, and the report."""
 
 import json
 import re

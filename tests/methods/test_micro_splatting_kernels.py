@@ -1,4 +1,4 @@
-"""Rules that subdivide, thin and merge, on constructed cases."""
+"""Rules that split, prune, and merge, on constructed cases."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""Figures in the colors of the photographs, beside PSNR."""
+"""Metrics in the colors of the photographs, in addition to PSNR."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""MS-SSIM against the oracle, FLIP and LPIPS as far as the packages and files for them are there."""
+"""MS-SSIM against the reference; FLIP and LPIPS if their packages and files are available."""
 
 import sys
 

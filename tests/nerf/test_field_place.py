@@ -1,4 +1,4 @@
-"""Where the cube of a field's grid lies beside what photographs show."""
+"""Whether the photographs show the cube of a field's grid."""
 
 from dataclasses import replace
 

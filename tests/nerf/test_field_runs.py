@@ -1,4 +1,4 @@
-"""Runs that train a field in the place of Gaussians: what they leave, their bits, and what they refuse."""
+"""Runs that train a field instead of Gaussians: outputs, bits, and refusals."""
 
 import json
 import math

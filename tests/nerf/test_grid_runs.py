@@ -1,4 +1,4 @@
-"""Runs that train a field whose network reads a grid: their bits, their files, and the recipe."""
+"""Runs that train a field with a hash grid: bits, files, and the recipe."""
 
 import json
 from pathlib import Path

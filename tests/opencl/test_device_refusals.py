@@ -1,4 +1,4 @@
-"""A runtime that refuses memory, or any call, ends a command with the code for that and not as a defect."""
+"""A runtime that refuses memory or a call ends the command with the matching exit code."""
 
 import re
 

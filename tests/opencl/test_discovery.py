@@ -1,4 +1,4 @@
-"""Which device is chosen, what keeps one from working, and what a compiler's limits lead to."""
+"""The choice of a device, devices that do not work, and limits of compilers."""
 
 import logging
 import os
@@ -35,7 +35,7 @@ OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, inde
 
 @pytest.fixture
 def set_devices(monkeypatch):
-    """Lets the test say which devices there are; all work."""
+    """Set the list of devices; all of them work."""
     monkeypatch.delenv("CLSPLAT_DEVICE", raising=False)
     monkeypatch.setattr(runtimes, "probe_fault", lambda *_: None)
     return lambda *devices: monkeypatch.setattr(discovery, "list_devices", lambda: list(devices))
@@ -153,7 +153,7 @@ def refusal(code: int) -> cl.Error:
 
 
 class BrokenDevice:
-    """A device that tells nothing of itself."""
+    """A device that refuses all queries."""
 
     @property
     def name(self):

@@ -1,4 +1,4 @@
-"""Kernel files of one's own: what cannot be read or found is refused with the form that is expected."""
+"""Custom kernel files: missing files and kernels are refused with the expected form."""
 
 import sqlite3
 from pickle import UnpicklingError

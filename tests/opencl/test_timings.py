@@ -1,4 +1,4 @@
-"""Times of kernels: of the steps that are sampled alone, and in the order of all other commands."""
+"""Kernel timings: only of sampled steps, and in the order of all other commands."""
 
 import numpy as np
 

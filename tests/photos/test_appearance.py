@@ -1,4 +1,4 @@
-"""Colors of each photograph: their numbers, their table, and whole runs with them."""
+"""Color corrections per photograph: parameters, table, and whole runs."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The colors of a photograph (colors.cl) against float64, and in a training step."""
+"""Color corrections (colors.cl) against float64, and in a training step."""
 
 from dataclasses import replace
 

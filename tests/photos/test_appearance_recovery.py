@@ -1,4 +1,4 @@
-"""Known exposures are found again: photographs of a model that is known, with gains that are known."""
+"""Known exposures are recovered from photographs of a known model."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,12 +58,12 @@ class Capture:
             self.photographs.append(Photograph(replace(camera, view=number), device.upload(pixels)))
 
     def rendered(self, camera: DeviceCamera) -> np.ndarray:
-        """The model's own colors, [H, W, 3]."""
+        """The uncorrected colors of the model, [H, W, 3]."""
         return render_floats(SplatPainter(self.rasterizer, self.model, self.background), camera)
 
     @property
     def white(self) -> float:
-        """The share of values that are white."""
+        """The fraction of white values."""
         return float(np.mean([photograph.image() == 255 for photograph in self.photographs]))
 
     def trained(self, rng: np.random.Generator, state: ColorState) -> StepTrainer:
@@ -120,7 +120,7 @@ def test_images_of_equal_exposure_stay_equal(rng, info):
 
 
 def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
-    """What is cut says no more than that it is bright."""
+    """A clipped value only says that it is bright."""
     truth = np.zeros((VIEWS, 3))
     truth[2] = 0.6
     truth -= truth.mean(axis=0)

@@ -1,4 +1,4 @@
-"""blur.cl against the oracle."""
+"""blur.cl against the reference."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Depth maps of other programs: fitted to points, refused or left out where they do not go with them."""
+"""Depth maps of other programs: fitted to points, and refused or dropped if they do not fit."""
 
 import logging
 from pathlib import Path

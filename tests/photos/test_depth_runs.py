@@ -1,4 +1,4 @@
-"""Trainings that know depths: they repeat and resume to the bit, and refuse what they cannot know."""
+"""Training with depths: bitwise repetition and resume, and refusals."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The sizes that follow from the photographs' detail, and the number of Gaussians that goes with them."""
+"""Image sizes that follow from the detail of the photographs, and the matching number of Gaussians."""
 
 import math
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Exposures of photographs, from the pixels in which they show the same points."""
+"""Exposures of photographs, estimated from pixels that show the same points."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -58,7 +58,7 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
 
 
 class Photograph:
-    """A photograph that counts whole."""
+    """A photograph whose pixels all count."""
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
@@ -125,7 +125,7 @@ def test_a_third_of_the_points_may_be_hidden(rng):
 
 
 def test_view_dependent_light_is_not_exposure(rng):
-    """Each photograph of a point differs for itself."""
+    """Each photograph of a point differs independently."""
     wall = Wall(rng)
     wall.log_gains[:] = 0
     colors = wall.colors

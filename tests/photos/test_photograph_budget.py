@@ -1,4 +1,4 @@
-"""What lies on the device is counted, and photographs keep to their budget."""
+"""Device memory is counted, and photographs stay within their budget."""
 
 import gc
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What a step compares with: a function of the step, so that a run that was interrupted goes on to the same bits."""
+"""The sample of a step is a function of the step, so that interrupted runs resume to the same bits."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Settings that follow from the photographs: what is decided, written, kept, and refused; a plug-in's decisions."""
+"""Settings that follow from the photographs: decisions, records, overrides, refusals, and plug-ins."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Edits keep their order, and stay apart, in a recipe of another number of steps."""
+"""Edits keep their order and distance if a recipe is stretched."""
 
 import functools
 import math
@@ -102,7 +102,7 @@ def test_a_cadence_below_a_step_is_refused():
 @settings(max_examples=3)
 @given(data=st.data())
 def test_corrected_step_count_keeps_all_up_to_the_last_edit(name, data):
-    """Whatever begins behind the last edit, such as an average, still does."""
+    """Whatever starts after the last edit, such as an average, still does."""
     recipe, old = recipe_and_edits(name)
     last = last_edit(recipe.training)
     done = data.draw(st.integers(1, recipe.training.steps - 1))

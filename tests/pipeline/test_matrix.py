@@ -1,4 +1,4 @@
-"""Files with `matrix:`: what they expand to, and what is refused."""
+"""Files with `matrix:`: their cells, and refusals."""
 
 import json
 

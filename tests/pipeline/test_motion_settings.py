@@ -1,4 +1,4 @@
-"""Settings that do not go together with Gaussians that move are refused, with what to write instead."""
+"""Settings that conflict with moving Gaussians are refused with a remedy."""
 
 import re
 from collections.abc import Mapping

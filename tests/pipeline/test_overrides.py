@@ -1,4 +1,4 @@
-"""`--set`: what it reaches, and errors that blame it."""
+"""`--set`: its keys, and its errors."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Pipeline files: what is accepted, what is refused and in which words."""
+"""Pipeline files: accepted input, and refusals with their messages."""
 
 import functools
 import json

@@ -1,4 +1,4 @@
-"""Variants from outside the package: loading, recording, refusing, and the same bits as inside."""
+"""Plug-ins: loading, recording, refusals, and the same bits as built-in code."""
 
 import ast
 import json

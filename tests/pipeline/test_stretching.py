@@ -1,4 +1,4 @@
-"""A recipe in another number of steps."""
+"""Recipes with a different number of steps."""
 
 from dataclasses import replace
 from itertools import cycle
@@ -27,7 +27,7 @@ def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
 
 
 def test_stretched_long_recipe_equals_the_short_one():
-    """But for the cadence and the end of growth, which splat_7k chooses."""
+    """Except for the cadence and the end of growth, which splat_7k sets."""
     new = stretched(load("splat").settings, 7000 / 30000).training
     assert (new.steps, new.rates.means.over) == (7000, 7000)
     raise_sh, densify, reset, white = new.during[:4]

@@ -1,4 +1,4 @@
-"""Files that are YAML and no settings, or not even YAML: a sentence with file and line, and nothing is executed."""
+"""Files that are not settings or not YAML: one sentence with file and line, and nothing is executed."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Photographs as people take them: turned by EXIF, of several lenses, and sets that give no model."""
+"""Casual photographs: rotated by EXIF, from several lenses, and sets that give no model."""
 
 import math
 import struct
@@ -200,7 +200,7 @@ def test_video_instead_of_a_folder_names_the_command(tmp_path, read):
 
 
 def matched(tmp_path: Path) -> MatchGraph:
-    """Photographs of which three are in the model, and three are soft: two of its place, and one of another."""
+    """Photographs: three in the model, and three soft ones, two of the same place and one of another."""
     names = ["a", "b", "c", "blurred", "soft", "elsewhere", "plain", "alone", "pair", "other", "few", "many"]
     soft = ("blurred", "soft", "elsewhere")
     for name in names:
@@ -276,7 +276,7 @@ def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
 
 
 def rotated_view(number: int) -> np.ndarray:
-    """What a camera sees that turns before a far wall, by 6 degrees each time."""
+    """Return the view of a camera that turns in front of a far wall, by 6 degrees each time."""
     angle = math.radians(6 * number - 15)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     near, far = (
@@ -333,7 +333,7 @@ def test_unusable_sets_end_with_one_sentence(tmp_path, dense, pixels, sentence):
 
 
 def test_featureless_photographs_end_with_one_sentence(tmp_path, dense):
-    """More pairs are looked for among photographs without features."""
+    """Photographs without features are matched with more pairs."""
     plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
     matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbors=2)
     with pytest.raises(DataError, match="none has features, where thousands"):
@@ -341,7 +341,7 @@ def test_featureless_photographs_end_with_one_sentence(tmp_path, dense):
 
 
 def test_only_performed_attempts_count(tmp_path, dense, caplog):
-    """All pairs were matched, so that there are no more of them to try."""
+    """All pairs were matched, so there are no more to try."""
     caplog.set_level("INFO")
     matches, cameras = prepared(tmp_path, [unrelated_photograph(number) for number in range(4)])
     with pytest.raises(DataError, match="no two of them show the same features"):

@@ -1,4 +1,4 @@
-"""The inspection of datasets: constructed ones with one fault each, and real ones that have none."""
+"""Inspection of datasets: constructed ones with one fault each, and real ones without faults."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The inspection of a folder of photographs that have no cameras yet."""
+"""Inspection of a folder of photographs without cameras."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Photographs that are left out are matched with more others, where not all pairs were matched."""
+"""Left-out photographs are matched with more photographs if not all pairs were matched."""
 
 import shutil
 import signal

@@ -1,4 +1,4 @@
-"""Steps from photographs to a scene: done once, redone when what they depend on changes, nothing left half-made."""
+"""Prepare steps: done once, redone if their inputs change, and never left incomplete."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ from tests.support.refusals import refusal
 
 
 class Copy(Step):
-    """Writes what it read, and its letter behind it."""
+    """Write what it read, followed by its letter."""
 
     calls: ClassVar[list[str]] = []
 
@@ -357,7 +357,7 @@ def test_concurrent_processes_prepare_a_result_once(pipeline, photos, tmp_path):
 
 
 def test_runs_of_different_photographs_prepare_concurrently(pipeline, photos, tmp_path, monkeypatch):
-    """One begins while the other is in the middle of its step."""
+    """One starts while the other is in the middle of its step."""
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / "p.txt").write_text("others")
     make = prepare_steps.FindFeatures.make

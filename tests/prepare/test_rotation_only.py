@@ -1,4 +1,4 @@
-"""Whether matches tell depths: cameras that turn on one spot, on several, and copies of one photograph or of many."""
+"""Whether matches give depth: rotating cameras at one or several positions, and copies of photographs."""
 
 from collections.abc import Sequence
 from pathlib import Path

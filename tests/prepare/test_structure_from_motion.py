@@ -1,4 +1,4 @@
-"""Structure from motion on real photographs, against the poses they came with; and photographs that need care."""
+"""Structure from motion on real photographs, against their known poses, and on difficult ones."""
 
 import shutil
 import signal
@@ -134,7 +134,7 @@ def test_photographs_without_features(tmp_path):
 
 @pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
 def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, five, attempt):
-    """With so few features of each photograph."""
+    """With few features per photograph."""
     monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(480, 1500))
     for name in ("features", "matches", "cameras"):
         (tmp_path / name).mkdir()

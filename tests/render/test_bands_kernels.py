@@ -1,4 +1,4 @@
-"""Bands of tiles and short launches: the same bits as all at once."""
+"""Bands of tiles and short launches give the same bits as one launch."""
 
 from dataclasses import replace
 
@@ -119,7 +119,7 @@ def test_refused_memory_leads_to_bands_with_the_same_bits(device, rng, monkeypat
 
 @on_one_setting
 def test_memory_refused_at_a_copy_leads_to_bands(device, rng, monkeypatch):
-    """Some take it at the first use."""
+    """Some runtimes allocate at the first use."""
     case, copy, refused = random_case(rng, 300, 60, 70), cl.enqueue_copy, []
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
     image, pixel_sums, _ = results(device, case, weights)

@@ -1,4 +1,4 @@
-"""blend_wide.cl and blend_simt.cl, forward, and layer.cl, against the oracle."""
+"""blend_wide.cl and blend_simt.cl (forward pass) and layer.cl against the reference."""
 
 import numpy as np
 

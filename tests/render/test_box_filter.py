@@ -1,4 +1,4 @@
-"""The screen filter `box`: settings, model files, what refuses it, and a run."""
+"""The screen filter `box`: settings, model files, conflicts, and a run."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""filter.cl against the oracle, and what both filters do to the brightness of an image."""
+"""filter.cl against the reference, and the effect of both filters on image brightness."""
 
 from dataclasses import replace
 from typing import Literal

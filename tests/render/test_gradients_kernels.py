@@ -1,4 +1,4 @@
-"""The whole backward pass against the oracle, against finite differences and against the other schedule."""
+"""The whole backward pass against the reference, finite differences, and the other schedule."""
 
 from dataclasses import replace
 

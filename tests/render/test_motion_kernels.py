@@ -1,4 +1,4 @@
-"""Gaussians at a moment, and the gradients by their motion (motion.cl), against float64."""
+"""Gaussians at a given time, and gradients of their motion (motion.cl), against float64."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Models whose values are too large: the pictures that commands make of them are refused, not written as black."""
+"""Models with too large values: their renders are refused, not written as black images."""
 
 from dataclasses import replace
 from pathlib import Path

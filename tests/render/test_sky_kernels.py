@@ -1,4 +1,4 @@
-"""A background of directions (sky.cl) against float64, and in a training step."""
+"""The environment map (sky.cl) against float64, and in a training step."""
 
 from dataclasses import replace
 

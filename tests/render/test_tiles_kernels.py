@@ -1,4 +1,4 @@
-"""pairs.cl and the tile lists: nothing visible is missing, nothing is twice, both sorts agree.
+"""pairs.cl and the tile lists: complete, without duplicates, and equal for both sorts.
 
 scan.cl, sort_radix.cl and sort_bitonic.cl are compared with NumPy.
 """

@@ -1,4 +1,4 @@
-"""What deployers start from: the container file, the service, the jobs, and the page that explains them."""
+"""Files for deployment: the container file, the service, the jobs, and their page."""
 
 import fnmatch
 import re

@@ -1,4 +1,4 @@
-"""What the documentation says holds: keys, commands, links, versions, the map of folders."""
+"""The documentation matches the code: keys, commands, links, versions, and the map of folders."""
 
 import importlib
 import re

@@ -1,4 +1,4 @@
-"""Every example runs, and so do the Python lines of the documentation; those of plug-ins are tested in test_plugins."""
+"""Every example and the Python code of the documentation run; test_plugins.py tests the plug-ins."""
 
 import ast
 import inspect

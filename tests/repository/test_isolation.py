@@ -1,4 +1,4 @@
-"""Child processes import nothing from the working folder, which may be somebody else's."""
+"""Child processes import nothing from the working folder, which may be untrusted."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""Rooms: what each may import, how many there are, and that imports have no circle."""
+"""Packages: what each may import, how many there are, and no import cycles."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""Limits that keep the house readable: sizes of files and functions, and every package in the wheel."""
+"""Limits on the size of files and functions, and the contents of the wheel."""
 
 import ast
 import tomllib

@@ -1,4 +1,4 @@
-"""Nothing that only some systems have is needed: tried here by taking it away."""
+"""Features that only some systems have are not needed: these tests take them away."""
 
 import ast
 import errno

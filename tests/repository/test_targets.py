@@ -1,4 +1,4 @@
-"""Builds for GPUs that are not here: the options of the code, what compilers say, and that planted faults are found."""
+"""Offline builds for GPUs: options, compiler statistics, and planted faults."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""Tests mirror the rooms, use each other's helpers through tests/support only, and have short names."""
+"""Tests mirror the packages, share helpers only through tests/support, and have short names."""
 
 import ast
 from collections.abc import Iterator

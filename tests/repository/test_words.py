@@ -1,4 +1,4 @@
-"""Words that stop a reader: British spellings are absent, and words of a private dialect only become fewer."""
+"""Spelling is American, and unidiomatic words only become fewer."""
 
 import re
 from collections import Counter

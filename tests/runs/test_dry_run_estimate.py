@@ -1,4 +1,4 @@
-"""What a dry run says before photographs are prepared, and of the time that a run takes."""
+"""The dry run before preparation, and its time estimates."""
 
 from pathlib import Path
 from types import SimpleNamespace

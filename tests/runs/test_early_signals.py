@@ -1,4 +1,4 @@
-"""A signal in the first second: wherever it comes, the command ends with its sentence and its code."""
+"""A signal in the first second ends the command with its message and exit code."""
 
 import contextlib
 import signal

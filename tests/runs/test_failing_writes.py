@@ -1,4 +1,4 @@
-"""The n-th write of a run fails, as on a disk that is full or bad: one sentence, exit 7, and nothing is lost."""
+"""The n-th write of a run fails, as on a full or bad disk: one sentence, exit code 7, and nothing is lost."""
 
 import builtins
 import errno

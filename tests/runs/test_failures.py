@@ -1,4 +1,4 @@
-"""A run that fails, wherever it is, saves the last whole state and ends, resumed, with the same bits."""
+"""A failing run saves its last complete state, and resumes to the same bits."""
 
 import errno
 import json
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def fail_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
-    """Let a run fail in a step, in different places of it."""
+    """Make a run fail in a step, at a given point of it."""
     counts = {"photograph": 0, "kernel": 0}
     get, call = Photographs.get, Kernel.__call__
 

@@ -1,4 +1,4 @@
-"""What a run starts from: photographs that decode, and the same ones when it goes on."""
+"""Inputs of a run: photographs are checked, and must be the same on resume."""
 
 import json
 import os

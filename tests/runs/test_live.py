@@ -1,4 +1,4 @@
-"""A run with a page that asks for pictures: the same bits, a pause, its end."""
+"""A run with a live page: the same bits, pauses, and its end."""
 
 import http.client
 import json
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 
 class Client:
-    """A browser's part, without the browser."""
+    """A stand-in for the browser."""
 
     def __init__(self, live: Live) -> None:
         parts = urlsplit(live.address)

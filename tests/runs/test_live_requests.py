@@ -1,4 +1,4 @@
-"""Who may ask, and for what: before any answer is computed."""
+"""Requests of the live page: which are accepted."""
 
 import json
 

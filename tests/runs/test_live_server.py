@@ -1,4 +1,4 @@
-"""The server itself: loopback alone, bounded requests, ports, its end."""
+"""The live server: loopback only, limited requests, ports, and shutdown."""
 
 import socket
 import threading
@@ -22,7 +22,7 @@ def server(monkeypatch):
 
 
 def exchange(server: Server, data: bytes) -> bytes:
-    """Send bytes; return all that comes back until the other side closes."""
+    """Send bytes; return the response until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(data)
         connection.shutdown(socket.SHUT_WR)

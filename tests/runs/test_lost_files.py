@@ -1,4 +1,4 @@
-"""Files of a finished run that were lost or changed: its last stages run again, and what they do not write is named."""
+"""Lost or changed files of a finished run: its last stages run again, and unrecoverable files are named."""
 
 import shutil
 from pathlib import Path
@@ -64,7 +64,7 @@ def damaged(out: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def saved_late(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run whose checkpoint is behind all that it has written."""
+    """A finished run whose checkpoint is older than its outputs."""
     folder = tmp_path_factory.mktemp("late")
     (folder / "late.yaml").write_text(SAVED_LATE.format(scene=tiny_scene))
     return clsplat.run(str(folder / "late.yaml"), out=folder / "run")
@@ -76,7 +76,7 @@ def copy(saved_late: Path, tmp_path: Path) -> Path:
 
 
 def change(path: Path) -> None:
-    """Change bytes of a file that ends as before."""
+    """Change bytes of a file but not its end."""
     whole = path.read_bytes()
     path.write_bytes(whole[:40] + b"x" * 20 + whole[60:])
 
@@ -209,7 +209,7 @@ def test_matrix_cells_with_lost_files_run_again(tiny_scene, tmp_path):
 
 @pytest.mark.parametrize("content", [None, b"", b"ply\n"])
 def test_candidate_without_its_model_is_trained_again(content, few_steps, info, tmp_path):
-    """Compress and lod would publish a damaged one."""
+    """Otherwise `compress` and `lod` would publish a damaged model."""
     source = ModelSource.of(few_steps, None)
     model = load_model(source.file)
     tuning = Tuning("rungs", source, model, 3, Device(info))

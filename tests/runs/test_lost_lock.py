@@ -1,4 +1,4 @@
-"""A process whose run.lock was removed or replaced notices it, ends with one sentence, and writes nothing more."""
+"""A process whose run.lock was removed or replaced ends with one sentence and writes nothing more."""
 
 import json
 import time
@@ -23,7 +23,7 @@ OTHER = json.dumps({"process": 4321, "host": "there", "time": 0, "command": "cls
 
 
 def take_folder(out: Path) -> dict[str, bytes]:
-    """Another process takes the folder and writes in it; what is there then."""
+    """Let another process take the folder and write into it; return its files."""
     (out / LOCK).unlink()
     (out / LOCK).write_text(OTHER)
     (out / "status.json").write_text(OTHER)

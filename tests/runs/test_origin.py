@@ -1,4 +1,4 @@
-"""A scene in world coordinates in a run and its files: the origin is kept, and given back."""
+"""A scene in world coordinates: a run and its files keep the origin."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A pipeline, also one from the network, writes inside its run folder alone."""
+"""A pipeline, even an untrusted one, writes only inside its run folder."""
 
 import json
 import typing

@@ -1,4 +1,4 @@
-"""What a run writes is reserved for it, and read back at its end: a file that has changed since is no success."""
+"""Output names are reserved, and outputs are read back at the end: a changed file is a failure."""
 
 import ast
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A refused run leaves no trace; --restart begins again and leaves the files of others."""
+"""A refused run leaves no files; --restart starts over and keeps foreign files."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Settings of a run that may change when it goes on, and those that may not."""
+"""Settings that may, and may not, change on resume."""
 
 import json
 import shutil

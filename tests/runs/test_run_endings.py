@@ -1,4 +1,4 @@
-"""However a run ends, its status.json has the reason, and the command prints one line."""
+"""Endings of a run: status.json has the reason, and the command prints one line."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""The folder of a run is its own: not that of photographs, of a user's file, or outside."""
+"""The run folder: never a folder of photographs, a user's file, or outside the given path."""
 
 import sys
 from pathlib import Path

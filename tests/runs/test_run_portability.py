@@ -1,4 +1,4 @@
-"""A run folder stands for its model and its scene; a run that is done goes on; its summary says what is where."""
+"""A run folder is accepted as model and scene, a finished run can be continued, and the summary lists its files."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""`clsplat status`: what is known of a run from its files, here and elsewhere."""
+"""`clsplat status`: the state of local and remote runs, from their files."""
 
 import json
 import subprocess
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def write_and_read_status(folder: Path, **values) -> dict:
-    """Write a status of a run whose process has ended, and return what is found."""
+    """Write the status of a run whose process has ended; return what `status` reads."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     killed = {"step": 7, "steps": 9, "state": "running", "process": gone.pid, "time": time.time() - 200}

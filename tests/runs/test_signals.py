@@ -1,4 +1,4 @@
-"""A signal in a stage other than training: the state is saved, and the run goes on to the same bits."""
+"""A signal in a stage other than training: the state is saved, and the run resumes to the same bits."""
 
 import os
 import re

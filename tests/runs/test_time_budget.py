@@ -1,4 +1,4 @@
-"""A run in a given time: how many steps are chosen, and that the bits are those of its pipeline."""
+"""Runs with a time limit: the chosen number of steps, and the bits of the resulting pipeline."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""A scene in any unit of length gives the same model: the near plane and all other lengths follow the scene."""
+"""A scene in any unit of length gives the same model: the near plane and all other lengths scale with it."""
 
 import json
 from dataclasses import replace

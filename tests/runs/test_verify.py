@@ -1,4 +1,4 @@
-"""`clsplat check RUN`: whatever changes in a run folder is noticed, from its files alone."""
+"""`clsplat check RUN` detects every change in a run folder."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def copy(finished: Path, tmp_path: Path) -> Path:
 
 
 def damaged(out: Path) -> dict[str, str]:
-    """The files that are not whole, and why."""
+    """The damaged files, with reasons."""
     found = clsplat.check(out)
     assert found["whole"] == all(one["whole"] for one in found["objects"])
     return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}

@@ -1,4 +1,4 @@
-"""Cameras written for other programs come back: poses, lenses, distortion, points, the split."""
+"""Cameras written for other programs: round trips of poses, lenses, distortion, points, and the split."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""The reader of COLMAP folders against damaged files and models that make no sense."""
+"""The reader of COLMAP folders on damaged files and invalid models."""
 
 import math
 import struct

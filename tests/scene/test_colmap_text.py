@@ -1,4 +1,4 @@
-"""The text files of COLMAP: dialects, and errors that name the line."""
+"""COLMAP's text files: dialects, and errors with the line."""
 
 from pathlib import Path
 

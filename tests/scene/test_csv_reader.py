@@ -1,4 +1,4 @@
-"""A reader from outside the package: examples/csv_reader.py."""
+"""A plug-in reader: examples/csv_reader.py."""
 
 import importlib.util
 from collections.abc import Iterator

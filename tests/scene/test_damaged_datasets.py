@@ -1,4 +1,4 @@
-"""Datasets with one fault each, given to the command line: a sentence and an exit code, soon and in little memory.
+"""Datasets with one fault each: one sentence and an exit code, quickly and with little memory.
 
 All of them go through one process, which is what bounds its memory.
 """

@@ -1,4 +1,4 @@
-"""What cameras noted of exposures: in JPEG files, and in a file beside images that lost it."""
+"""Exposures from EXIF data, and from a file next to images without EXIF data."""
 
 import json
 import struct
@@ -86,7 +86,7 @@ def test_impossible_exposures_are_ignored(numbers):
 
 
 def test_rotated_image_keeps_its_exposure(tmp_path):
-    """So does its upright copy."""
+    """Its upright copy, too."""
     for number, orientation in enumerate((1, 6, 1)):
         (tmp_path / f"{number}.jpg").write_bytes(with_exposure(iso=100 * (number + 1), orientation=orientation))
     gather(tmp_path, tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])

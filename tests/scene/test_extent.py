@@ -1,4 +1,4 @@
-"""The scale of a scene, which sizes and rates are relative to, and cameras that must not decide it."""
+"""The extent of a scene, and outlier cameras that must not affect it."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def orbit(count=24, radius=3.0):
 
 @pytest.mark.parametrize("distance", [1e2, 1e5, 1e9])
 def test_a_far_camera_does_not_change_the_extent(distance):
-    """Nor, therefore, any learning rate or threshold."""
+    """Learning rates and thresholds follow the extent."""
     healthy = orbit()
     assert camera_extent(views_at([*healthy, (distance, 0, 0)])) == camera_extent(views_at(healthy))
     assert outlier_cameras(views_at([*healthy, (distance, 0, 0)])).tolist() == [False] * 24 + [True]

@@ -1,4 +1,4 @@
-"""The visual hull of silhouettes: known bodies, what no view shows, and photographs without transparency."""
+"""The visual hull of silhouettes: known shapes, unseen regions, and photographs without transparency."""
 
 import shutil
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_one_inconsistent_silhouette_empties_the_hull():
 
 
 def narrow_views() -> list[View]:
-    """Which see half a unit to each side of the origin."""
+    """Views that see half a unit to each side of the origin."""
     camera = Camera(SIZE, SIZE, 450, 450, SIZE / 2, SIZE / 2)
     return [View(view.name, camera, view.world_to_camera) for view in ring()]
 

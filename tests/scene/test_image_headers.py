@@ -1,4 +1,4 @@
-"""Sizes of photographs from their headers, held against the decoder."""
+"""Image sizes from headers, compared with the decoder."""
 
 from pathlib import Path
 

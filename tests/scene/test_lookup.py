@@ -1,4 +1,4 @@
-"""Photographs, masks and models that are not quite where a dataset says, or are called otherwise there."""
+"""Photographs, masks, and models with other paths or names than the dataset says."""
 
 import json
 import logging

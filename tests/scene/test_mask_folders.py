@@ -1,4 +1,4 @@
-"""Masks that something else has made, in a folder of one's own: `scene.masks`."""
+"""Masks in a user's folder: `scene.masks`."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Masks, alpha as mask, turned and undistorted photographs: which pixels count, and that the others do not."""
+"""Masks, alpha as a mask, and rotated or undistorted photographs: which pixels count."""
 
 import json
 import shutil

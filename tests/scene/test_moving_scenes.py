@@ -1,4 +1,4 @@
-"""Scenes that move: the ray-cast one, the readers of times, and what is refused."""
+"""Moving scenes: the ray-cast scene, readers of times, and refusals."""
 
 import shutil
 from dataclasses import replace

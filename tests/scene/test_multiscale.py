@@ -1,4 +1,4 @@
-"""Several scales of each photograph: the dataset on disk, scales made on the way, and the order of views."""
+"""Photographs at several scales: the dataset on disk, scaling on the fly, and the order of views."""
 
 import json
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Where the points begin that photographs show, and the near plane."""
+"""The nearest visible points, and the near plane."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Scenes in world coordinates: one origin in float64, subtracted from all positions and given back in files."""
+"""Scenes in world coordinates: a float64 origin, subtracted from all positions and restored in files."""
 
 import numpy as np
 import pytest

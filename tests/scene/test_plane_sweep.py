@@ -1,4 +1,4 @@
-"""The plane sweep finds surfaces: a textured wall, a ray-cast table, and those that structure from motion found."""
+"""The plane sweep finds surfaces: a textured wall, a ray-cast table, and structure-from-motion points."""
 
 import re
 import shutil

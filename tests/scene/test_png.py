@@ -1,4 +1,4 @@
-"""Metadata of a PNG change no pixel and print no line; a damaged one is named with the place of the fault."""
+"""PNG metadata changes no pixel and prints nothing; damage is reported with its offset."""
 
 import struct
 import zlib

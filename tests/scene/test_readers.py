@@ -1,4 +1,4 @@
-"""The list of dataset readers: shipped ones and those of plug-ins."""
+"""The list of dataset readers: shipped and from plug-ins."""
 
 from collections.abc import Iterator
 from pathlib import Path

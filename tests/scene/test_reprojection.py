@@ -1,4 +1,4 @@
-"""How far points are from where photographs show them: measured, kept, and what follows from it."""
+"""The reprojection error: measurement, storage, and settings that depend on it."""
 
 from dataclasses import replace
 

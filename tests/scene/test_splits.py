@@ -1,4 +1,4 @@
-"""Which photographs a run trains on, chooses by and is tested on, and those that a dataset names and does not have."""
+"""Training, validation, and test views, and photographs that a dataset lists but lacks."""
 
 import json
 import logging

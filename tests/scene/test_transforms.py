@@ -107,7 +107,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
     ],
 )
 def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
-    """Odd ones for each frame, which win against those of all."""
+    """Per-frame values take precedence over shared ones."""
     per_frame = len(values) % 2 == 0
     wrong = dict.fromkeys(values, "overridden")
     table = (

@@ -1,4 +1,4 @@
-"""The time of a view: in [0, 1], kept by all that copies a view, and a part of what a scene is."""
+"""The time of a view: in [0, 1], kept by copies, and part of the scene's identity."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Which way is up in a scene, and what its cameras look at."""
+"""The up direction of a scene, and the point that its cameras look at."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The stage that removes what a model does not need: each rule what it should, all refused, and the bits repeat."""
+"""The stage `cleanup`: the effect of each rule, refusals, and repeated bits."""
 
 import json
 from pathlib import Path

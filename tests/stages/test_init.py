@@ -1,4 +1,4 @@
-"""A second `init` between two trainings starts anew."""
+"""A second `init` between two trainings starts over."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Stages that make a trained model smaller: which Gaussians and which bands go, and that the bits repeat."""
+"""Stages that shrink a trained model: which Gaussians and bands are removed, and repeated bits."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a run's page advises: by figures of views, and by where the cameras stand."""
+"""Advice in the report, from metrics of views and camera positions."""
 
 import math
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Vectors of a palette: the one of each row, at the edges of groups and lanes, and the means of rows that share one."""
+"""Palette vectors: the vector of each row, at the edges of groups and lanes, and means of rows that share one."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Errors of harmonics as the training views show them, against sums over directions, and a palette that shows few."""
+"""Visible errors of harmonics, against sums over directions, and a palette that minimizes them."""
 
 from types import SimpleNamespace
 

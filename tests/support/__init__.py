@@ -1,1 +1,1 @@
-"""What tests and their authors share."""
+"""Helpers for tests and their authors."""

@@ -243,7 +243,7 @@ def limited_value(key: str, value: Any) -> Any:
 
 
 def is_point(item: Any) -> bool:
-    """Whether this is a point of a schedule."""
+    """Return whether a value is a point of a schedule."""
     return isinstance(item, list) and len(item) == 2 and all(type(part) in (int, float) for part in item)
 
 

@@ -1,4 +1,4 @@
-"""Cells of a sweep, and an engine whose cells end as a test wants."""
+"""Cells of a sweep, and an engine whose cells end as specified."""
 
 import os
 from pathlib import Path

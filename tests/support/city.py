@@ -1,4 +1,4 @@
-"""A city of boxes: streets with markings, pavements, houses with windows and roofs, parks; seen from the air."""
+"""A city of boxes from the air: streets, pavements, houses with windows and roofs, and parks."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial

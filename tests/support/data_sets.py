@@ -1,4 +1,4 @@
-"""Where the real datasets lie that some tests read: the folder $CLSPLAT_DATA, or one beside the checkout."""
+"""The folder of real datasets for tests: $CLSPLAT_DATA, or one next to the checkout."""
 
 import os
 from pathlib import Path

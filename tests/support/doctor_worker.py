@@ -1,4 +1,4 @@
-"""Replace the process that checks a device by a script that answers at once, as a test wants."""
+"""Replace the process that checks a device with a script."""
 
 from clsplat.conformance import supervision
 

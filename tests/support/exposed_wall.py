@@ -1,4 +1,4 @@
-"""A wall of squares, photographed with other exposures."""
+"""A wall of squares, photographed with different exposures."""
 
 from pathlib import Path
 

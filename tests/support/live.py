@@ -1,4 +1,4 @@
-"""A run with a live page, and a thread beside it."""
+"""A run with a live page, and a background thread."""
 
 import threading
 from contextlib import contextmanager
@@ -25,7 +25,7 @@ def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
 
 @contextmanager
 def in_background(act):
-    """Run a function in a thread; fail where it fails."""
+    """Run a function in a thread; fail if it fails."""
     faults = []
 
     def guarded():

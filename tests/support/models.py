@@ -1,4 +1,4 @@
-"""Models for tests of formats, and the files of other programs."""
+"""Models for format tests, and files of other programs."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""Plant faults in a copy of the checkout, and see whether the tests notice them.
+"""Plant faults in a copy of the checkout, and check whether tests detect them.
 
     python -m tests.support.mutants --seed 49 --count 40 --out mutants.json
 

@@ -1,4 +1,4 @@
-"""A COLMAP scene whose cameras stand on a circle, and what an inspection says of it."""
+"""A COLMAP scene with cameras on a circle, and the findings of its inspection."""
 
 from pathlib import Path
 
@@ -45,6 +45,6 @@ def photograph(file: Path, size: tuple[int, int] = SIZE) -> None:
 
 
 def finding_text(inspection: Inspection, level: str) -> str:
-    """The one finding of a level."""
+    """The text of the only finding of a level."""
     (text,) = [finding.text for finding in inspection.findings if finding.level == level]
     return text

@@ -1,4 +1,4 @@
-"""A capture of known colors: a ground of squares under a painted sky, before a camera that turns and walks."""
+"""A capture with known colors: a ground of squares under a painted sky, seen by a moving camera."""
 
 from pathlib import Path
 

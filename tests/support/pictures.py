@@ -1,4 +1,4 @@
-"""Image and video files: masked, turned by EXIF, full of corners, decoded."""
+"""Image and video files: masks, EXIF orientation, corners, and decoding."""
 
 import shutil
 import struct
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def blocks(seed: int, width: int, height: int) -> np.ndarray:
-    """A picture full of corners."""
+    """An image full of corners."""
     rng = np.random.default_rng(seed)
     pixels = np.full((height, width, 3), 128, np.uint8)
     for _ in range(width * height // 300):
@@ -49,7 +49,7 @@ def masked_scene(source: Path, out: Path, filling: int) -> Path:
 
 
 def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
-    """A JPEG with an EXIF tag that says how to turn it."""
+    """A JPEG with an EXIF orientation."""
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 100])
     tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
     segment = b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff

@@ -53,7 +53,7 @@ def with_frequent_edits(old: Stage, loop: Optimize, saved: int) -> Optimize:
 
 
 def train(pipeline: Pipeline, out: Path, resume: bool = False) -> str:
-    """Run it; return the hash of its model."""
+    """Train with a recipe; return the hash of its model."""
     run_pipeline(pipeline, RunState.read(out), os.environ.get("CLSPLAT_DEVICE"), "resume" if resume else "new")
     return digest(out)
 

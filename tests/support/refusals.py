@@ -1,4 +1,4 @@
-"""What every refusal of bad input must be: a DataError of one line, at once, without much memory."""
+"""Refusals of bad input: a DataError of one line, quickly and with little memory."""
 
 import time
 import tracemalloc

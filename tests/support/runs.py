@@ -1,4 +1,4 @@
-"""A run of twelve steps, for the tests of checkpoints, of failures and of settings that change."""
+"""A run of twelve steps, for tests of checkpoints, failures, and changed settings."""
 
 import hashlib
 import io

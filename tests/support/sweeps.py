@@ -1,4 +1,4 @@
-"""A small real sweep for the tests of kills, and the processes of one that runs."""
+"""A small real sweep for tests with kills, and its processes."""
 
 import hashlib
 import json
@@ -51,7 +51,7 @@ class Sweep:
         self.file.write_text(f"name: sweep\nmatrix: {json.dumps(axes)}\n{PIPELINE}")
 
     def start(self) -> "subprocess.Popen[str]":
-        """Start the command, also again."""
+        """Start, or restart, the command."""
         words = ["run", str(self.file), "--out", str(self.out), "--resume", "--on", str(self.on)]
         return subprocess.Popen(
             [sys.executable, "-m", "clsplat", *words],
@@ -62,7 +62,7 @@ class Sweep:
         )
 
     def saved(self) -> set[str]:
-        """The checkpoints of all attempts that there are now."""
+        """The current checkpoints of all attempts."""
         return {str(path) for path in self.store.root.glob("cells/*/attempts/*/checkpoints/step_*.npz")}
 
     def events(self, name: str) -> int:
@@ -111,7 +111,7 @@ def _words(process: "psutil.Process") -> list[str]:
 
 
 def kill(processes: "list[psutil.Process]") -> int:
-    """Kill them; return how many were there."""
+    """Kill them; return their number."""
     count = 0
     for one in processes:
         try:

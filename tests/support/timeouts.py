@@ -1,4 +1,4 @@
-"""A test whose code waits for ever fails after some seconds."""
+"""Fail a test that hangs, after some seconds."""
 
 import signal
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A cell that a device does not hold goes to a larger one."""
+"""A cell that does not fit on a device moves to a larger one."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Cells: what names them, how one is run and published once, what stops it, what is removed."""
+"""Cells: keys, running and publishing once, cancellation, and cleanup."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Comparisons of constructed run folders: what is one row, what differs, what is shown, what is refused."""
+"""Comparisons of constructed run folders: rows, differences, output, and refusals."""
 
 import base64
 import html

@@ -1,4 +1,4 @@
-"""Places of files: runs are compared, and cells named, by what their files hold."""
+"""Runs are compared and cells are named by the content of files, not by paths."""
 
 import os
 import shutil

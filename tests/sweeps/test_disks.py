@@ -1,4 +1,4 @@
-"""The disk of a store fills, loses the end of a file, or has two names: every cell is published once, with its bits.
+"""A store's disk is full, truncates a file, or has two mount points: every cell is published once with its bits.
 
 They take a minute, and run where those of kills do; a full disk and two mount points need the right to mount.
 """

@@ -1,4 +1,4 @@
-"""Stores and matrix folders made by somebody else: nothing outside of them is written, and damage is a sentence."""
+"""Untrusted stores and matrix folders: nothing outside is written, and damage is one sentence."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Kills of each process of a sweep: every cell is published once, with the bits of one that was left alone.
+"""Kills of each process of a sweep: every cell is published once, with undisturbed bits.
 
 They take minutes: CLSPLAT_KILLS is the number of kills, over six cells where it is more than two; without it they skip,
 and `test_short_kills.py` is what the suite has of them.

@@ -1,4 +1,4 @@
-"""How the cells of a matrix run: each by itself, none stops the others, and a dry run answers as the run."""
+"""Cells of a matrix run independently, and a dry run agrees with the run."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""The short form of the kills: a run that is killed in its training, and the cell that goes on from its checkpoint."""
+"""A short test of kills: a run is killed during training, and its cell resumes from the checkpoint."""
 
 import hashlib
 from pathlib import Path

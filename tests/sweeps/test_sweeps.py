@@ -1,4 +1,4 @@
-"""Sweeps: a matrix through a store, its folder as without one, and the engines that run its cells."""
+"""Sweeps: a matrix with a store, its folder, and the engines that run its cells."""
 
 import json
 import os
@@ -276,7 +276,7 @@ def test_invalid_worker_option_is_named(given, words):
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
-    """A certificate that has signed itself."""
+    """A self-signed certificate."""
     folder = tmp_path_factory.mktemp("tls")
     if not (openssl := shutil.which("openssl")):
         pytest.skip("needs openssl")

@@ -1,4 +1,4 @@
-"""Compile every kernel for GPUs that are not here, and judge what their compilers say."""
+"""Compile every kernel for GPUs that are not present, and evaluate the output of the compilers."""
 
 import argparse
 import os

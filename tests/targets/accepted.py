@@ -1,4 +1,4 @@
-"""Faults that are known and stay: each is said on the page, and one that is not seen any more is a fault itself."""
+"""Accepted faults: each is listed on the page, and one that no longer occurs is a failure."""
 
 from collections.abc import Iterable
 

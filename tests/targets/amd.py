@@ -1,4 +1,4 @@
-"""AMD's GPUs: clang's code for them, with its own notes about registers, memory and occupancy."""
+"""AMD GPUs: clang's assembly, with its notes on registers, memory, and occupancy."""
 
 import re
 from functools import cache

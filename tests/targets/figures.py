@@ -1,4 +1,4 @@
-"""What a compiler says about a kernel, the limits that it must keep, and two sets of figures compared."""
+"""Compiler statistics of a kernel, their limits, and comparisons of two sets."""
 
 import json
 from dataclasses import asdict, dataclass, field, fields

@@ -1,4 +1,4 @@
-"""NVIDIA's GPUs: clang's PTX, and what ptxas makes of it."""
+"""NVIDIA GPUs: clang's PTX, and the report of ptxas."""
 
 import math
 import re

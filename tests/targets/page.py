@@ -1,4 +1,4 @@
-"""The part of docs/results/compilers.md that the figures make."""
+"""The generated part of docs/results/compilers.md."""
 
 from collections.abc import Iterable, Mapping
 from itertools import zip_longest

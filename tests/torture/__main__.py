@@ -1,4 +1,4 @@
-"""The long form of the tests of what must not be lost: `make torture`, an hour and more on two cores.
+"""The long form of the tests against data loss: `make torture`, more than an hour on two cores.
 
     python -m tests.torture [--kills 1000] [--inputs 100000] [--write]
 

@@ -1,4 +1,4 @@
-"""A kill of the long form, and a kill at the n-th file of a run: resumed, it ends with the same bits."""
+"""A kill at a random time, and at the n-th file of a run: the resumed run has the same bits."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""adam.cl against the oracle, and average.cl with the stages that use it against averages in float64."""
+"""adam.cl against the reference, and average.cl with its stages against float64 averages."""
 
 import numpy as np
 import pytest

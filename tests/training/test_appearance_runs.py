@@ -1,4 +1,4 @@
-"""Whole runs in which photographs have colors of their own."""
+"""Whole runs with a color correction per photograph."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Backgrounds that are drawn for each step of a training."""
+"""Random backgrounds for each training step."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Trainings that leave the model which is best at photographs kept out of them, and what that model is told to be."""
+"""Training that keeps the best model on validation views, and reports about it."""
 
 import json
 import shutil

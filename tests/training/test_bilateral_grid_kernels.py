@@ -1,4 +1,4 @@
-"""The colors of a photograph by place and luminance (color_grid.cl and its tables) against float64, and in a step."""
+"""Bilateral grids (color_grid.cl and its tables) against float64, and in a training step."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Grids of the photographs' colors: their settings, whole runs with them, and what these leave."""
+"""Bilateral grids: settings, whole runs, and outputs."""
 
 import hashlib
 import json

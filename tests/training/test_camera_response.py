@@ -1,4 +1,4 @@
-"""Vignetting and response curves of each camera: the kernel, whole runs, and the same module from outside."""
+"""Vignetting and response curves per camera: the kernel, whole runs, and the same module as a plug-in."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def test_curves_are_monotone_and_go_from_black_to_white(rng):
 
 @pytest.fixture(scope="module")
 def finished(tiny_scene, tmp_path_factory) -> Run:
-    """A finished run of twelve steps; nothing is changed in it."""
+    """A finished run of twelve steps; tests do not modify it."""
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "response", *RESPONSE)
 
 

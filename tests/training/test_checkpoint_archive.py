@@ -1,4 +1,4 @@
-"""The file of a checkpoint: what was written is read, and every damage is noticed."""
+"""Checkpoint files: round trips, and detection of all damage."""
 
 import os
 

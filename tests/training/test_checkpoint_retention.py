@@ -1,4 +1,4 @@
-"""Which checkpoints go when a newer one is saved, and that none which cannot go ends a run."""
+"""Retention of checkpoints: old ones are removed, and files that cannot be removed do not end a run."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Damaged checkpoints are passed over, and a run goes on from a whole one."""
+"""Damaged checkpoints are skipped, and a run resumes from an intact one."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""deferred.cl against the oracle, and against updates at once."""
+"""deferred.cl against the reference, and against immediate updates."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Gaussians that each photograph has for itself: what they do to a step, and that nothing else ever has them."""
+"""Distractors, the private Gaussians of each photograph: their effect on a step, and their absence from outputs."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What reports say about the time that is left, and about the PSNR."""
+"""Progress reports: the remaining time and the PSNR."""
 
 import pytest
 

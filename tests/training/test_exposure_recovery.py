@@ -1,4 +1,4 @@
-"""Known exposures are found again by runs that know nothing of the scene but its points."""
+"""Known exposures are recovered by runs that only know the points of the scene."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Focal lengths that are learned with poses: shared by a camera's photographs, kept, measured, and written."""
+"""Focal lengths learned with poses: shared by the photographs of a camera, saved, measured, and written."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The recipe that asks whether learned cameras are better than those of the dataset."""
+"""The recipe that compares learned cameras with those of the dataset."""
 
 import json
 import re

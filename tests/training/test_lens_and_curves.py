@@ -1,4 +1,4 @@
-"""A training module from outside the package, examples/lens_and_curves.py, by finite differences."""
+"""A plug-in training module, examples/lens_and_curves.py, against finite differences."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The plan of memory: what is counted, what fits, and what is refused."""
+"""The memory plan: its accuracy, its limits, and refusals."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Training modules: what the loop knows of them, their order, and how `--set` addresses them."""
+"""Training modules: independence of the loop, order, and addressing by `--set`."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""A state that is not finite is never a checkpoint, and what the message advises works."""
+"""A non-finite state is never a checkpoint, and the advice in the message works."""
 
 import json
 import re
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def break_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the means not finite in a step."""
+    """Make the means non-finite in a step."""
     train_one = Run.editing_tables
     run_step = {}
 

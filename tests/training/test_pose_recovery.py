@@ -1,4 +1,4 @@
-"""Jittered cameras, and wrong focal lengths, are found again: photographs of a known model from known places."""
+"""Jittered cameras and wrong focal lengths are recovered from photographs of a known model."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Places of cameras: their derivatives, their table, and whole runs in which they are learned."""
+"""Camera poses: derivatives, their table, and whole runs that optimize them."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""metrics.jsonl: a run that was stopped and goes on has the lines of one that was not, each once."""
+"""metrics.jsonl: a resumed run has the same lines as an uninterrupted one, each once."""
 
 import json
 from pathlib import Path

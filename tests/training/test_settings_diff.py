@@ -1,4 +1,4 @@
-"""What may change when a run goes on: a class says it, also one of a plug-in, and nothing else may."""
+"""Settings that may change on resume, as declared by classes, also in plug-ins."""
 
 from typing import ClassVar, Literal
 

@@ -1,4 +1,4 @@
-"""Steps that skip the backward pass where a view has converged: the rule, and what a skipped step leaves as it was."""
+"""Steps that skip the backward pass of converged views: the rule, and the unchanged state."""
 
 import json
 import logging
@@ -43,7 +43,7 @@ def slow_rule(skip: SkipBackward, visits: list[tuple[str, float]]) -> list[bool]
     """Which of the steps after `start` are skipped: every sum from all visits before, again at every step."""
 
     def converged(at: int) -> bool:
-        """Whether the loss of a step is not above the average of its view's earlier ones."""
+        """Return whether the loss of a step is at most the average of earlier losses of its view."""
         view, loss = visits[at]
         earlier = [value for name, value in visits[:at] if name == view]
         ages = range(len(earlier) - 1, -1, -1)
@@ -96,7 +96,7 @@ def test_rule_matches_plain_sums(rng, least, views, noise, decay):
 
 @pytest.mark.parametrize("least", [0.1, 0.9])
 def test_minimum_fraction_of_full_steps_is_respected(least):
-    """Losses that only fall would all be skipped."""
+    """All steps with decreasing losses would be skipped."""
     visits = [(f"view {step % 9}", 1 / (1 + step)) for step in range(2000)]
     found = np.array(decisions(SkipBackward(start=0, warm_up=100, min_fraction=least), visits))
     whole = np.cumsum(~found) / np.arange(1, len(found) + 1)
@@ -160,7 +160,7 @@ def start_run(scene: Path, out: Path, *overrides: str) -> tuple[Run, Iterator[Vi
 
 
 def state(run: Run) -> dict[str, Any]:
-    """All that an update changes."""
+    """Everything that an update changes."""
     gaussians = run.model.gaussians
     tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
     of_filter = run.modules["haar"].scalars if "haar" in run.modules else {}
@@ -214,7 +214,7 @@ def test_failure_after_the_decision_saves_the_previous_step(tiny_scene, tmp_path
 
 
 def test_no_loss_is_read_before_the_start(tiny_scene, tmp_path, monkeypatch):
-    """A value that is read is a wait for the device."""
+    """Reading a value waits for the device."""
     reads, get = Counter(), Array.get
 
     def counted(array: Array) -> Any:

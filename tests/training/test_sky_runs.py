@@ -1,4 +1,4 @@
-"""Whole runs with a sky: a background of directions that is learned."""
+"""Whole runs with a sky, a learned environment map."""
 
 import json
 import shutil
@@ -53,7 +53,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Yard, Path]:
 
 @pytest.fixture(scope="module")
 def sky_run(yard, tmp_path_factory) -> Path:
-    """A run that finds out by itself that there is a sky."""
+    """A run that detects the sky automatically."""
     out = tmp_path_factory.mktemp("runs") / "yard"
     asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
     run_pipeline(asked, RunState.read(out), None, "new")
@@ -172,7 +172,7 @@ def test_decision_is_not_written_as_a_setting():
 
 
 def test_directions_without_visible_sky_are_left_to_gaussians(yard):
-    """The sky begins with the colors of the photographs."""
+    """The sky starts with the colors of the photographs."""
     _, folder = yard
     scene = clsplat.read_scene(folder)
     photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]

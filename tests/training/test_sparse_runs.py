@@ -1,4 +1,4 @@
-"""Whole runs with what holds back a model of few photographs: dropout, and opacities that decay."""
+"""Whole runs with regularization for few photographs: dropout and opacity decay."""
 
 import numpy as np
 import pytest

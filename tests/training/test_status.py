@@ -1,4 +1,4 @@
-"""status.json: every one fits its schema, it has a heartbeat, and it never disturbs a run."""
+"""status.json: its schema, its heartbeat, and no effect on the run."""
 
 import gc
 import json
@@ -51,7 +51,7 @@ def written(monkeypatch, tmp_path):
 
 
 def until(holds) -> None:
-    """Wait for something that another thread does."""
+    """Wait for a condition that another thread fulfills."""
     for _ in range(2000):
         if holds():
             return

@@ -1,4 +1,4 @@
-"""One training step from its parts, as pipelines, benchmarks and notebooks do it; losses in NumPy among the others."""
+"""One training step from its parts, as in pipelines, benchmarks, and notebooks; also with NumPy losses."""
 
 from itertools import islice
 from pathlib import Path
@@ -157,7 +157,7 @@ def test_masked_pixels_have_no_gradient(any_device, rng):
 
 
 def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
-    """L1, as a notebook would write it."""
+    """L1 as a notebook would write it."""
     difference = image - photograph
     return float(np.abs(difference).mean()), np.sign(difference) / difference.size
 

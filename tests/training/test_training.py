@@ -1,4 +1,4 @@
-"""Whole runs on a tiny scene: the loss falls, the bits repeat, a run killed and resumed is the run that was not."""
+"""Whole runs on a tiny scene: the loss decreases, and repeated and resumed runs have the same bits."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Pixels that are left out since their photograph shows what the scene does not have."""
+"""Pixels that are masked because they show transient objects."""
 
 import numpy as np
 import pytest

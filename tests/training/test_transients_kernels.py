@@ -1,4 +1,4 @@
-"""transients.cl: residuals, their numbers by size, and the mask without the large ones."""
+"""transients.cl: residuals, their histogram, and the mask."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The page in a real browser, without a display: what it draws, what its controls do, and that nothing leaves it."""
+"""The page in a headless browser: rendering, controls, and no network access."""
 
 import json
 import re
@@ -84,7 +84,7 @@ def opened(browser, page):
 
 
 def screenshot(browser) -> np.ndarray:
-    """The screen, [H, W, 3]."""
+    """Return the screen, [H, W, 3]."""
     browser.rest()
     return cv2.imdecode(np.frombuffer(browser.picture(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 

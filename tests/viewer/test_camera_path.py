@@ -1,4 +1,4 @@
-"""camera_path.json of nerfstudio: read, moved back; damaged files are refused."""
+"""nerfstudio's camera_path.json: reading, transforming back, and refusal of damaged files."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Charts of pages: what their ticks and legends say, and which curve they draw."""
+"""Charts of pages: ticks, legends, and curves."""
 
 import re
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The stage of pipelines, the command and the function: the same pages, errors in one line."""
+"""The stage, the command, and the function write the same pages, and errors are one line."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Pages of models that move: what they hold, and what a browser draws at a moment."""
+"""Pages of moving models: their contents, and their rendering at a given time."""
 
 from base64 import b64decode
 from dataclasses import replace

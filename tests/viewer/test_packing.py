@@ -1,4 +1,4 @@
-"""A packed model is the model, within the steps of its tables; the same model gives the same bytes."""
+"""A packed model matches the model within its quantization steps; equal models give equal bytes."""
 
 import gzip
 from dataclasses import replace

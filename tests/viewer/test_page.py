@@ -1,4 +1,4 @@
-"""The page as text: escapes, its policy, its size, its photographs, its frame of motion."""
+"""The page as text: escaping, content policy, size, photographs, and motion."""
 
 import base64
 import hashlib

@@ -1,4 +1,4 @@
-"""Pages: every value is escaped, nothing outside of the page is needed, the same input gives the same bytes."""
+"""Pages: escaped values, no external resources, and equal bytes for equal input."""
 
 import ast
 import json

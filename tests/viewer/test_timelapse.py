@@ -1,4 +1,4 @@
-"""A time-lapse while training: the model's bits stay, a run that was killed ends with the same pictures."""
+"""A time-lapse during training: the model's bits do not change, and killed runs resume to the same images."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""Files of video: what they hold, the same bytes twice, and no file where one cannot be made."""
+"""Video files: contents, reproducible bytes, and no partial files."""
 
 import builtins
 import sys

@@ -1,4 +1,4 @@
-"""Camera paths: where they go, which way is up, and what they refuse."""
+"""Camera paths: shape, up direction, and refusals."""
 
 import logging
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Space cut into cells, the views of blocks, and models joined: what holds for any Gaussians."""
+"""Cells, views of blocks, and joined models, for arbitrary Gaussians."""
 
 from pathlib import Path
 

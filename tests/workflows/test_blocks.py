@@ -1,4 +1,4 @@
-"""`clsplat blocks`: a scene is cut, its blocks are trained alone, and together they are the whole."""
+"""`clsplat blocks`: a scene is partitioned, its blocks are trained separately, and merged."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def train(scene: Path, coarse: Path, out: Path, *overrides: str, **options) -> d
 
 @pytest.fixture(scope="module")
 def trained(tiny_scene: Path, few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
-    """A scene in three blocks; nothing is changed in it."""
+    """A scene in three blocks; tests do not modify it."""
     out = tmp_path_factory.mktemp("blocks") / "out"
     return out, train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
 

@@ -1,4 +1,4 @@
-"""`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
+"""`clsplat compress`: targets, the extent of the search, and outputs."""
 
 import json
 import re

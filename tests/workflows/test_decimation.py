@@ -1,4 +1,4 @@
-"""Decimation by merging pairs: against a straight float64 reference, and what it keeps."""
+"""Decimation by merging pairs, against a simple float64 reference, and preserved properties."""
 
 import numpy as np
 import pytest
@@ -115,7 +115,7 @@ def test_same_model_gives_same_bytes_in_any_row_order(rng):
 
 
 def test_coincident_duplicates_merge(rng):
-    """More of them than there are neighbors."""
+    """More of them than the number of neighbors."""
     one = model(rng, 1)
     found = decimate(one[np.zeros(51, int)])
     assert len(found) == 26
@@ -148,7 +148,7 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
 
 
 def test_cheapest_pair_merges_first_and_pairs_are_disjoint():
-    """Three in a row, and two far from them that are equal."""
+    """Three in a row, and two equal ones far away."""
     x = np.array([0, 0.1, 0.35, 9, 9], np.float32)
     tables = {
         "means": np.stack([x, 0 * x, 0 * x], axis=1),

@@ -1,4 +1,4 @@
-"""`clsplat lod`: levels are merged, trained, measured and written, and what cannot be is refused."""
+"""`clsplat lod`: levels are merged, trained, measured, and written; invalid input is refused."""
 
 import json
 import shutil
@@ -105,7 +105,7 @@ def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch)
 
 @pytest.fixture
 def model_file(few_steps: Path, tmp_path: Path) -> Path:
-    """The file of a model whose photographs are not known."""
+    """A model file with unknown photographs."""
     file = tmp_path / "model.ply"
     file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
     return file
@@ -221,7 +221,7 @@ def test_training_does_not_resume_with_other_photographs(few_steps, tiny_scene, 
 
 
 def test_folder_of_levels_is_a_model(trained, tiny_scene, tmp_path):
-    """With a scene of its own, as any model file."""
+    """With a scene, like any model file."""
     found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
     assert found["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
 
