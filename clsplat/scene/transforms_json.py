@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -137,10 +138,23 @@ class FrameFiles(FileLookup):
         Photographs of lenses with distortion are undistorted when they are read.  Raises DataError.
         """
         frame, path, masks = self.frames[i], self.paths[i], [files.get(i) for files in self.masks.values()]
-        size = None if frame.number("w") and frame.number("h") else stored_size(path)
+        size = None
+        if not (frame.number("w") and frame.number("h")):
+            try:
+                size = stored_size(path)
+            except DataError:  # decoding lists all damaged photographs
+                size = self._first_size
         view = view_of(frame, self.names[i], size, clock)
         view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
         return fit_to_photograph(view) if path in self.reduced else view
+
+    @cached_property
+    def _first_size(self) -> tuple[int, int]:
+        """The size of the first photograph that can be read.  Raises DataError when there is none."""
+        for path in self.paths:
+            with suppress(DataError):
+                return stored_size(path)
+        return stored_size(self.paths[0])
 
 
 def _with_png(name: str) -> list[str]:

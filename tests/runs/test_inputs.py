@@ -84,9 +84,8 @@ def test_a_damaged_test_view_stops_a_run_before_its_first_step(scene, tmp_path):
 
 def test_one_message_lists_all_damaged_files(scene, tmp_path):
     train_views = read_scene(scene).split("train")
-    for view in train_views[1:6]:
+    for view in train_views[1:7]:
         view.image_path.write_bytes(b"nothing")
-    cv2.imwrite(str(train_views[6].image_path), np.zeros((30, 40, 3), np.uint8))
     with pytest.raises(DataError) as error:
         opening.open_run(load("smoke", [f"scene.path='{scene}'"]), tmp_path / "run", None)
     text = str(error.value)
@@ -97,11 +96,11 @@ def test_one_message_lists_all_damaged_files(scene, tmp_path):
 
 
 def test_image_of_another_size_is_found_in_the_same_pass(scene):
-    view = views(scene)[3]
-    cv2.imwrite(str(view.image_path), np.zeros((30, 40, 3), np.uint8))
-    files = decode_all(views(scene))
-    assert "the image is 40x30 pixels, its camera 40x40; expected the same size" in files[view.image_path].fault
-    assert [found.fault for file, found in files.items() if file != view.image_path] == [""] * 9
+    views = read_scene(scene).views
+    cv2.imwrite(str(views[3].image_path), np.zeros((30, 40, 3), np.uint8))
+    files = decode_all(views)
+    assert "the image is 40x30 pixels, its camera 40x40; expected the same size" in files[views[3].image_path].fault
+    assert [found.fault for file, found in files.items() if file != views[3].image_path] == [""] * 9
 
 
 def test_masks_are_decoded_too(tmp_path):
