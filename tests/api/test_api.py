@@ -116,12 +116,12 @@ def test_view_looking_at_a_point_centers_it_with_up_upwards(rng):
         (([0, 0], [0, 0, 5], [0, 1, 0]), "of 3 numbers each"),
     ],
 )
-def test_a_view_without_a_direction_is_refused(place, message):
+def test_view_without_a_direction_is_refused(place, message):
     with pytest.raises(ValueError, match=f"^'view': .*{message}"):
         clsplat.View.looking_at(*place, CAMERA)
 
 
-def test_a_pose_of_another_shape_is_refused():
+def test_pose_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"the pose of 'front' has shape \(4, 4\); expected \(3, 4\)"):
         clsplat.View("front", CAMERA, np.eye(4))
     assert clsplat.View("front", CAMERA, np.eye(4)[:3].tolist()).position.shape == (3,)

@@ -45,7 +45,7 @@ def without_times(text: bytes | str) -> str:
     return re.sub(r'"(train_seconds|cpu_seconds|ms)": [\d.e-]+|"(stages|seconds)": \{[^}]*\}', "", text)
 
 
-def test_a_run(runs):
+def test_run(runs):
     by_command, by_function = map(contents, runs)
     assert by_command.keys() == by_function.keys()
     exact = [name for name in by_command if name.endswith((".ply", ".png", "pipeline.yaml"))]

@@ -92,7 +92,7 @@ def test_table_changed_in_place_before_backward_is_refused(device, rng):
         image.sum().backward()
 
 
-def test_a_second_derivative_is_refused(device, rng):
+def test_second_derivative_is_refused(device, rng):
     case = random_case(rng, 5, *SIZE)
     parameters = parameters_of(model_of(case))
     image, _ = clsplat.torch.render(Renderer(model_of(case), device), case.view, parameters)
@@ -119,7 +119,7 @@ def test_moving_model_is_refused_but_not_its_snapshot(device, rng):
     clsplat.torch.render(Renderer(model.at(0.5), device), case.view, parameters_of(model.at(0.5)))
 
 
-def test_a_missing_table_and_a_wrong_shape_are_refused(device, rng):
+def test_missing_table_and_a_wrong_shape_are_refused(device, rng):
     case = random_case(rng, 5, *SIZE)
     renderer, parameters = Renderer(model_of(case), device), parameters_of(model_of(case))
     with pytest.raises(ValueError, match=r"quats has shape \(5, 3\); expected \(5, 4\)"):

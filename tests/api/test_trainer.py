@@ -110,7 +110,7 @@ def test_trainer_resumes_its_checkpoint_or_the_commands(tiny_scene, tmp_path):
     assert equal(after_command.model, whole.model)
 
 
-def test_a_temporary_folder_goes_away_with_its_trainer(tiny_scene):
+def test_temporary_folder_goes_away_with_its_trainer(tiny_scene):
     trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 3})
     trainer.run(2)
     folder = trainer.out

@@ -170,7 +170,7 @@ def test_pipelines_prints_keys_in_set_notation():
     assert found["stages"][:2] == ["init", "optimize"]
 
 
-def test_a_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
+def test_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
     clsplat("pipelines", "smoke", "--copy", tmp_path / "mine.yaml")
     assert (tmp_path / "mine.yaml").read_text() == shipped()["smoke"].read_text()
     (tmp_path / "mine.yaml").write_text("mine")
@@ -180,7 +180,7 @@ def test_a_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
     assert copy("smoke", tmp_path) == tmp_path / "smoke.yaml"
 
 
-def test_a_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
+def test_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
     measured = json.loads(clsplat("evaluate", finished, "--json").stdout)
     assert measured["test"]["2"] == json.loads((finished / "metrics.json").read_text())["test"]["2"]
     assert list(measured["test"]) == ["2"], "the run's own downscale"

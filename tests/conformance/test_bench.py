@@ -93,7 +93,7 @@ def test_measurement_is_read_without_its_baseline(tmp_path):
         (measurement(scenes={"A": {"stages": {}}}), "scenes.A.host"),
     ],
 )
-def test_an_invalid_measurement_is_refused_with_its_key(data, place, tmp_path):
+def test_invalid_measurement_is_refused_with_its_key(data, place, tmp_path):
     (tmp_path / "x.json").write_text(json.dumps(data))
     with pytest.raises(ConfigError, match=rf"x\.json: {place}: .*expected the JSON of an earlier"):
         read_measurement(tmp_path / "x.json", "splat")
@@ -107,7 +107,7 @@ def test_another_device_is_named():
     assert "  on another device: 'a chip'" in compare_conditions(measurement(device="another"), measurement())
 
 
-def test_a_slower_machine_is_reported():
+def test_slower_machine_is_reported():
     slower = measurement(peaks={**PEAKS, "gflops": 45.0})
     changes = "0.75 of its GFLOP/s, 1.00 of its Gexp/s, 1.00 of its GB/s"
     assert changes in "".join(compare_conditions(slower, measurement()))
@@ -119,7 +119,7 @@ def test_unmeasured_scene_is_reported():
     )
 
 
-def test_a_table_in_text_is_plain_and_never_cut(monkeypatch):
+def test_table_in_text_is_plain_and_never_cut(monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     monkeypatch.setenv("FORCE_COLOR", "1")
     long = "a long name [bold]of[/bold] a scene" * 20
@@ -131,7 +131,7 @@ def test_a_table_in_text_is_plain_and_never_cut(monkeypatch):
     assert text_table([]) == ""
 
 
-def test_the_table_of_a_scene_has_a_row_for_each_stage():
+def test_table_of_a_scene_has_a_row_for_each_stage():
     result = BenchResult(
         work=Work(gaussians=1000, pairs=2000, rows=3, pixels=4),
         stages={"project": 1.2, "blend": 30.0},

@@ -33,7 +33,7 @@ def cases() -> list[Any]:
 
 @pytest.mark.usefixtures("cache_references")
 @pytest.mark.parametrize(("device", "check"), cases(), indirect=["device"])
-def test_a_check_passes(device, check):
+def test_check_passes(device, check):
     found = list(check.deviations(device))
     assert_within_bounds(one for one in found if not isinstance(one, Note))
     out, lines = io.StringIO(), queue.Queue()

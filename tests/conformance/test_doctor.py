@@ -123,7 +123,7 @@ def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, inf
     assert [(one.fault, one.out_of_memory) for one in results] == [("opening it: no memory", True)] * 2
 
 
-def test_a_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
+def test_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
     worker(monkeypatch)
     results = list(run_checks(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
     assert [one.passes for one in results] == [True, True, True, True, False, False], (
@@ -169,7 +169,7 @@ def within(seconds: float, condition) -> bool:
     return bool(condition())
 
 
-def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path, empty_cache):
+def test_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path, empty_cache):
     for name in ("json.py", "hashlib.py"):
         (tmp_path / name).write_text("raise RuntimeError('of the user')")
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
@@ -334,5 +334,5 @@ PHILOX = (  # of the paper's own test vectors: counter, key, words
 
 
 @pytest.mark.parametrize(("counter", "key", "words"), PHILOX)
-def test_the_random_numbers_of_the_reference_are_philox(counter, key, words):
+def test_random_numbers_of_the_reference_are_philox(counter, key, words):
     assert reference.philox(counter, key) == words

@@ -103,6 +103,6 @@ def test_invalid_grid_is_refused(keys, complaint):
         GridShape(**keys)
 
 
-def test_a_network_without_any_position_is_refused():
+def test_network_without_any_position_is_refused():
     with pytest.raises(ValidationError, match="read no position"):
         FieldShape(degrees=0)

@@ -303,7 +303,7 @@ def first_failure(device: Device, planted: str, checks: list[Check]) -> str | No
 
 
 @pytest.mark.parametrize("planted", [*FAULTS, *MORE, *OPTIONAL])
-def test_a_planted_fault_is_caught(monkeypatch, planted):
+def test_planted_fault_is_caught(monkeypatch, planted):
     """The source is changed in memory only."""
     file, text, wrong = {**FAULTS, **MORE, **OPTIONAL}[planted]
     assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"

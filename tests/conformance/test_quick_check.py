@@ -150,7 +150,7 @@ def test_cache_path_does_not_change_the_record(monkeypatch, info, tmp_path):
     assert quick._record(info, "wide", "radix") == before
 
 
-def test_a_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):
+def test_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):
     device = Device(info)
     quick.remember(info, device.schedule)
     quick.ensure_correct(device)

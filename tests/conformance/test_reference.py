@@ -742,7 +742,7 @@ def test_gradients_of_a_layer_before_an_image(rng):
     assert relative_error(ref.layer_cover(left, 0.3)[1], numeric) < FD_TOLERANCE
 
 
-def test_a_sky_has_no_seam(rng):
+def test_sky_has_no_seam(rng):
     """Neighboring directions have neighboring colors everywhere, and a color of all texels is that of the sky."""
     texels, directions = rng.random((9, 9, 3)), rng.normal(size=(40, 50, 3))
     directions[:10, :, 0] = 0  # where octants meet

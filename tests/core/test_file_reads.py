@@ -117,7 +117,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_pipe_is_refused_at_once(name, pipe):
+def test_pipe_is_refused_at_once(name, pipe):
     read, kind = READERS[name]
     with failing("the reader waits", seconds=20), pytest.raises(kind, match="it is a pipe"):
         read(pipe)

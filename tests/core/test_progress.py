@@ -136,7 +136,7 @@ def text_of(bar: "terminal._RunBar") -> str:
     return bar.__rich__().tasks[0].description
 
 
-def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
+def test_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
     status, now = StatusFile(tmp_path), [100.0]
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     bar = terminal._RunBar(status)

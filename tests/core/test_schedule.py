@@ -36,12 +36,12 @@ def test_step_value_holds_until_the_next():
 
 
 @pytest.mark.parametrize("between", ["linear", "steps"])
-def test_a_single_point_is_a_constant(between):
+def test_single_point_is_a_constant(between):
     schedule = {"points": [[10, 0.7]], "between": between}
     assert [value_of(schedule, step) for step in (0, 10, 11, 500)] == [0.7] * 4
 
 
-def test_a_decay_is_exponential_between_its_start_and_its_end():
+def test_decay_is_exponential_between_its_start_and_its_end():
     shares = {0: 0.0, 49: 0.0, 50: 0.0, 51: 0.01, 100: 0.5, 149: 0.99, 150: 1.0, 9999: 1.0}
     expected = [10 ** (-2 - 2 * share) for share in shares.values()]
     assert [value_of(DECAY, step) for step in shares] == pytest.approx(expected, rel=1e-12)
@@ -53,7 +53,7 @@ def test_periodic_value_is_0_at_other_steps():
     assert min(curve.values) == 0
 
 
-def test_a_decay_begins_at_once_and_may_grow():
+def test_decay_begins_at_once_and_may_grow():
     growing = {"initial": 1.0, "final": 100.0, "over": 4}
     assert [value_of(growing, step) for step in range(6)] == pytest.approx(
         [1, 10**0.5, 10, 10**1.5, 100, 100], rel=1e-12
@@ -206,6 +206,6 @@ def test_weights_may_be_negative(recipe):
         load(recipe(**{place: "[[0, -1.0], [10, 2.0]]"}))
 
 
-def test_a_decay_has_no_rounding_at_its_ends():
+def test_decay_has_no_rounding_at_its_ends():
     assert math.isclose(value_of(DECAY, 0), 1e-2, rel_tol=1e-15)
     assert math.isclose(value_of(DECAY, 150), 1e-4, rel_tol=1e-14)

@@ -62,7 +62,7 @@ def test_variants_are_the_subclasses_with_a_name():
 
 
 @pytest.mark.usefixtures("forget_variants")
-def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
+def test_variant_defined_later_is_known_after_a_rebuild(loaded):
     class Thin(Rule):
         """Remove every n-th Gaussian."""
 

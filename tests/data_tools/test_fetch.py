@@ -113,7 +113,7 @@ def test_partial_download_is_kept_after_retries(web, tmp_path):
     assert server.asked[-1] == "bytes=5000-"
 
 
-def test_a_wrong_checksum(web, tmp_path):
+def test_wrong_checksum(web, tmp_path):
     folder, address, _ = web
     archive(folder / "d.zip")
     message = refusal(quietly, WebArchive(f"{address}/d.zip", "free", "0" * 64), tmp_path / "d")

@@ -93,7 +93,7 @@ def test_normals_point_at_the_camera_and_have_length_one(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
-def test_a_surface_point_projects_onto_the_pixel_that_sees_it(dataset: Path, split: str) -> None:
+def test_surface_point_projects_onto_the_pixel_that_sees_it(dataset: Path, split: str) -> None:
     point = np.array([-0.12, 0.14, 0.72])  # the top of the globe: nothing is higher, so every camera sees it
     for pose, focal, image in frames(dataset, split):
         right, up, backward = np.linalg.inv(pose)[:3] @ [*point, 1]

@@ -134,7 +134,7 @@ def test_children_follow_their_parents_distribution(device, rng):
 
 
 @on_one_setting
-def test_random_numbers_depend_on_seed_and_step_alone(device, rng):
+def test_random_numbers_depend_only_on_seed_and_step(device, rng):
     seed_state = rng.bit_generator.state
     results = []
     for step in (600, 600, 700):

@@ -37,7 +37,7 @@ def edits_seen(without_plugins):
 
 
 @pytest.mark.usefixtures("edits_seen")
-def test_a_table_of_a_rule_returns_on_resume(tiny_scene, tmp_path):
+def test_table_of_a_rule_returns_on_resume(tiny_scene, tmp_path):
     whole = train(tiny_scene, tmp_path / "whole", *SETTINGS)
     assert sum(record["causes"].get("edits_seen", 0) for record in whole.records.read("densify")) > 0
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *SETTINGS])

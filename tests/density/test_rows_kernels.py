@@ -126,7 +126,9 @@ def test_edit_with_more_rows_than_32_bits_changes_nothing(device, rng):
     before = {table: gaussians[table].get() for table in gaussians.tables}
     edit = edit_of(gaussians)
     edit.choose(np.ones(COUNT, bool), 2**32 // COUNT + 1, 1)
-    with pytest.raises(MemoryLimitError, match="step 600: the rules would create more than 4,294,967,294 Gaussians; set"):
+    with pytest.raises(
+        MemoryLimitError, match="step 600: the rules would create more than 4,294,967,294 Gaussians; set"
+    ):
         apply_edit(edit, Tiler(device, Workspace(device)))
     assert gaussians.count == COUNT
     for table, planes in before.items():
@@ -215,7 +217,7 @@ class Relocate(Rule):
 
 
 @on_one_setting
-def test_a_relocation_keeps_the_number_of_gaussians(device, rng):
+def test_relocation_keeps_the_number_of_gaussians(device, rng):
     """Copies have their source's place and its new opacity; sources forget their moments, bystanders do not."""
     gaussians = gaussians_of(device, rng)
     before = {name: gaussians.get(name) for name in gaussians.tables}

@@ -205,7 +205,7 @@ def test_invalid_option_is_refused_before_writing(option, text, source, tmp_path
         ("b.spz", {"quality": "best"}, "--quality 'best': expected one of small, balanced, high"),
     ],
 )
-def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_path):
+def test_option_without_meaning_is_refused(name, options, words, source, tmp_path):
     with pytest.raises(ConfigError, match=words):
         clsplat.convert(source, tmp_path / name, **options)
     assert not (tmp_path / name).exists()
@@ -426,7 +426,7 @@ stages:
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog"])
-def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng, caplog):
+def test_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng, caplog):
     caplog.set_level("INFO")
     out = tmp_path / "run"
     write(tmp_path / name, splats(rng, 40, 1))
@@ -441,7 +441,7 @@ def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path
     assert clsplat.render_views(out / name, tiny_scene, tmp_path / "views") == 2
 
 
-def test_a_folder_of_images_is_a_model(source, tmp_path):
+def test_folder_of_images_is_a_model(source, tmp_path):
     clsplat.convert(source, tmp_path / "f" / "meta.json", sh_degree=0)
     assert clsplat.check(tmp_path / "f")["format"] == "SOG"
     assert len(read(tmp_path / "f")) == 100
@@ -475,7 +475,7 @@ def test_infinite_opacities_and_flat_scales_are_limits(tmp_path, rng, caplog):
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 4
 
 
-def test_an_empty_result_is_an_error(tmp_path, rng):
+def test_empty_result_is_an_error(tmp_path, rng):
     one = splats(rng, 6, 0)
     write(tmp_path / "a.ply", one.rows(slice(0)))
     one.parameters["means"][:] = np.nan
@@ -486,7 +486,7 @@ def test_an_empty_result_is_an_error(tmp_path, rng):
     assert not (tmp_path / "c.ply").exists()
 
 
-def test_what_looks_like_a_model_is_no_pipeline(tmp_path, rng):
+def test_model_file_is_refused_as_a_pipeline(tmp_path, rng):
     write(tmp_path / "meta.json", splats(rng, 6, 0))
     (tmp_path / "meta.json").rename(tmp_path / "Scene.JSON")
     assert clsplat.check(tmp_path / "Scene.JSON")["format"] == "SOG"

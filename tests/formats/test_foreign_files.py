@@ -150,7 +150,7 @@ def test_values_are_those_of_the_golden_files():
 
 
 @pytest.mark.parametrize("ending", ["glb", "gltf"])
-def test_the_khr_matrix_has_its_values_in_each_number_type(ending):
+def test_khr_matrix_has_its_values_in_each_number_type(ending):
     """Fifteen parts; all but one have linear colors."""
     found = outcomes()[data_set("splats") / "khr" / f"khr_conformance_matrix.{ending}"]
     assert isinstance(found, SplatFile)

@@ -122,7 +122,7 @@ def test_zero_rotation_is_refused(rotation, tmp_path, rng):
 
 
 @pytest.mark.parametrize("scale", [[1, 2, 1], [-1, 1, 1], [0, 0, 0]])
-def test_a_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
+def test_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
     _, other = moved(tmp_path, rng, scale=scale)
     with pytest.raises(DataError, match="the transform of a node is not supported"):
         load(other)
@@ -188,7 +188,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("fault", REFUSED)
-def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
+def test_damaged_glb_is_refused(fault, tmp_path, rng):
     changed, words = REFUSED[fault]
     write_glb(tmp_path / "a.glb", splats(rng, 4, 0), Writing())
     tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
@@ -267,7 +267,7 @@ def test_openusd_holds_every_number(tmp_path, rng):
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.spz", "a.sog", "a.splat", "a.ply"])
-def test_the_same_model_gives_the_same_bytes(name, tmp_path, rng):
+def test_same_model_gives_the_same_bytes(name, tmp_path, rng):
     source = splats(rng, 300, 3, "mip")
     sums = [write(tmp_path / folder / name, source) for folder in ("a", "b")]
     assert sums == [sha256(tmp_path / folder / name) for folder in ("a", "b")]
@@ -319,7 +319,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.parametrize("where", ["data:application/octet-stream;base64,", "a%20b/c.bin"])
-def test_a_gltf_is_its_glb_twin(where, tmp_path, rng):
+def test_gltf_is_its_glb_twin(where, tmp_path, rng):
     _, tree, binary = parted(tmp_path, rng)
     if where.startswith("data"):
         where += base64.b64encode(binary).decode()
@@ -335,7 +335,7 @@ def test_a_gltf_is_its_glb_twin(where, tmp_path, rng):
 
 
 @pytest.mark.parametrize("uri", ["../c.bin", "%2e%2e/c.bin", "/etc/hostname", "file:///etc/hostname", 7, "data:,abc"])
-def test_a_buffer_outside_of_the_folder_is_refused(uri, tmp_path, rng):
+def test_buffer_outside_of_the_folder_is_refused(uri, tmp_path, rng):
     _, tree, binary = parted(tmp_path, rng)
     (tmp_path / "c.bin").write_bytes(binary)
     (tmp_path / "d").mkdir()
@@ -346,7 +346,7 @@ def test_a_buffer_outside_of_the_folder_is_refused(uri, tmp_path, rng):
 
 
 @pytest.mark.parametrize("quantity", ["SCALE", "OPACITY"])
-def test_logarithms_and_logits_are_read_as_such(quantity, tmp_path, rng, caplog):
+def test_logarithms_and_logits_are_recognized(quantity, tmp_path, rng, caplog):
     source, tree, binary = parted(tmp_path, rng)
     view = tree["bufferViews"][tree["meshes"][0]["primitives"][0]["attributes"][f"{KHR}:{quantity}"]]
     name = {"SCALE": "log_scales", "OPACITY": "logit_opacity"}[quantity]
@@ -404,7 +404,7 @@ def test_parts_of_other_degrees_and_transforms_are_joined(tmp_path, rng):
         assert not found.sh_rest[:, width:].any()
 
 
-def test_an_spz_in_a_glb_has_the_axes_that_its_bounds_show(tmp_path, rng):
+def test_spz_in_a_glb_has_the_axes_that_its_bounds_show(tmp_path, rng):
     """Its axes are x left, y up, z front; some programs keep those of SPZ."""
     write(tmp_path / "a.spz", splats(rng, 30, 1, "mip"))
     data, plain = (tmp_path / "a.spz").read_bytes(), read(tmp_path / "a.spz")

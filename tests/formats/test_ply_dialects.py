@@ -47,7 +47,7 @@ def test_disc_gets_a_tiny_third_axis(tmp_path, rng):
     np.testing.assert_array_equal(found["quats"], source["quats"])
 
 
-def test_the_published_bytes_of_a_compressed_ply(rng):
+def test_published_bytes_of_a_compressed_ply(rng):
     """Values worked out by hand from the first splat of a file that splat-transform wrote."""
     path = interop("train1000.compressed.ply")
     assert detect(path).name == "compressed PLY"
@@ -72,7 +72,7 @@ def test_compressed_ply_of_another_program_equals_its_source(name, rows):
     assert np.median(difference) < 0.01
 
 
-def test_a_compressed_ply_without_ranges_of_colors(tmp_path):
+def test_compressed_ply_without_ranges_of_colors(tmp_path):
     header, body = packed()
     for end in ("min", "max"):
         for color in "rgb":
@@ -103,7 +103,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
-def test_a_damaged_compressed_ply_is_refused(fault, tmp_path):
+def test_damaged_compressed_ply_is_refused(fault, tmp_path):
     change, words = BROKEN[fault]
     (tmp_path / "b.ply").write_bytes(b"end_header\n".join(change(*packed())))
     with pytest.raises(DataError, match=words):
@@ -111,7 +111,7 @@ def test_a_damaged_compressed_ply_is_refused(fault, tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_an_ascii_ply_is_its_binary_twin(degree, tmp_path, rng):
+def test_ascii_ply_is_its_binary_twin(degree, tmp_path, rng):
     write(tmp_path / "a.ply", splats(rng, 20, degree, "mip"))
     text = as_text((tmp_path / "a.ply").read_bytes())
     for name, content in (("b.ply", text), ("c.ply", text.replace(b"\n", b"\r\n"))):

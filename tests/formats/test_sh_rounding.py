@@ -114,7 +114,7 @@ def test_sky_is_recognized_in_a_converted_ply(rng, tmp_path):
         assert load(tmp_path / "a.ply").save(tmp_path / name) == baked.save(tmp_path / f"direct_{name}")
 
 
-def test_without_a_gap_all_gaussians_count(rng):
+def test_all_gaussians_count_without_a_gap(rng):
     for power in (1, 2, 4):
         assert before_gap(rng.uniform(0, 1, 2000) ** power).all()
     few = np.append(rng.uniform(0, 1, 980), rng.uniform(40, 50, 20))

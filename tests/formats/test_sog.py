@@ -25,7 +25,7 @@ from tests.support.data_sets import data_set
 from tests.support.models import assert_close, interop, round_trip, splats
 
 
-def test_the_published_bytes_of_a_sog():
+def test_published_bytes_of_a_sog():
     path = interop("train1000.sog")
     assert detect(path).name == "SOG"
     found = {name: table[0] for name, table in read(path).parameters.items()}
@@ -192,7 +192,7 @@ def test_palette_does_not_depend_on_the_thread_count(rng):
     np.testing.assert_array_equal(before[1], after[1])
 
 
-def test_a_transparent_splat_keeps_its_color(tmp_path, rng):
+def test_transparent_splat_keeps_its_color(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
     found = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
@@ -235,7 +235,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("fault", REFUSED)
-def test_a_damaged_meta_is_refused(fault, tmp_path, rng):
+def test_damaged_meta_is_refused(fault, tmp_path, rng):
     changes, words = REFUSED[fault]
     with pytest.raises(DataError, match=words):
         read(folder_of(tmp_path, rng, **changes))
@@ -259,7 +259,7 @@ def test_image_of_another_size_is_refused_before_decoding(tmp_path, rng):
             read(folder)
 
 
-def test_a_damaged_bundle_is_refused(tmp_path, rng):
+def test_damaged_bundle_is_refused(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 1))
     data = path.read_bytes()

@@ -21,7 +21,7 @@ def by_size(source):
     return source.rows(np.argsort(-size, kind="stable"))
 
 
-def test_the_published_bytes_of_a_splat(tmp_path):
+def test_published_bytes_of_a_splat(tmp_path):
     (tmp_path / "a").write_bytes(PUBLISHED)
     assert detect(tmp_path / "a").name == "splat", "by content, for the name says nothing"
     found = {name: table[0] for name, table in read(tmp_path / "a").parameters.items()}
@@ -70,7 +70,7 @@ def test_text_of_numbers_is_not_a_splat(tmp_path):
 @pytest.mark.parametrize(
     ("data", "words"), [(PUBLISHED[:-1], "31 bytes, not a multiple of 32"), (b"\xff" * 64, "finite")]
 )
-def test_a_damaged_splat_is_refused(data, words, tmp_path):
+def test_damaged_splat_is_refused(data, words, tmp_path):
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(DataError, match=words):
         read(tmp_path / "a.splat")
@@ -107,7 +107,7 @@ def test_ksplat_of_another_program_equals_its_source(level):
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_a_larger_ksplat_has_buckets(level):
+def test_larger_ksplat_has_buckets(level):
     found = read(interop(f"playbot31k.{level}.ksplat"))
     source = read(interop("playbot31k.ply"))
     assert len(found) == len(source)
@@ -133,14 +133,14 @@ DAMAGED = {
 }
 
 
-def test_a_ksplat_without_a_count_of_sections_has_all_its_places(tmp_path):
+def test_ksplat_without_a_section_count_has_all_sections(tmp_path):
     (tmp_path / "a.ksplat").write_bytes(ksplat(sections=0))
     assert len(read(tmp_path / "a.ksplat")) == 3
     (tmp_path / "a.ksplat").write_bytes(ksplat(count=0, sections=0)[:4096])
     assert len(read(tmp_path / "a.ksplat")) == 0
 
 
-def test_a_splat_is_recognized_unless_the_name_is_of_another(tmp_path):
+def test_splat_is_recognized_unless_the_name_is_of_another(tmp_path):
     for name in ("a", "a.bin", "a.splat"):
         (tmp_path / name).write_bytes(PUBLISHED * 40)
         assert len(read(tmp_path / name)) == 40
@@ -150,13 +150,13 @@ def test_a_splat_is_recognized_unless_the_name_is_of_another(tmp_path):
 
 
 @pytest.mark.parametrize("fault", DAMAGED)
-def test_a_damaged_ksplat_is_refused(fault, tmp_path):
+def test_damaged_ksplat_is_refused(fault, tmp_path):
     change, words = DAMAGED[fault]
     (tmp_path / "a.ksplat").write_bytes(ksplat(**change))
     with pytest.raises(DataError, match=words):
         read(tmp_path / "a.ksplat")
 
 
-def test_a_ksplat_is_not_written(tmp_path, rng):
+def test_ksplat_is_not_written(tmp_path, rng):
     with pytest.raises(ConfigError, match=r"ksplat can be read but not written; give a name that ends in .ply, "):
         write(tmp_path / "a.ksplat", splats(rng, 3))

@@ -31,7 +31,7 @@ def version_4(path, source, **more):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_the_published_bytes_of_an_spz(version):
+def test_published_bytes_of_an_spz(version):
     """Positions as the file has them, up and back; then as a PLY has them, whose order it keeps."""
     path = interop(f"train1000.v{version}.spz")
     assert detect(path).name == "SPZ"
@@ -198,7 +198,7 @@ def test_declared_axes_are_turned_to_those_of_a_ply(tmp_path, caplog):
         np.testing.assert_allclose(matrix @ before @ matrix.T, after, atol=1e-5 * before.max())
 
 
-def test_a_plain_file_of_an_old_version_is_read(tmp_path):
+def test_plain_file_of_an_old_version_is_read(tmp_path):
     (tmp_path / "a.spz").write_bytes(legacy(2))
     (tmp_path / "b.spz").write_bytes(gzip.compress(legacy(2)))
     for name, table in read(tmp_path / "a.spz").parameters.items():
@@ -255,7 +255,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("fault", REFUSED)
-def test_a_damaged_spz_is_refused(fault, tmp_path):
+def test_damaged_spz_is_refused(fault, tmp_path):
     data, words = REFUSED[fault]
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(DataError, match=words):

@@ -126,7 +126,7 @@ def test_boxes_match_splat_transform(tmp_path):
     np.testing.assert_allclose(bound["max"], BOUND[1], rtol=1e-6)
 
 
-def test_the_same_levels_give_the_same_bytes(written, tmp_path, rng):
+def test_same_levels_give_the_same_bytes(written, tmp_path, rng):
     folder, made = written
     assert write_lod(tmp_path / "again", made, Writing(quality="high"), SMALL)
     files = {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
@@ -158,7 +158,7 @@ def test_folder_appears_only_when_complete(tmp_path, rng, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_in_use_is_refused(tmp_path, monkeypatch):
+def test_folder_in_use_is_refused(tmp_path, monkeypatch):
     for name in ("used/inner", "here", "empty"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "file").write_text("mine")
@@ -204,7 +204,7 @@ def test_folders_of_killed_processes_are_removed_first(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "site", "site.2"])
 
 
-def test_an_empty_level_is_refused(written, tmp_path):
+def test_empty_level_is_refused(written, tmp_path):
     _, made = written
     with pytest.raises(DataError, match="has no Gaussians"):
         write_lod(tmp_path / "b", [made[0], made[1].rows([])])
@@ -227,7 +227,7 @@ def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
     assert not (tmp_path / "b").exists()
 
 
-def test_an_environment_is_part_of_the_model(written, rng):
+def test_environment_is_part_of_the_model(written, rng):
     folder, _ = written
     write(folder / "env" / "meta.json", splats(rng, 20, 2))
     meta = json.loads((folder / "lod-meta.json").read_text())

@@ -29,7 +29,7 @@ def seeds(folder):
     return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]
 
 
-def test_a_damaged_path_is_read_or_refused(seeds, folder):
+def test_damaged_path_is_read_or_refused(seeds, folder):
     @fuzzed(80, data=damaged(seeds, WORDS))
     def reads(data):
         (folder / "b.json").write_bytes(data)
@@ -43,7 +43,7 @@ def test_a_damaged_path_is_read_or_refused(seeds, folder):
     reads()
 
 
-def test_a_damaged_move_is_read_or_refused(seeds, folder):
+def test_damaged_move_is_read_or_refused(seeds, folder):
     (folder / "own").mkdir()
     (folder / "own" / "a.json").write_bytes(seeds[2])
 

@@ -95,7 +95,7 @@ def test_every_reader_is_fuzzed():
 
 
 @pytest.mark.parametrize("name", [*NAMES, "ksplat"])
-def test_a_damaged_model_is_read_or_refused(name, folder: Path):
+def test_damaged_model_is_read_or_refused(name, folder: Path):
     path = folder / NAMES.get(name, "a.ksplat")
 
     @fuzzed(30, data=damaged(seeds(name, folder), WORDS.get(name, ())))
@@ -134,7 +134,7 @@ def test_damaged_sog_member_is_read_or_refused(folder: Path):
     reads()
 
 
-def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
+def test_damaged_tree_of_levels_is_read_or_refused(folder: Path):
     """The parts are whole; their lod-meta.json is not, or is another tree."""
     levels = [splats(RNG, count, 1) for count in (60, 20)]
     write_lod(folder / "levels", levels, limits=LeafLimits(40, 2.0, 10))
@@ -152,7 +152,7 @@ def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
     reads()
 
 
-def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
+def test_glb_of_another_shape_is_read_or_refused(folder: Path):
     """Its JSON is whole, but no glTF."""
     tree, binary = split_glb(seeds("GLB", folder)[0])
     spz = seeds("SPZ", folder)[-1]
@@ -174,7 +174,7 @@ def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
     unpacks()
 
 
-def test_a_sog_of_another_shape_is_read_or_refused(folder: Path):
+def test_sog_of_another_shape_is_read_or_refused(folder: Path):
     """Its meta.json is whole, but no SOG; its ZIP, of any kind, may have a damaged byte, and may unpack to much."""
     with zipfile.ZipFile(io.BytesIO(seeds("SOG", folder)[1])) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}

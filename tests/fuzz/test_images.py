@@ -41,7 +41,7 @@ def seeds(suffix: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp", ".webp"])
-def test_a_damaged_image_is_read_or_refused(suffix, folder: Path):
+def test_damaged_image_is_read_or_refused(suffix, folder: Path):
     @fuzzed(data=damaged(seeds(suffix), WORDS))
     def reads(data):
         path = folder / f"a{suffix}"

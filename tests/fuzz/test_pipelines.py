@@ -42,7 +42,7 @@ METRICS += b'"steps": 4, "train_seconds": 1.5, "seed": 0, "device": "d", "pipeli
 LINES = b'{"step": 1, "kind": "train", "loss": 0.5}\n{"step": 2, "kind": "densify", "added": 3}\n'
 
 
-def test_a_damaged_pipeline_is_valid_or_refused(folder):
+def test_damaged_pipeline_is_valid_or_refused(folder):
     seeds = [shipped()[name].read_bytes() for name in ("smoke", "splat", "photos", "micro_splatting")]
     seeds += [load("smoke").text().encode(), load("mip_splatting").text().encode()]
 
@@ -57,7 +57,7 @@ def test_a_damaged_pipeline_is_valid_or_refused(folder):
     reads()
 
 
-def test_a_damaged_matrix_is_valid_or_refused(folder):
+def test_damaged_matrix_is_valid_or_refused(folder):
     @fuzzed(
         data=damaged([MATRIX, MATRIX.replace(b"  pipelines: [smoke]\n", b"") + load("smoke").text().encode()], YAML)
     )
@@ -73,7 +73,7 @@ def overrides() -> list[bytes]:
 
 
 @pytest.mark.parametrize("name", ["smoke", "micro_splatting"])
-def test_a_damaged_setting_is_valid_or_refused(name):
+def test_damaged_setting_is_valid_or_refused(name):
     one = damaged(overrides(), [*YAML, "stages[0]", ".", "=", "[", "]"])
 
     @fuzzed(100, data=lambda random: [one(random) for _ in range(random.randint(1, 2))])

@@ -54,7 +54,7 @@ def clouds(folder: Path) -> list[bytes]:
     return [binary, text.encode(), text.replace("\n", "\r\n").encode()]
 
 
-def test_a_damaged_model_is_read_or_refused(folder):
+def test_damaged_model_is_read_or_refused(folder):
     @fuzzed(data=damaged(splats(folder), WORDS))
     def reads(data):
         (folder / "model.ply").write_bytes(data)

@@ -42,7 +42,7 @@ def checkpoint() -> bytes:
     return file.getvalue()
 
 
-def test_a_damaged_archive_is_equal_or_refused(folder: Path):
+def test_damaged_archive_is_equal_or_refused(folder: Path):
     """What is read is what was written, whatever was changed."""
     path = folder / "step_7.npz"
 
@@ -59,7 +59,7 @@ def test_a_damaged_archive_is_equal_or_refused(folder: Path):
     reads()
 
 
-def test_a_damaged_field_is_equal_or_refused(folder: Path):
+def test_damaged_field_is_equal_or_refused(folder: Path):
     shape = FieldShape(depth=1, skip=None, width=4, color_width=4, degrees=1)
     field = FieldModel(shape, shape.initial_parameters(0), Rendering(background="white"))
     field.save(folder / "whole.npz")
@@ -110,7 +110,7 @@ def checked_part(name: str, content: Any, found: dict[str, Any]) -> Any:
     return [content["state"], [one["file"] for one in found["objects"]]] if name == "status.json" else content
 
 
-def test_a_damaged_sky_is_a_map_or_refused(folder: Path):
+def test_damaged_sky_is_a_map_or_refused(folder: Path):
     path, model = folder / "model_sky.json", folder / "model.ply"
     model.write_bytes(b"a model")
     Sky(np.linspace(0, 1, 192, dtype=np.float32).reshape(64, 3)).write(path, {model.name: sha256(model)})

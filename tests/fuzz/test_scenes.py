@@ -71,7 +71,7 @@ def colmap(folder: Path, kind: str) -> tuple[Path, dict[str, list[bytes]]]:
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_a_damaged_colmap_model_is_read_or_refused(stem, kind, folder):
+def test_damaged_colmap_model_is_read_or_refused(stem, kind, folder):
     path, seeds = colmap(folder, kind)
 
     @fuzzed(data=damaged(seeds[stem], MODELS))
@@ -101,7 +101,7 @@ def tables() -> list[bytes]:
 
 
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
-def test_a_damaged_transforms_file_is_read_or_refused(name, folder):
+def test_damaged_transforms_file_is_read_or_refused(name, folder):
     path = folder / name.partition(".")[0]
     for photograph in "ab":
         photo(path / f"{photograph}.png")
@@ -114,7 +114,7 @@ def test_a_damaged_transforms_file_is_read_or_refused(name, folder):
     reads()
 
 
-def test_a_damaged_table_of_sizes_is_read_or_refused(folder):
+def test_damaged_table_of_sizes_is_read_or_refused(folder):
     path = folder / "multiscale"
     for photograph in "ab":
         photo(path / f"{photograph}.png")

@@ -38,7 +38,7 @@ def test_round_trip_gives_the_same_bytes(tmp_path, rng, degree, filtered):
     assert read.rendering.notes["version"] == "0"
 
 
-def test_a_run_folder_is_a_model(tmp_path, rng):
+def test_run_folder_is_a_model(tmp_path, rng):
     model_of(random_case(rng, 3)).save(tmp_path / "point_cloud.ply")
     assert len(load(tmp_path)) == 3
 
@@ -169,6 +169,6 @@ def test_scene_display_has_four_images_and_escaped_names(tiny_scene):
 
 
 @pytest.mark.parametrize("path", ["", ".", "/"])
-def test_a_path_without_a_name_is_refused(rng, path):
+def test_path_without_a_name_is_refused(rng, path):
     with pytest.raises(OutputError, match=r"cannot be written \(it has no file name\); give the path of a file$"):
         model_of(random_case(rng, 3)).save(path)

@@ -31,7 +31,7 @@ def moving_model(width: int = 5, count: int = 40) -> Model:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_a_ply_keeps_the_motion(tmp_path, width):
+def test_ply_keeps_the_motion(tmp_path, width):
     model = moving_model(width)
     model.save(tmp_path / "model.ply")
     found = load(tmp_path / "model.ply")

@@ -150,6 +150,6 @@ def test_second_fourth_plane_is_refused(device, rng):
     assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"
 
 
-def test_a_training_also_needs_a_loss_on_colors():
+def test_training_also_needs_a_loss_on_colors():
     with pytest.raises(ValueError, match="at least one loss must compare images"):
         Optimize(steps=3, losses=[InverseDepth()])

@@ -160,7 +160,7 @@ def test_loss_value_and_gradient(device, rng, width, height):
 
 
 @on_one_setting
-def test_a_frame_without_the_plane_is_refused(device, rng):
+def test_frame_without_the_plane_is_refused(device, rng):
     x = rng.uniform(0, 1, (3, 5, 5)).astype(np.float32)
     with pytest.raises(ConfigError, match="weight_entropy needs a frame with the content 'entropy'"):
         WeightEntropy().add(comparison_of(device, x, x))
@@ -196,6 +196,6 @@ def test_steps_with_only_this_loss_lower_the_entropy(device, rng):
     assert values[-1] < 0.8 * values[0]
 
 
-def test_a_training_also_needs_a_loss_on_colors():
+def test_training_also_needs_a_loss_on_colors():
     with pytest.raises(ValueError, match="at least one loss must compare images"):
         Optimize(steps=3, losses=[WeightEntropy()])

@@ -111,7 +111,7 @@ def test_mask_blackens_excluded_pixels(device, rng, width, height):
 
 
 @on_one_setting
-def test_a_photograph_without_a_mask_counts_everywhere(device, rng):
+def test_photograph_without_a_mask_counts_everywhere(device, rng):
     photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
     assert photograph.planes(Workspace(device)).mask is None
     assert photograph.counted() is None

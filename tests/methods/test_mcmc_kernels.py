@@ -142,7 +142,7 @@ def test_gaussians_selected_earlier_are_no_sources(device, rng, limit):
 
 
 @on_one_setting
-def test_without_an_opaque_gaussian_nothing_changes(device, rng):
+def test_nothing_changes_without_an_opaque_gaussian(device, rng):
     gaussians = some_gaussians(device, rng, 30, faint=30)
     before = gaussians.get("means")
     assert relocated(gaussians).tolist() == list(range(30))

@@ -96,7 +96,7 @@ def test_penalties_move_gaussians(tiny_scene, tmp_path, without_penalty, penalty
     assert measured["heavy"] < 0.5 * measured["none"]
 
 
-def test_a_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
+def test_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
     steady = LOSSES.replace("[[10, 0.8], [40, 0.4]]", "0.8")
     run = train(tiny_scene, tmp_path / "run", steady, *SETTINGS[1:])
     assert finished.rasterizer.workspace._arrays.keys() == run.rasterizer.workspace._arrays.keys()

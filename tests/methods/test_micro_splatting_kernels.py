@@ -230,7 +230,7 @@ def test_nothing_merges_where_a_mean_is_not_finite(device, rng):
     assert case.apply(MergeNeighbors(distance_below=1e9, color_below=1e9)).after == 4
 
 
-def test_a_merged_covariance_is_that_of_the_mixture(rng):
+def test_merged_covariance_is_that_of_the_mixture(rng):
     count = 50
     tables = {
         "means": rng.normal(0, 1, (2 * count, 3)),

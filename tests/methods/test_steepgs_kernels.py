@@ -168,7 +168,7 @@ def test_nonfinite_gaussian_adds_nothing(device, rng):
 
 
 @on_one_setting
-def test_the_schedules_agree(device, rng):
+def test_schedules_agree(device, rng):
     case, weights = random_case(rng, 200, 60, 50), rng.normal(size=(3, 50, 60)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     found, again = (added_up(one, case, weights)[0] for one in (device, other))
@@ -350,7 +350,7 @@ def test_scalar_rules_refuse_the_matrix_statistic():
 
 
 @on_one_setting
-def test_a_gaussian_between_two_blobs_escapes_its_saddle(device):
+def test_gaussian_between_two_blobs_escapes_its_saddle(device):
     """Its gradient is zero by symmetry, so that no gradient splits it; the matrix does, and the loss falls."""
     case = random_case(np.random.default_rng(0), 1, 48, 32)
     camera = case.camera()

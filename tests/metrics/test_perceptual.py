@@ -134,7 +134,7 @@ def test_files_that_are_not_lpips_are_refused(rng, network, tmp_path):
         Lpips(network(offset=0.5), "-1..1")
 
 
-def test_a_network_that_crashes_opencv_ends_no_process(network, monkeypatch):
+def test_network_that_crashes_opencv_ends_no_process(network, monkeypatch):
     """Children that crash in place of OpenCV, which does not crash at the same files in all versions."""
     path = network()
     ends = iter([ChildResult(-11, ""), ChildResult(0, "")])

@@ -233,7 +233,7 @@ def test_nonfinite_field_stops_the_run_and_is_quarantined(tiny_scene, tmp_path, 
     assert [path.name for path in (tmp_path / "run/checkpoints").glob("failed_*")]
 
 
-def test_a_checkpoint_of_another_shape_is_refused(finished):
+def test_checkpoint_of_another_shape_is_refused(finished):
     """What a file says of its shape, and the tables that it holds, belong together."""
     state, tables = checkpoint.load(checkpoint.list_files(finished)[-1])
     assert state.field is not None

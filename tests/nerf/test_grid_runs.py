@@ -59,7 +59,7 @@ def test_grid_file_gives_the_metrics_of_its_run(finished):
     assert found["test"]["2"] == recorded["test"]["2"]
 
 
-def test_a_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):
+def test_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):
     notes, arrays = archive.read(finished / "field.npz")
     notes["shape"]["grid"]["entries"] = 2048
     with (tmp_path / "field.npz").open("wb") as file:
@@ -69,7 +69,7 @@ def test_a_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["grid.side", "grid.levels", "width"])
-def test_a_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missing):
+def test_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missing):
     """Defaults may change."""
     notes, arrays = archive.read(finished / "field.npz")
     own, _, key = missing.rpartition(".")

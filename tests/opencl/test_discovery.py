@@ -75,7 +75,7 @@ def test_other_gpus_are_named_in_one_line(set_devices, caplog):
 
 
 @pytest.mark.parametrize(("info", "least"), [(CPU, 16), (LARGE, 64)])
-def test_a_device_with_small_groups_does_not_work(set_devices, info, least):
+def test_device_with_small_groups_does_not_work(set_devices, info, least):
     assert replace(info, group=least).fault() is None
     small = replace(info, group=least - 1)
     assert small.fault() == f"its work-groups have at most {least - 1} items; {least} are needed"
@@ -306,7 +306,7 @@ def drivers(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("action", "end"), [("raise(11)", "crashes with SIGSEGV"), ("exit(0)", "ends the process")])
-def test_a_runtime_that_ends_the_process_is_named(drivers, action, end):
+def test_runtime_that_ends_the_process_is_named(drivers, action, end):
     drivers("a_good", "(void)0")
     bad = drivers("bad", f"extern int raise(int); {action}")
     with pytest.raises(DeviceError) as error:
@@ -329,7 +329,7 @@ def test_runtimes_that_load_are_not_loaded_in_a_child_again(drivers, monkeypatch
     assert len(loaded) == 1, "only after a change"
 
 
-def test_a_limit_on_memory_is_named_where_no_device_works(monkeypatch):
+def test_memory_limit_is_named_if_no_device_works(monkeypatch):
     monkeypatch.setattr(runtimes, "process_limit", lambda name: 700_000 << 10)
     runtimes.check_runtimes.cache_clear()
     with pytest.raises(MemoryLimitError, match=r"may use only 683 MiB of address space \(`ulimit -v`\): raise"):
@@ -340,7 +340,7 @@ def test_a_limit_on_memory_is_named_where_no_device_works(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES"])
-def test_a_variable_that_hides_all_devices_is_named(monkeypatch, name):
+def test_variable_that_hides_all_devices_is_named(monkeypatch, name):
     monkeypatch.setattr(discovery, "list_devices", list)
     for other in runtimes.VARIABLES:
         monkeypatch.delenv(other, raising=False)

@@ -11,7 +11,7 @@ from clsplat.opencl.device import Program
 from tests.support.devices import on_one_setting
 
 
-def test_a_missing_kernel_file_is_named(device, tmp_path):
+def test_missing_kernel_file_is_named(device, tmp_path):
     with pytest.raises(KernelError, match=r"own\.cl: no such kernel file"):
         device.program(tmp_path / "own.cl")
 

@@ -69,7 +69,7 @@ def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
     assert scalars["other"] == 1
 
 
-def test_a_view_has_one_row_at_all_its_sizes():
+def test_view_has_one_row_at_all_its_sizes():
     colors = ExposureState(Exposure(), ("a", "b", "a"))
     colors.rate = 0.01
     colors.start_from({})

@@ -99,7 +99,7 @@ def test_identity_parameters_leave_the_gradients(device, rng, monkeypatch, losse
         assert np.linalg.norm(found[name] - expected) < 1e-4 * np.linalg.norm(expected), name
 
 
-def test_a_mask_hides_pixels_whatever_their_colors_become(device, rng):
+def test_mask_hides_pixels_regardless_of_their_colors(device, rng):
     """An offset makes black pixels bright."""
     case = Case(device, rng, Affine(), share=0.5)
     case.scalars.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})

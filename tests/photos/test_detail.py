@@ -20,14 +20,14 @@ NOISE = Spectrum(BOUNDS**2)  # as many amplitudes at every frequency of the plan
 NATURAL = Spectrum(BOUNDS)  # amplitudes that fall as 1 / frequency
 
 
-def test_a_flat_spectrum_begins_with_a_quarter_of_the_pixels():
+def test_flat_spectrum_begins_with_a_quarter_of_the_pixels():
     steps, divisors = knots([NOISE, NOISE], 27000, 8)
     amplitudes = [0.25 + 0.75 * i / (KNOTS - 1) for i in range(KNOTS)]
     assert divisors == pytest.approx([a**-0.5 for a in amplitudes], rel=2e-3)
     assert steps == pytest.approx([27000 * math.log(4 * a) / math.log(4) for a in amplitudes], rel=2e-3, abs=1e-6)
 
 
-def test_a_natural_spectrum_begins_with_a_sixteenth():
+def test_natural_spectrum_begins_with_a_sixteenth():
     steps, divisors = knots([NATURAL], 6000, 8)
     assert divisors[0] == pytest.approx(4, rel=2e-3)
     middle = 0.25 + 0.75 * 10 / (KNOTS - 1)
@@ -42,7 +42,7 @@ def test_largest_divisor_follows_the_most_detailed_image():
     assert knots([NATURAL], 6000, 3)[1][0] == 3
 
 
-def test_without_detail_the_size_is_full_from_the_start():
+def test_size_is_full_from_the_start_without_detail():
     gray = DetailDivisor(follows="detail", until=900).of([np.full((40, 60, 3), 77, np.uint8)])
     assert gray.points == [[0, 1]]
     assert "full size" in course(gray)
@@ -93,7 +93,7 @@ def test_settings_that_follow_detail_are_resolved_before_use():
     assert settled.settled(lambda: []) is settled
 
 
-def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
+def test_rate_of_the_means_is_constant_up_to_the_full_size():
     rates = Rates(means={"initial": 1e-2, "final": 1e-4, "start": "full_size", "until": 1000})
     assert rates.resolve(601).means == Decay(initial=1e-2, final=1e-4, start=601, over=399)
     means = [rates.resolve(600).at(step, 2.0)["means"] for step in (1, 600, 800, 1000, 2000)]

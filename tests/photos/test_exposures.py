@@ -111,7 +111,7 @@ def test_images_linked_by_a_chain_of_points_are_compared(rng):
     assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.01)
 
 
-def test_a_third_of_the_points_may_be_hidden(rng):
+def test_third_of_the_points_may_be_hidden(rng):
     wall = Wall(rng)
     whole = wall.photograph
 

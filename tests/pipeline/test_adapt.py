@@ -112,7 +112,7 @@ def test_decisions_are_repeated_for_other_photographs(tmp_path):
     assert adapted(other, Measures(3)).settings.model.sh_degree == 0
 
 
-def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
+def test_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     asked = [f"scene.path='{tiny_scene}'", *FEW, ADAPT]
     text = describe(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
     assert "adapt          8 photographs\n" in text

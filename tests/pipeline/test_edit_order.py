@@ -92,7 +92,7 @@ def test_fractional_cadence_fires_at_or_below_its_multiples():
     assert [step for step in range(1, 30) if fires_at(10, step)] == fire_steps(10, 0, 30) == fire_steps(10.0, 0, 30)
 
 
-def test_a_cadence_below_a_step_is_refused():
+def test_cadence_below_a_step_is_refused():
     with pytest.raises(ConfigError, match="expected a number of steps of at least 1; fractions are allowed"):
         load("splat_7k", ["densify.every=0.5"])
     assert load("splat_7k", ["densify.every=2.94"]).settings.training.during[1].every == 2.94

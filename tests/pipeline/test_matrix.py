@@ -141,7 +141,7 @@ def test_refusals(case, write):
     assert "\n" not in str(error.value)
 
 
-def test_an_option_cannot_contradict_the_matrix(write):
+def test_option_cannot_contradict_the_matrix(write):
     with pytest.raises(ConfigError, match=r"the matrix lists values of optimize\.steps"):
         load_experiment(write(SMALL), ["optimize.steps=3"])
 

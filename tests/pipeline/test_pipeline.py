@@ -492,7 +492,7 @@ def faults_of_schema(path: Path, schema: Draft202012Validator, is_resolved: bool
 
 
 @pytest.mark.usefixtures("without_plugins")
-def test_the_schema_accepts_what_the_loader_accepts(own_schema):
+def test_schema_accepts_what_the_loader_accepts(own_schema):
     """Every file, and what the files that stand for all kinds resolve to."""
     faults = [fault for name in SHIPPED for fault in faults_of_schema(shipped(name).path, own_schema, name in KINDS)]
     for path in EXAMPLES.glob("*.yaml"):
@@ -534,7 +534,7 @@ SCHEMA_REFUSES = {
 
 
 @pytest.mark.parametrize("case", SCHEMA_REFUSES)
-def test_the_schema_refuses_what_the_loader_refuses(case, write, own_schema):
+def test_schema_refuses_what_the_loader_refuses(case, write, own_schema):
     with pytest.raises(ConfigError):
         load(write(SCHEMA_REFUSES[case]))
     assert not valid(SCHEMA_REFUSES[case], own_schema)

@@ -49,13 +49,13 @@ def write(folder: Path, name: str, text: str) -> Path:
     return path
 
 
-def test_a_class_in_a_file_is_a_variant(tmp_path):
+def test_class_in_a_file_is_a_variant(tmp_path):
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "mine" in variants(Rule)
     assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
 
 
-def test_a_curve_in_a_file_is_a_schedule(tmp_path):
+def test_curve_in_a_file_is_a_schedule(tmp_path):
     text = """
 import math
 from clsplat.core.schedule import Curve
@@ -135,7 +135,7 @@ def test_unnameable_class_is_refused(tmp_path, body, fault):
     assert "mine" not in variants(Rule)
 
 
-def test_an_exception_of_a_plugin_names_its_file_and_line(tmp_path):
+def test_exception_of_a_plugin_names_its_file_and_line(tmp_path):
     text = RULE.format(name="raising").replace("pass", "1 / 0")
     path = write(tmp_path, "raising", text)
     plugins.load_file(path)
@@ -248,7 +248,7 @@ def test_installed_plugin_is_recorded_where_its_import_is_used(install):
     assert recorded("{type: clone, statistic: own}") == {"first"}
 
 
-def test_an_installed_reader_is_recorded_always(install):
+def test_installed_reader_is_recorded_always(install):
     install({"my.py": READER.format(name="Own")}, first="my")
     plugins.load_installed()
     assert set(load("splat").settings.plugins) == {"first"}
@@ -262,7 +262,7 @@ def test_installed_plugin_error_names_file_and_line(install, text, reason):
     assert "my.register" not in sys.modules
 
 
-def test_the_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
+def test_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
     install({"my/__init__.py": "", "my/register.py": "", "my/late.py": "x = 1"}, first="my.register")
     plugins.load_installed()
     (before,) = plugins.loaded()
@@ -272,7 +272,7 @@ def test_the_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
     assert plugins.loaded()[0].digest != before.digest
 
 
-def test_the_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypatch):
+def test_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(plugins, "_loaded", {})
     file = write(tmp_path, "mine", "from a_helper import x\n")
@@ -445,7 +445,7 @@ def test_public_module_exports_all_imports():
     assert inside == [], "nothing in the package imports it"
 
 
-def test_the_rule_and_the_stage_of_the_examples_act(tiny_scene, tmp_path):
+def test_rule_and_the_stage_of_the_examples_act(tiny_scene, tmp_path):
     plugins.load_file(EXAMPLES / "random_pruning.py")
     rules = "[{type: prune_at_random, share: 0.9, opacity_below: 0.9}]"
     stages = f"{{densify: {{every: 10, start: 15, rules: {rules}}}}}, {{cap_size: {{every: 10, max_size: 0.001}}}}"

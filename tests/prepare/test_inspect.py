@@ -51,7 +51,7 @@ def changed(images: list[ImageEntry], index: int, **changes: object) -> list[Ima
 # ---- healthy
 
 
-def test_a_healthy_scene_is_ready(scene):
+def test_healthy_scene_is_ready(scene):
     inspection = Inspection.from_folder(scene)
     facts = inspection.facts
     assert (inspection.verdict, inspection.findings) == ("ready to train", [])
@@ -122,7 +122,7 @@ def test_distortion_is_the_displacement_at_the_corner():
 # ---- errors: what the reader refuses too
 
 
-def test_a_missing_image(scene):
+def test_missing_image(scene):
     (scene / "images" / "03.png").unlink()
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
@@ -160,7 +160,7 @@ def test_larger_images_of_the_same_shape_are_allowed(tmp_path):
     assert inspection.verdict == "ready to train"
 
 
-def test_an_unreadable_image(scene):
+def test_unreadable_image(scene):
     (scene / "images" / "05.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
     assert "1 image file cannot be decoded (05.png)" in finding_text(Inspection.from_folder(scene), "error")
 
@@ -205,7 +205,7 @@ def test_photographs_without_poses(tmp_path):
     assert "contains 1 photograph but no camera poses" in finding_text(inspection, "error")
 
 
-def test_an_empty_folder(tmp_path):
+def test_empty_folder(tmp_path):
     assert "no dataset found" in finding_text(Inspection.from_folder(tmp_path), "error")
     with pytest.raises(DataError, match="no such folder"):
         Inspection.from_folder(tmp_path / "nowhere")
@@ -254,7 +254,7 @@ def test_trainable_means_readable_by_a_reader(tmp_path_factory, kind: str, data:
 # ---- warnings and notes
 
 
-def test_an_unregistered_image(scene):
+def test_unregistered_image(scene):
     photograph(scene / "images" / "other.png")
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.unregistered == ["images/other.png"]
@@ -403,7 +403,7 @@ def test_few_views(tmp_path):
 # ---- what is shown
 
 
-def test_the_command_line(scene, tmp_path):
+def test_command_line(scene, tmp_path):
     done = clsplat("inspect", scene, "--html", tmp_path / "page.html")
     assert done.stdout.splitlines()[-1].strip() == "ready to train"
     assert "reprojection" not in done.stdout  # the writer's errors are all the same: a placeholder

@@ -376,7 +376,7 @@ def test_runs_of_different_photographs_prepare_concurrently(pipeline, photos, tm
     assert len(list((tmp_path / "runs" / "prepared").glob("find_features-*/record.json"))) == 2
 
 
-def test_a_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
+def test_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
     words = ["run", str(pipeline), "--scene", str(photos), "--set", "optimize.steps=3", "--out", "runs/a"]
     assert clsplat(*words)[0] == 0
     (photos / "p.txt").write_text("other")
@@ -384,7 +384,7 @@ def test_a_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
     assert clsplat(*words, "--restart")[0] == 0
 
 
-def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):
+def test_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):
     step = prepare_steps.FindFeatures()
     message = refusal(prepare, plan([step], tiny_scene, tmp_path / "r" / "p"), tiny_scene, tmp_path / "r" / "p")
     assert "already contains cameras" in message

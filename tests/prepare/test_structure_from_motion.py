@@ -214,7 +214,7 @@ features.find_features(Path({str(five)!r}), Path({str(tmp_path / "half")!r}), fe
         assert (tmp_path / "half" / "images" / file.name).read_bytes() == file.read_bytes()
 
 
-def test_a_database_without_all_photographs_starts_again(five, tmp_path):
+def test_incomplete_database_is_rebuilt(five, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
@@ -402,7 +402,7 @@ def test_similar_photographs_are_paired(rng):
 # ---- the scene written
 
 
-def test_a_written_model_reads_back(tmp_path, rng):
+def test_written_model_reads_back(tmp_path, rng):
     camera = Camera(6, 4, 5.5, 5.25, 3.1, 1.9)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))

@@ -45,7 +45,7 @@ def test_resolved_file_names_the_box_filter(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "rule"), [("steep_7k", "split_steepest"), ("auto_7k", "clone")])
-def test_a_rule_that_reads_conics_is_refused(name, rule):
+def test_rule_that_reads_conics_is_refused(name, rule):
     words = rf"stages\[1\]\.optimize\..*: '{rule}' cannot be .*box \(model.screen_filter\): .*another screen filter"
     with pytest.raises(ConfigError, match=words):
         load_pipeline(name, [BOX])

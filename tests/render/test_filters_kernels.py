@@ -61,7 +61,7 @@ def test_filter_variance(device, rng, count, focal):
 
 
 @on_one_setting
-def test_a_shared_focal_length_makes_both_definitions_equal(device, rng):
+def test_shared_focal_length_makes_both_definitions_equal(device, rng):
     case = random_case(rng, 100)
     views = [replace(view, camera=replace(view.camera, fx=40.0)) for view in views_around(case, rng, 5)]
     of_each = refreshed(device, case, views, Smoothing())

@@ -144,7 +144,7 @@ def test_edges_of_tiles(device, rng, width, height, size):
     assert_within_bounds(check_sum(case, pixel_sums_of(device, case, weights, 11), weights, size))
 
 
-def test_what_cannot_be_drawn(device, rng):
+def test_degenerate_splats_are_not_drawn(device, rng):
     case = replace(not_drawable(rng), **BOX)
     records, keys, _ = splats_of(device, case)
     culled = [0, 1, 2, 3, 4, 5, 7, 8]

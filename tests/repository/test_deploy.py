@@ -51,7 +51,7 @@ def test_copied_files_are_not_ignored():
     assert [path for path in copied() if not any(fnmatch.fnmatch(path, rule) for rule in kept)] == []
 
 
-def test_the_container_runs_without_root_and_leaves_no_lists():
+def test_container_runs_without_root_and_leaves_no_lists():
     last = max(i for i, (name, _) in enumerate(steps()) if name == "FROM")
     users = [rest for name, rest in steps()[last:] if name == "USER"]
     assert users
@@ -125,7 +125,7 @@ def test_probe_detects_a_heartbeat_and_its_end(tmp_path):
     assert subprocess.run(command, check=False).returncode != 0
 
 
-def test_the_page_explains_every_key_of_the_status():
+def test_page_explains_every_key_of_the_status():
     table = PAGE[PAGE.index("## status.json") : PAGE.index("**Is it alive?**")]
     named = set(
         re.findall(r"`(\w+)`", " ".join(line.split("|")[1] for line in table.splitlines() if line[:3] == "| `"))

@@ -155,7 +155,7 @@ def test_documented_skip_reasons_match_the_program():
         assert part.strip() in source, reason
 
 
-def test_the_navigation_has_at_most_seven_groups():
+def test_navigation_has_at_most_seven_groups():
     assert len(re.findall(r"^  - (.+):$", text_of(ROOT / "mkdocs.yml").partition("\nnav:")[2], re.M)) <= 7
 
 
@@ -231,7 +231,7 @@ def test_links_between_repository_files_are_valid():
             assert made or path.exists(), f"{page.name}: {target}"
 
 
-def test_the_front_page_is_short():
+def test_front_page_is_short():
     assert len(text_of(ROOT / "README.md").splitlines()) < 130
 
 
@@ -285,7 +285,7 @@ def test_versions_agree_in_all_files():
     assert (first[1], first[2]) == (released, citation.get("date-released"))
 
 
-def test_the_changelog_is_short():
+def test_changelog_is_short():
     assert len(text_of(ROOT / "CHANGELOG.md").splitlines()) <= 200
 
 

@@ -187,7 +187,7 @@ def test_growing_resolution_trains_at_its_sizes(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "limit"), [("opacity_entropy", 25), ("box_blur", 40), ("csv_reader", 35)])
-def test_an_example_is_short(name, limit):
+def test_example_is_short(name, limit):
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= limit
 
 

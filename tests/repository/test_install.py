@@ -124,7 +124,7 @@ def test_sdist_contains_docs_examples_and_the_changelog(built):
     assert not any(name.startswith("tests/") for name in names)
 
 
-def test_the_version_names_the_commit_of_a_clean_checkout(tmp_path):
+def test_version_names_the_commit_of_a_clean_checkout(tmp_path):
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
     (tmp_path / "clsplat").mkdir()
     (tmp_path / "clsplat" / "a.py").write_text("a = 1\n")

@@ -268,7 +268,7 @@ FINE = Figures(registers=40, spills=0, scratch=0, local=4096, group=64, width=32
         ({"group": 257}, "gfx900 scale (TILE 8) has groups of 257 items; at most 256 are allowed"),
     ],
 )
-def test_a_kernel_beyond_the_limits_is_named(change, sentence):
+def test_kernel_beyond_the_limits_is_named(change, sentence):
     table = {
         Place("gfx900", "simt", "scale", "TILE 8"): Figures(**(vars(FINE) | change)),
         Place("a", "simt", "b"): FINE,
@@ -276,7 +276,7 @@ def test_a_kernel_beyond_the_limits_is_named(change, sentence):
     assert figures.faults(table) == [sentence]
 
 
-def test_the_schedule_of_cpus_may_spill_on_a_gpu():
+def test_schedule_of_cpus_may_spill_on_a_gpu():
     assert figures.faults({Place("gfx900", "wide", "scale"): Figures(**(vars(FINE) | {"spills": 3}))}) == []
 
 
@@ -360,7 +360,7 @@ def test_missing_requested_compiler_is_a_fault(tmp_path):
     assert "clang 16 or later is missing: apt-get install clang-19\n" in done.stderr
 
 
-def test_an_unknown_target_is_refused():
+def test_unknown_target_is_refused():
     done = command("gfx1")
     assert done.returncode == 2
     assert "no target named gfx1; there are amd, nvidia, intel, gfx900" in done.stderr

@@ -165,7 +165,7 @@ def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])
-def test_pairs_are_all_of_them_or_those_of_neighbors(count):
+def test_pairs_are_exhaustive_or_sequential(count):
     every = count * (count - 1) // 2
     assert most_pairs(count, "exhaustive", 10) == every
     assert most_pairs(count, "auto", 10) == (every if count <= MAX_EXHAUSTIVE else 20 * count)

@@ -80,7 +80,7 @@ def test_hanging_import_is_stopped(tmp_path, monkeypatch):
     assert time.monotonic() - begun < 10
 
 
-def test_a_signal_that_a_library_catches_stops_the_run(tiny_scene: Path, tmp_path: Path, monkeypatch):
+def test_signal_that_a_library_catches_stops_the_run(tiny_scene: Path, tmp_path: Path, monkeypatch):
     check = opening.check_start
 
     def catching(*arguments):

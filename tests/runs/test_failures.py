@@ -89,7 +89,7 @@ def test_failing_evaluation_loses_nothing(error, call, tiny_scene, tmp_path, mon
     assert records(tmp_path) == records(few_steps)
 
 
-def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
+def test_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
     end, states = StatusFile.end, []
 
     def recorded(status, state, *more):

@@ -73,7 +73,7 @@ def views(folder: Path) -> tuple[View, ...]:
 # ---- before the first step
 
 
-def test_a_damaged_test_view_stops_a_run_before_its_first_step(scene, tmp_path):
+def test_damaged_test_view_stops_a_run_before_its_first_step(scene, tmp_path):
     file = damage(read_scene(scene).split("test")[1].image_path)
     done = command("run", "smoke", "--scene", scene, "--out", tmp_path / "run", expect=3)
     assert f"1 of 10 image files cannot be trained on: {file} (not an image, or a damaged one" in done.stderr
@@ -249,7 +249,7 @@ def test_moved_or_rewritten_equal_files_are_the_same(scene, tmp_path):
     assert kinds[0] == kinds[1]
 
 
-def test_the_order_of_the_test_views_does_not_matter(scene):
+def test_order_of_the_test_views_does_not_matter(scene):
     opened = read_scene(scene)
     assert identity(replace(opened, test=opened.test[::-1])).digest == identity(opened).digest
     other = identity(replace(opened, train=opened.train[::-1]))
@@ -374,7 +374,7 @@ def test_dry_run_of_a_resume_prints_the_step(scene, tmp_path):
     assert "and so are all others" in command(*words, "--resume", expect=7).stderr
 
 
-def test_a_dry_run_finds_damaged_photographs(scene, tmp_path):
+def test_dry_run_finds_damaged_photographs(scene, tmp_path):
     damage(views(scene)[1].image_path)
     done = command("run", "smoke", "--scene", scene, "--out", tmp_path / "run", "--dry-run", expect=3)
     assert "1 of 10 image files cannot be trained on" in done.stderr

@@ -116,14 +116,14 @@ def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatc
     trained(live, tiny_scene, tmp_path / "run")
 
 
-def test_a_pause_ends_by_itself_when_no_page_is_open(live, tiny_scene, tmp_path, monkeypatch):
+def test_pause_ends_by_itself_when_no_page_is_open(live, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "PAUSE_TIMEOUT", 0.3)
     live.state.pause(True)
     trained(live, tiny_scene, tmp_path / "run")
     assert not live.state.paused
 
 
-def test_a_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
+def test_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
     client = Client(live)
 
     def stop():
@@ -169,7 +169,7 @@ def test_live_renders_wait_for_their_time_budget(live, tiny_scene, tmp_path):
     assert live.state.budget.spent == 0
 
 
-def test_the_server_ends_with_the_run(tiny_scene, tmp_path, capsys):
+def test_server_ends_with_the_run(tiny_scene, tmp_path, capsys):
     job = Job.open("smoke", tiny_scene, tmp_path / "run", FEW)
     job.run(live=0)
     shown = capsys.readouterr().out

@@ -81,7 +81,7 @@ def test_camera_is_read_as_the_page_writes_it():
         "a,2,3;0,0,0,1;9,9,5,5,10,10",
     ],
 )
-def test_an_impossible_camera_is_refused(text):
+def test_impossible_camera_is_refused(text):
     with pytest.raises(RequestError, match="camera: expected"):
         parse_camera(text)
 

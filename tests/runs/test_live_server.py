@@ -53,7 +53,7 @@ def test_other_methods_are_refused_and_close_the_connection(server, method):
     assert b"<" not in found
 
 
-def test_an_answer_forbids_frames_caches_and_referrers(server):
+def test_answer_forbids_frames_caches_and_referrers(server):
     lines = exchange(server, b"GET /token/x HTTP/1.1\r\nHost: localhost\r\n\r\n").decode().split("\r\n")
     assert lines[0] == "HTTP/1.1 200 OK"
     assert lines[-1] == "x"

@@ -160,7 +160,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_a_refused_resume_leaves_a_run_done(name, copy):
+def test_refused_resume_leaves_a_run_done(name, copy):
     kind, changes, words = REFUSALS[name]
     (copy / "viewer.html").unlink()
     (checkpoint,) = (copy / "checkpoints").iterdir()

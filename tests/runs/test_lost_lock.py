@@ -64,7 +64,7 @@ def run(scene: Path, out: Path) -> None:
     ("take", "failure"),
     [(take_folder, None), (take_folder, KeyboardInterrupt()), (removed, None), (removed, RuntimeError("a defect"))],
 )
-def test_a_run_that_lost_its_folder_writes_nothing_more(take, failure, tiny_scene, tmp_path, monkeypatch):
+def test_run_that_lost_its_folder_writes_nothing_more(take, failure, tiny_scene, tmp_path, monkeypatch):
     """It loses the folder at step 8, in an edit before the second checkpoint; with a failure, that ends it, too."""
     before: dict[str, bytes] = {}
     edit: Callable[..., None] = Densify.run

@@ -13,7 +13,7 @@ from tests.support.commands import ran
 pytestmark = pytest.mark.slow
 
 
-def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
+def test_refused_run_leaves_no_folder(tiny_scene, tmp_path):
     damaged = tmp_path / "damaged.ply"
     damaged.write_text("ply")
     for name, arguments in {

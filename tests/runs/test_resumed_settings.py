@@ -90,7 +90,7 @@ def test_run_stopped_after_its_last_stage_finishes(killed_run, tiny_scene, few_s
     assert (killed_run / "checkpoints" / "step_000012.npz").read_bytes() == before
 
 
-def test_training_longer_says_what_a_longer_plan_would_change(few_steps, tiny_scene, tmp_path, caplog):
+def test_longer_training_reports_what_a_longer_plan_changes(few_steps, tiny_scene, tmp_path, caplog):
     """An edit that is due at the last step of a run skips no update, as it does between steps."""
     Job.resume(few_steps, steps=14)
     assert "'densify' was due at step 12, the last one, so the result differs from a run planned as long" in caplog.text

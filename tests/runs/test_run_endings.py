@@ -104,7 +104,7 @@ def test_unwritable_log_is_a_failure_with_a_status(tiny_scene, tmp_path):
     assert json.loads((tmp_path / "run" / "status.json").read_text())["exit_code"] == 7
 
 
-def test_a_signal_that_is_ignored_stays_ignored():
+def test_signal_that_is_ignored_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with stopping_on_signals(pytest.fail):
@@ -114,7 +114,7 @@ def test_a_signal_that_is_ignored_stays_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
+def test_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path)]
     command += ["--set", "optimize.steps=12"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -149,7 +149,7 @@ def test_folder_with_another_run_keeps_its_status(tiny_scene, tmp_path):
     assert (tmp_path / "status.json").read_text() == '{"state": "done"}'
 
 
-def test_the_terminal_keeps_stdout_for_json(capsys):
+def test_terminal_keeps_stdout_for_json(capsys):
     terminal.start_logging(debug=False)
     terminal.keep_stdout_for_json()
     experiment.LOG.info("a remark")

@@ -39,7 +39,7 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
         )
 
 
-def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
+def test_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
     for name in ("renders", "report.html", "point_cloud.ply", *files.RUN_FILES - {files.PIPELINE}):
         out = tmp_path / f"run of {name}"
         out.mkdir()

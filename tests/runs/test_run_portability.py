@@ -132,7 +132,7 @@ def test_report_starts_with_images_and_cameras(done, tiny_scene):
     assert page.elements["button"] == page.elements["img"], "each picture grows"
 
 
-def test_a_comparison_links_the_reports_and_names_the_seeds(tiny_scene, tmp_path):
+def test_comparison_links_the_reports_and_names_the_seeds(tiny_scene, tmp_path):
     runs = [tmp_path / f"seed {seed}" for seed in (0, 1)]
     for seed, out in enumerate(runs):
         train(tiny_scene, out, "optimize.steps=10", "optimize.log_every=5", f"seed={seed}")

@@ -42,7 +42,7 @@ def test_remote_run_is_judged_only_by_its_heartbeat(elsewhere, tmp_path):
     assert "no heartbeat" not in reading.status_text(write_and_read_status(tmp_path, time=time.time() - 2, **elsewhere))
 
 
-def test_a_stopped_process_has_no_heartbeat(tmp_path):
+def test_stopped_process_has_no_heartbeat(tmp_path):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         found = write_and_read_status(tmp_path, process=process.pid)
         process.communicate(b"\n")
@@ -109,7 +109,7 @@ def test_step_is_the_later_of_status_and_report(tmp_path):
         ("state", '"x"'),
     ],
 )
-def test_a_damaged_status_is_refused(name, value, tmp_path):
+def test_damaged_status_is_refused(name, value, tmp_path):
     write_and_read_status(tmp_path, host="a")
     path = tmp_path / "status.json"
     status = {**json.loads(path.read_text()), name: "HERE"}
@@ -118,7 +118,7 @@ def test_a_damaged_status_is_refused(name, value, tmp_path):
     assert message.startswith(f"{path}: damaged ({name}: ")
 
 
-def test_a_status_of_a_newer_version_is_refused(tmp_path):
+def test_status_of_a_newer_version_is_refused(tmp_path):
     write_and_read_status(tmp_path)
     path = tmp_path / "status.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))

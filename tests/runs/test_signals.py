@@ -93,7 +93,7 @@ def test_long_stage_ends_early_with_saved_state_and_is_repeated(
         assert (tmp_path / file.relative_to(uninterrupted)).read_bytes() == file.read_bytes()
 
 
-def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
+def test_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(render, "render_view", signalled(render.render_view, 1, times=2))
     words = f"stopped at once, and no checkpoint was saved; `clsplat resume {tmp_path}` starts it over"
     with pytest.raises(Interrupted, match=re.escape(words)):

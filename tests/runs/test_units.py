@@ -41,14 +41,14 @@ def near_of(run: Path) -> float | str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", FACTORS)
-def test_a_scene_trains_alike_in_any_unit_of_length(runs, factor):
+def test_scene_trains_alike_in_any_unit_of_length(runs, factor):
     assert trained_psnr(runs[factor]) == pytest.approx(trained_psnr(runs[1]), abs=0.1)
     assert near_of(runs[factor]) == pytest.approx(factor * near_of(runs[1]), rel=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, *FACTORS])
-def test_a_file_of_another_program_is_drawn_in_any_unit(runs, factor, tmp_path):
+def test_file_of_another_program_is_drawn_in_any_unit(runs, factor, tmp_path):
     model = load(runs[factor])
     replace(model, rendering=Rendering()).save(tmp_path / "foreign.ply")
     assert not load(tmp_path / "foreign.ply").rendering.near
@@ -58,7 +58,7 @@ def test_a_file_of_another_program_is_drawn_in_any_unit(runs, factor, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_keeps_its_near_plane(runs):
+def test_resumed_run_keeps_its_near_plane(runs):
     run, file = runs[1], runs[1] / "pipeline.yaml"
     assert (
         "up to date"
@@ -79,7 +79,7 @@ def test_a_resumed_run_keeps_its_near_plane(runs):
     assert near_of(run) == number
 
 
-def test_the_near_plane_is_a_share_of_the_scene(tiny_scene):
+def test_near_plane_is_a_fraction_of_the_scene(tiny_scene):
     scene = read_scene(tiny_scene)
     assert near_plane(replace(scene, points=None)) == pytest.approx(0.04 * scene.extent, rel=0.005)
     view = scene.split("train")[0]

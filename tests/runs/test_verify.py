@@ -155,7 +155,7 @@ def test_missing_renders_are_detected(copy):
     assert all(name.startswith("renders/test/") for name in damaged(copy))
 
 
-def test_a_list_without_a_declared_output_is_damaged(copy):
+def test_list_without_a_declared_output_is_damaged(copy):
     (copy / "checksums.json").write_text("{}")
     names = ["pipeline.yaml", "metrics.jsonl", "metrics.json", "point_cloud.ply", "viewer.html", "report.html"]
     assert damaged(copy) == {"checksums.json": f"lacks {', '.join(map(repr, names))}"}
@@ -295,13 +295,13 @@ def test_check_of_a_matrix_includes_its_cells(tiny_scene, tmp_path):
     assert "inputs.json" not in damaged(out), "which is of a run, not of a matrix"
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path):
+def test_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"has neither pipeline.yaml nor status.json"):
         verify(RunState.read(tmp_path))
     assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
 
 
-def test_the_schema_of_a_status_describes_every_key():
+def test_schema_of_a_status_describes_every_key():
     schema = clsplat.status_schema()
     for part in (schema, *schema["$defs"].values()):
         assert [name for name, value in part["properties"].items() if "description" not in value] == []

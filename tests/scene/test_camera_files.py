@@ -172,7 +172,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
+def test_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
     clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, "inria")
     change, message = FAULTS[fault]
     file = tmp_path / "cameras.json"

@@ -191,7 +191,7 @@ def test_model_is_found_in_three_folders(tmp_path: Path, place: str) -> None:
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse"])
-def test_the_model_folder_itself_may_be_named(tmp_path: Path, place: str) -> None:
+def test_model_folder_itself_may_be_named(tmp_path: Path, place: str) -> None:
     path = write_model(tmp_path / place, tiny_model())
     write_scene(tmp_path / "other", tiny_model())
     (tmp_path / "other" / "images").rename(tmp_path / "images")
@@ -245,7 +245,7 @@ def test_nonfinite_points_are_dropped(tmp_path: Path, kind: str, caplog: pytest.
     assert "dropped 3 points" in caplog.text
 
 
-def test_a_hundred_thousand_points_are_read(tmp_path: Path) -> None:
+def test_hundred_thousand_points_are_read(tmp_path: Path) -> None:
     row = struct.pack("<Q3d3BdQ", 1, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 3) + struct.pack("<6I", *range(6))
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 100_000) + row * 100_000)
     points = read_point_table(tmp_path).cloud()

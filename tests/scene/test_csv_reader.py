@@ -42,7 +42,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_example_is_short():
+def test_example_is_short():
     assert len(EXAMPLE.read_text().splitlines()) <= 35
 
 
@@ -68,7 +68,7 @@ def test_inspection_matches_that_of_colmap(scene):
 
 
 @pytest.mark.usefixtures("_plugin")
-def test_a_missing_photograph_is_named(scene):
+def test_missing_photograph_is_named(scene):
     (scene / "images" / "03.png").unlink()
     assert "03.png" in refusal(read_scene, scene / "images")
     assert "03.png" in finding_text(Inspection.from_folder(scene / "images"), "error")
@@ -103,6 +103,6 @@ def test_damage_is_reported_with_file_and_line(scene, line, old, new):
 
 @pytest.mark.usefixtures("_plugin")
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\0", HEADER.encode()])
-def test_a_file_without_photographs_is_refused(scene, content):
+def test_file_without_photographs_is_refused(scene, content):
     (scene / "images" / "cameras.csv").write_bytes(content)
     refusal(read_scene, scene / "images")

@@ -72,7 +72,7 @@ def test_exposures_file_round_trip(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["[]", '{"a": 1}', '{"a": {"seconds": 1e999, "aperture": 2, "iso": 3}}', "{"])
-def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
+def test_damaged_file_is_refused_in_one_line(tmp_path, text):
     (tmp_path / EXPOSURES_FILE).write_text(text)
     with pytest.raises(DataError, match=EXPOSURES_FILE) as refused:
         read_exposures(tmp_path)

@@ -19,7 +19,7 @@ def orbit(count=24, radius=3.0):
 
 
 @pytest.mark.parametrize("distance", [1e2, 1e5, 1e9])
-def test_a_far_camera_does_not_change_the_extent(distance):
+def test_far_camera_does_not_change_the_extent(distance):
     """Learning rates and thresholds follow the extent."""
     healthy = orbit()
     assert camera_extent(views_at([*healthy, (distance, 0, 0)])) == camera_extent(views_at(healthy))

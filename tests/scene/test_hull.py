@@ -81,7 +81,7 @@ def test_cells_seen_by_few_views_are_dropped():
     assert np.abs(np.linalg.norm(points.positions, axis=1) - 0.3).max() < 0.05
 
 
-def test_a_point_on_the_border_of_an_image_has_a_pixel_or_none(rng):
+def test_point_on_the_border_of_an_image_has_a_pixel_or_none(rng):
     """Single precision: a quotient may round up to the height of the image."""
     camera = Camera(400, 225, 555, 555, 200, 112.5)
     silhouette = Silhouette(View("a", camera, np.eye(3, 4)), np.zeros((225, 400, 4), np.uint8))
@@ -94,7 +94,7 @@ def test_a_point_on_the_border_of_an_image_has_a_pixel_or_none(rng):
     assert place.row.max() < 225
 
 
-def test_an_alpha_that_ends_below_255_is_opaque():
+def test_alpha_that_ends_below_255_is_opaque():
     def matte(view: View) -> np.ndarray:
         return np.minimum(ball(view), 254)
 

@@ -72,7 +72,7 @@ MATCHES = {  # the kind of dataset, the names in it, and the files on disk in th
 
 
 @pytest.mark.parametrize("case", MATCHES)
-def test_a_photograph_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, case: str) -> None:
+def test_photograph_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, case: str) -> None:
     kind, names, files = MATCHES[case]
     scene = made(tmp_path / "scene", kind, names, files)
     with caplog.at_level(logging.INFO, "clsplat"):
@@ -103,7 +103,7 @@ REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is s
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_a_photograph_is_refused(tmp_path: Path, case: str) -> None:
+def test_photograph_is_refused(tmp_path: Path, case: str) -> None:
     kind, names, files, text = REFUSALS[case]
     scene = made(tmp_path / "scene", kind, names, files)
     assert text in refusal(read_scene, scene)
@@ -157,7 +157,7 @@ def test_splits_name_photographs_as_frames_do(tmp_path: Path) -> None:
     assert [view.name for view in read_scene(scene).split("test")] == ["images/b.jpg"]
 
 
-def test_photographs_of_two_files_are_looked_for_together(tmp_path: Path) -> None:
+def test_photographs_of_two_files_are_searched_together(tmp_path: Path) -> None:
     """Those for testing are not taken from training where they are missing."""
     made(tmp_path, BLENDER, ["train/r_0"], ["train/r_0.png"])
     made(tmp_path, "transforms_test", ["test/r_0"], [])
@@ -183,7 +183,7 @@ def test_masks_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "place", ["colmap/sparse/0", "dense/0/sparse", "colmap_sparse/0", "colmap_text", "a/b/sparse/0", "output/model"]
 )
-def test_a_model_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+def test_model_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
     for image in orbit().images:
         (tmp_path / "images").mkdir(exist_ok=True)
         photograph(tmp_path / "images" / image.name)
@@ -199,7 +199,7 @@ def test_a_model_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, plac
     assert not inspection.facts.unregistered
 
 
-def test_of_several_models_below_the_largest_of_the_same_photographs_is_used(tmp_path: Path) -> None:
+def test_largest_nested_model_of_equal_photographs_is_used(tmp_path: Path) -> None:
     small = replace(orbit(), images=orbit().images[:5])
     (tmp_path / "images").mkdir()
     for image in orbit().images:
@@ -221,7 +221,7 @@ def test_several_scenes_below_are_listed(tmp_path: Path) -> None:
     assert "fox (COLMAP), horse (COLMAP); give one of these" in refusal(read_scene, tmp_path)
 
 
-def test_a_transforms_file_below_is_read(tmp_path: Path) -> None:
+def test_nested_transforms_file_is_read(tmp_path: Path) -> None:
     made(tmp_path / "nerf", JSON, ["images/a.jpg", "images/b.jpg"], ["../images/a.jpg", "../images/b.jpg"])
     assert located(tmp_path) == {"images/a.jpg": "images/a.jpg", "images/b.jpg": "images/b.jpg"}
 
@@ -235,7 +235,7 @@ def test_missing_photographs_without_sizes_are_one_error(tmp_path: Path) -> None
     assert "100 of 100 registered images are missing on disk" in errors[0]
 
 
-def test_photographs_of_several_sizes_need_no_sizes_in_the_file(tmp_path: Path) -> None:
+def test_photographs_of_several_sizes_need_no_sizes(tmp_path: Path) -> None:
     scene = made(tmp_path, JSON, ["a.jpg", "b.jpg"], ["a.jpg"], (64, 48))
     photograph(scene / "b.jpg", (48, 64))
     table = json.loads((scene / "transforms.json").read_text())
@@ -244,13 +244,13 @@ def test_photographs_of_several_sizes_need_no_sizes_in_the_file(tmp_path: Path) 
     assert Inspection.from_folder(scene).trainable
 
 
-def test_the_only_photograph_is_trained_on_without_holdout(tmp_path: Path) -> None:
+def test_only_photograph_is_trained_on_without_holdout(tmp_path: Path) -> None:
     scene = made(tmp_path, JSON, ["a.jpg"], ["a.jpg"])
     assert "the only image is held out for testing; set scene.holdout=0 to train on it" in refusal(read_scene, scene)
     assert len(read_scene(scene, 0).train) == 1
 
 
-def test_the_folder_above_is_named_where_it_has_the_cameras(tmp_path: Path) -> None:
+def test_parent_folder_with_cameras_is_named(tmp_path: Path) -> None:
     scene = made(tmp_path, "colmap", ["a.jpg"], ["images/a.jpg"])
     assert f"the cameras are in {scene}: give that folder" in refusal(read_scene, scene / "images")
 

@@ -111,7 +111,7 @@ def test_folder_without_matching_masks_is_refused(tiny_scene, tmp_path):
     assert "set scene.masks to another folder" in told
 
 
-def test_a_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp_path):
+def test_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp_path):
     masks = masks_of(tiny_scene, tmp_path / "masks")
     file = next(masks.rglob("*.png"))
     cv2.imwrite(str(file), np.full((30, 40), 255, np.uint8))

@@ -116,7 +116,7 @@ def test_times_of_any_unit_are_normalized(tmp_path):
     assert [view.time for view in read_scene(path, 0).views] == [1, 0, 0.5]
 
 
-def test_a_blender_scene_has_one_clock_for_both_files(tmp_path):
+def test_blender_scene_has_one_clock_for_both_files(tmp_path):
     train = write(tmp_path / "a", "transforms_train.json", camera_angle_x=0.7, frames=timed(0.25, 0.5))
     write(train, "transforms_test.json", camera_angle_x=0.7, frames=[timed(0.75)[0] | {"file_path": "t.png"}])
     assert [view.time for view in read_scene(train).views] == [0, 0.5, 1]

@@ -150,7 +150,7 @@ def test_order_decides_how_often_scales_are_drawn():
 
 
 @pytest.mark.parametrize("order", ["uniform", "shuffle", "stack"])
-def test_the_order_depends_on_seed_and_step_alone(order):
+def test_order_depends_only_on_seed_and_step(order):
     views = views_of(7, 1, 2)
     straight = draw_views(views, order, 60, seed=3)
     assert draw_views(views, order, [50, 3, 21], seed=3) == [straight[step - 1] for step in (50, 3, 21)]

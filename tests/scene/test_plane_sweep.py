@@ -179,7 +179,7 @@ def test_real_surfaces_are_covered():
 @pytest.mark.parametrize(
     ("more", "found", "alpha", "joined"), [(1, 70, False, 70), (1, 0, False, 0), (0, 70, False, 0), (1, 70, True, 0)]
 )
-def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, more, found, alpha, joined):
+def test_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, more, found, alpha, joined):
     """more: than the scene's points are enough."""
     own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
     cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))

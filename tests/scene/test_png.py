@@ -64,7 +64,7 @@ def test_metadata_changes_no_pixel_and_prints_nothing(kind, what, wrong, tmp_pat
         (16, 7, b"\0\x07\x07\0\0\0", [(7, 0), (1792, 65535), (0, 65535)]),
     ],
 )
-def test_the_transparent_level_of_a_gray_photograph_is_kept(tmp_path, bits, level, row, expected):
+def test_transparent_level_of_a_gray_photograph_is_kept(tmp_path, bits, level, row, expected):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 1, bits, 0, 0, 0, 0))
     pixels = chunk(b"tRNS", struct.pack(">H", level)) + chunk(b"IDAT", zlib.compress(b"\0" + row))
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))

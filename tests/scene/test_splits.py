@@ -52,7 +52,7 @@ def test_split_changes_only_the_views(folder, split):
 
 
 @pytest.mark.parametrize("listed", ["b", "images/b.png", "images\\b.png", "b.jpg", "images/b.JPG"])
-def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
+def test_listed_name_may_be_the_end_of_a_path(folder, listed):
     assert letters(read_scene(folder, Split(ViewSelection(names=[listed, "q"]))), "test") == "bq"
 
 
@@ -69,13 +69,13 @@ def test_full_path_takes_precedence_over_a_path_end(tmp_path, listed):
     assert [view.name for view in scene.split("test")] == ["1.png"]
 
 
-def test_a_listed_name_may_have_another_suffix(tmp_path):
+def test_listed_name_may_have_another_suffix(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "c.png"))
     scene = read_scene(tmp_path, Split(ViewSelection(names=["1.jpg"])))
     assert [view.name for view in scene.split("test")] == ["a/1.png"]
 
 
-def test_a_file_lists_test_views(folder):
+def test_file_lists_test_views(folder):
     (folder / "test.txt").write_text("# of the paper\nc.png\n\n x.png \n")
     assert letters(read_scene(folder, Split(ViewSelection(file="test.txt"))), "test") == "cx"
 
@@ -107,7 +107,7 @@ def test_invalid_list_is_refused(folder, choice, fault):
 @pytest.mark.parametrize(
     "split", [Split(8, ViewSelection(names=["a", "i"])), Split(8, None, ViewSelection(names=["a", "b"]))]
 )
-def test_a_test_photograph_in_another_list_is_named(folder, split):
+def test_test_photograph_in_another_list_is_named(folder, split):
     with pytest.raises(DataError, match=r"scene\.(train|validation): the list of names: '[ai]' is a test view"):
         read_scene(folder, split)
 
@@ -139,7 +139,7 @@ def test_dataset_split_applies_unless_names_are_listed(folder):
     assert letters(read_scene(folder, Split(ViewSelection(names=["b"]))), "test") == "b"
 
 
-def test_a_sparse_capture_is_every_nth_of_the_training_views(folder):
+def test_sparse_capture_is_every_nth_of_the_training_views(folder):
     whole = read_scene(folder, 8)
     scene = read_scene(folder, Split(8, ViewSelection(every=4)))
     assert letters(scene, "test") == letters(whole, "test") == "aiq"

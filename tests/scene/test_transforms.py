@@ -120,7 +120,7 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
         assert ours == pytest.approx(theirs)
 
 
-def test_the_scale_of_a_rotation_is_ignored(tmp_path: Path) -> None:
+def test_scale_of_a_rotation_is_ignored(tmp_path: Path) -> None:
     scaled = [[*(2.5 * value for value in row[:3]), str(row[3])] for row in POSE[:3]]
     view, _ = read_scene(write(tmp_path, **LENS, frames=frames("a.png", "b.png", transform_matrix=scaled))).views
     np.testing.assert_allclose(view.world_to_camera @ (2, 4, 1, 1), (1, -2, 4))
@@ -200,7 +200,7 @@ def test_shared_values_are_not_copied_per_frame(tmp_path: Path) -> None:
     assert "2000 of 2000 image files are missing" in refusal(read_scene, tmp_path)
 
 
-def test_a_thousand_damaged_frames_are_a_thousand_faults(tmp_path: Path) -> None:
+def test_thousand_damaged_frames_are_a_thousand_faults(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{}] * 1000}))
     parts = Parts(tmp_path)
     NerfstudioReader().list_parts(parts)

@@ -110,7 +110,7 @@ def test_energy_of_bands_is_the_mean_square_over_directions(rng, degree):
         np.testing.assert_allclose(found[:, band], np.square(colors).sum(axis=2).mean(axis=0), rtol=0.03)
 
 
-def test_a_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
+def test_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     for degree in (1, 2, 0):
         before = run.model.gaussians.get("sh_rest")
@@ -322,7 +322,7 @@ def test_share_palette_needs_a_palette(tmp_path):
         load_pipeline(str(path))
 
 
-def test_a_palette_of_a_model_without_harmonics_changes_nothing(few_steps, tiny_scene, tmp_path):
+def test_palette_of_a_model_without_harmonics_changes_nothing(few_steps, tiny_scene, tmp_path):
     source = few_steps / "point_cloud.ply"
     lines = [line for line in PALETTE.replace("sh_degree: 2", "sh_degree: 0").splitlines() if "optimize" not in line]
     (tmp_path / "palette.yaml").write_text("\n".join(lines).replace("MODEL", json.dumps(str(source))))

@@ -81,7 +81,7 @@ def test_few_images_are_reported():
 
 
 @pytest.mark.parametrize("turn", [0, 250])
-def test_the_widest_gap_around_a_scene_is_found(turn):
+def test_widest_gap_around_a_scene_is_reported(turn):
     angles = [turn + 12 * i for i in range(26)]  # 300 degrees, and 60 without any
     degrees, one, other = widest_gap(views_around(angles))
     assert degrees == pytest.approx(60, abs=1)

@@ -52,7 +52,7 @@ def test_equal_rows_do_not_change(device, rng):
 
 
 @on_one_setting
-def test_a_cluster_without_weight_gets_its_first_row(device, rng):
+def test_cluster_without_weight_gets_its_first_row(device, rng):
     gaussians, labels, weights = clustered(device, rng, 40, 4)
     weights[labels == 2] = 0
     set_clusters(gaussians, labels, weights)
@@ -62,7 +62,7 @@ def test_a_cluster_without_weight_gets_its_first_row(device, rng):
 
 
 @on_one_setting
-def test_the_cluster_of_a_gaussian_moves_with_it(device, rng):
+def test_cluster_of_a_gaussian_moves_with_it(device, rng):
     gaussians, labels, _ = clustered(device, rng, 50, 5)
     source = rng.permutation(50)[:30]
     gaussians.rearrange(device.upload(source.astype(np.uint32)), device.zeros(30, np.uint32), 30)

@@ -65,7 +65,7 @@ def test_fingerprint_matches_the_runs_record_of_its_scene(few_steps, tiny_scene,
     assert Scenes(tmp_path).facts(checked).digest == expected
 
 
-def test_a_cell_is_published_once_and_then_skipped(store, options):
+def test_cell_is_published_once_and_then_skipped(store, options):
     first = run_cell(CELL, store, command(WRITES), options)
     assert first.state == "published"
     result = store.folder(CELL.key).result
@@ -148,7 +148,7 @@ def test_unwritable_result_counts_as_a_failure(store, options, monkeypatch, time
     assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
 
 
-def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, options):
+def test_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, options):
     saves = "import sys, pathlib, shutil, os; p = pathlib.Path(sys.argv[2], 'checkpoints'); p.mkdir(exist_ok=True)\n"
     saves += f"left = sorted(pathlib.Path({str(few_steps / CHECKPOINTS)!r}).iterdir())\n"
     saves += "new = [one for one in left if not (p / one.name).exists()]\n"
@@ -299,7 +299,7 @@ def test_damaged_spec_is_rewritten(store, options):
     assert json.loads((folder.path / "spec.json").read_text()) == SPEC
 
 
-def test_a_spec_is_never_changed(store):
+def test_spec_is_never_changed(store):
     folder = store.add(CELL)
     with pytest.raises(OutputError, match="belongs to another cell"):
         folder.write_spec({**SPEC, "seed": 1})
@@ -338,7 +338,7 @@ def test_longest_cell_is_first_and_a_lost_one_restarts(store, options):
 SLOTS = (DeviceSlot("w", "one", "x"), DeviceSlot("w", "two", "y"), DeviceSlot("w", "three", "y"))
 
 
-def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, options):
+def test_sweep_stays_in_the_bits_class_of_most_devices(store, options):
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS)
     Dispatcher(store, engine, True, options).run(pending_cells(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {"y"}
@@ -406,7 +406,7 @@ def test_device_that_suits_no_cell_is_checked_once(store, options, monkeypatch):
     assert looks.count("y") == 4, "one look at each cell that waits"
 
 
-def test_a_signal_stops_a_sweep(store, options):
+def test_signal_stops_a_sweep(store, options):
     with pytest.raises(Interrupted, match="and --resume"):
         Dispatcher(store, Fake(), True, options, is_stopped=lambda: True).run(pending_cells(1))
 

@@ -281,7 +281,7 @@ def test_page_of_a_single_run_has_no_best_and_no_seeds(make_run, tmp_path):
     assert not any(words in text for words in ("bold", "deviation", "several seeds", "All runs"))
 
 
-def test_without_records_there_are_no_curves(make_run, tmp_path):
+def test_page_without_records_has_no_curves(make_run, tmp_path):
     folder = make_run("run")
     (folder / "metrics.jsonl").unlink()
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -321,7 +321,7 @@ def test_markup_in_names_is_shown_as_text(make_run, tmp_path):
     assert f"{HOSTILE} device" in page.text, "among the settings that differ"
 
 
-def test_the_same_runs_give_the_same_bytes(make_run, tmp_path, monkeypatch):
+def test_same_runs_give_the_same_bytes(make_run, tmp_path, monkeypatch):
     """Sets of strings have another order in each of these processes."""
     folders = [make_run("a"), make_run("b", "init.opacity=0.3"), make_run("c", "seed=1", device="another")]
     pages = []
@@ -399,7 +399,7 @@ def test_refusals(make_run, tmp_path, how, code, words):
     assert not (tmp_path / "page.html").exists()
 
 
-def test_the_same_run_twice_is_refused(make_run, tmp_path):
+def test_same_run_twice_is_refused(make_run, tmp_path):
     folder = make_run("run")
     with pytest.raises(ConfigError, match="given twice"):
         write_comparison([folder, tmp_path / "." / "run"], tmp_path / "page.html")
@@ -414,7 +414,7 @@ def test_page_without_photographs_shows_other_parts(make_run, tmp_path):
     assert "20.00" in page
 
 
-def test_a_damaged_render_is_refused(make_run, tmp_path):
+def test_damaged_render_is_refused(make_run, tmp_path):
     folder = make_run("run")
     (folder / "renders/test/r_001.png").write_bytes((folder / "renders/test/r_001.png").read_bytes()[:40])
     with pytest.raises(DataError, match=r"r_001.png: the end of the file is missing"):
@@ -424,7 +424,7 @@ def test_a_damaged_render_is_refused(make_run, tmp_path):
         write_comparison([folder], tmp_path / "page.html")
 
 
-def test_the_command(make_run, tmp_path):
+def test_command(make_run, tmp_path):
     done = clsplat("compare", make_run("a"), make_run("b", "seed=1"), "--out", tmp_path / "c.html")
     assert "2 runs compared" in done.stdout
     assert "tiny" in (tmp_path / "c.html").read_text()

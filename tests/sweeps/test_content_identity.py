@@ -102,7 +102,7 @@ def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, t
     assert f"{tmp_path / 'm.ply'} differs from the file with which the sweep started" in outcome.message
 
 
-def test_a_file_that_changes_while_a_cell_runs_fails_it(store, options, tmp_path):
+def test_file_that_changes_while_a_cell_runs_fails_it(store, options, tmp_path):
     file = write(tmp_path / "m.ply", "as it was")
     cell = replace(CELL, files={str(file): content_of(file)})
     changes = f"import pathlib; pathlib.Path({str(file)!r}).write_text('another')"

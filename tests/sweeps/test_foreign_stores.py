@@ -61,7 +61,7 @@ def test_links_in_a_store_are_refused(store, options, outside, name):
     assert sorted(outside.rglob("*")) == before
 
 
-def test_an_attempt_that_is_a_link_is_no_attempt(store, options, outside):
+def test_attempt_that_is_a_link_is_no_attempt(store, options, outside):
     folder = store.add(CELL)
     (folder.path / "attempts").mkdir()
     (folder.path / "attempts" / ("a" * 32)).symlink_to(outside, target_is_directory=True)
@@ -78,7 +78,7 @@ def test_undistorted_photos_are_not_written_through_a_link(store, options, outsi
     assert "undistorted: is a symbolic link that does not point to" in outcome.message
 
 
-def test_a_result_is_not_copied_through_a_link(tmp_path, outside):
+def test_result_is_not_copied_through_a_link(tmp_path, outside):
     result, target = tmp_path / "result", tmp_path / "out"
     (result / "renders").mkdir(parents=True)
     (result / "renders" / "a.png").write_bytes(b"image")
@@ -91,7 +91,7 @@ def test_a_result_is_not_copied_through_a_link(tmp_path, outside):
 
 
 @pytest.mark.parametrize("name", ["store", "prepared", "undistorted"])
-def test_a_matrix_folder_with_a_link_to_outside_is_refused(tmp_path, outside, name):
+def test_matrix_folder_with_a_link_to_outside_is_refused(tmp_path, outside, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).symlink_to(outside, target_is_directory=True)

@@ -62,7 +62,7 @@ def test_matrix_folder_is_accepted_for_its_cells(finished, tmp_path):
     assert "no cell of this matrix has finished" in done.stderr
 
 
-def test_a_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypatch):
+def test_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypatch):
     read, folders = opening.read_scene, []
 
     def counted(folder, holdout):
@@ -98,7 +98,7 @@ def test_resume_runs_only_missing_cells(finished, tmp_path):
     assert {path.parent.name: path.read_bytes() for path in out.glob("*/point_cloud.ply")} == bits
 
 
-def test_a_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
+def test_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
     """Of --set and --scene, which its file does not name."""
     (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{seeds: [0, 1]}}\n{STAGES}")
     out = tmp_path / "run"

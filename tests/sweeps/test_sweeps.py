@@ -314,7 +314,7 @@ def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeyp
         sweeps.run_worker("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
 
-def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
+def test_device_is_not_chosen_for_a_scheduler(file, tmp_path):
     execution_file = tmp_path / "lab.yaml"
     execution_file.write_text("engine: dask://127.0.0.1:1\n")
     with pytest.raises(ConfigError, match="--device: with a scheduler, workers choose the devices"):
@@ -354,7 +354,7 @@ def test_sweep_ends_if_all_workers_have_another_version(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("starter", ["nobody", "this machine"])
-def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
+def test_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client, sent = FakeClient(), []
     monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))

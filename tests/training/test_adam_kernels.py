@@ -258,7 +258,7 @@ def test_empty_model(device, rng):
 
 
 @on_one_setting
-def test_an_average_of_equal_values_is_the_value(device, rng):
+def test_average_of_equal_values_is_the_value(device, rng):
     """To the bit, as a table of the parameters that no step changes."""
     gaussians = random_case(rng, 65).model(device).gaussians
     before = {name: gaussians.get(name) for name in PARAMETERS}

@@ -129,7 +129,7 @@ def distances(run: Run) -> np.ndarray:
     return np.linalg.norm(read_ply(run.out / "point_cloud.ply").parameters["means"], axis=1)
 
 
-def test_a_start_on_the_hull(tmp_path, pipeline):
+def test_training_starts_on_the_hull(tmp_path, pipeline):
     """`transparent: hull` is for photographs with alpha; `auto` alone takes random points, as published."""
     scene = ball_scene(tmp_path / "scene", 4)
     found = distances(train(scene, tmp_path / "hull", *STILL, "init.transparent=hull", pipeline=pipeline))

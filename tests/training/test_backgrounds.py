@@ -70,7 +70,7 @@ def test_run_repeats_bit_for_bit(tiny_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
+def test_model_with_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="cannot be combined with sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=envmap", "optimize.steps=2")
     asked = load(

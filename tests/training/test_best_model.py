@@ -175,7 +175,7 @@ def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeli
     equal_ends(again, tmp_path / "1")
 
 
-def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
+def test_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
     found = Scores(step=30, train=20, validation=20)
     best_run = Best(
@@ -346,7 +346,7 @@ def test_other_models_at_the_end_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("steps", "every"), [(7000, 350), (2019, 100), (730, 104), (350, 116), (199, 199), (12, 12)])
-def test_a_training_is_measured_near_its_end(pipeline, steps, every):
+def test_training_is_measured_near_its_end(pipeline, steps, every):
     """A refit of a short one would be up to 99 steps shorter than it."""
     training = load(pipeline).settings.training.model_copy(update={"steps": steps, "keep": "best"})
     assert {one.every for one in training.measuring([])} == {every}
@@ -359,7 +359,7 @@ def test_minutes_and_refit_are_incompatible(tiny_scene, tmp_path, pipeline):
         job.run(minutes=5)
 
 
-def test_a_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
+def test_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
     import clsplat
 
     trainer = Trainer(clsplat.read_scene(tiny_scene), pipeline)
@@ -371,7 +371,7 @@ NOW = Scores(step=8, train=30.0, validation=20.0)
 FOUND = Best(measured=NOW, degree=0, metrics={}, evaluations=1, since_best=0, first_overfit=None, last=NOW)
 
 
-def test_a_checkpoint_without_its_best_model_is_damaged(best_run):
+def test_checkpoint_without_its_best_model_is_damaged(best_run):
     state, tables = checkpoint.load(best_run / "checkpoints" / "step_000014.npz")
     own, _ = split(tables, best_model.FOLDER)
     assert state.best is not None

@@ -29,7 +29,7 @@ def test_image_and_derivatives(device, rng, width, height, nodes):
     assert_within_bounds(check_grid(device, rng, width, height, nodes))
 
 
-def test_a_fourth_plane_is_copied(device, rng):
+def test_fourth_plane_is_copied(device, rng):
     assert_within_bounds(check_grid(device, rng, 33, 18, (4, 4, 4), channels=4))
 
 
@@ -135,7 +135,7 @@ def test_single_cell_equals_the_affine_kind(device, rng):
 
 
 @on_one_setting
-def test_a_mask_hides_pixels_whatever_their_colors_become(device, rng):
+def test_mask_hides_pixels_regardless_of_their_colors(device, rng):
     case = Case(device, rng, share=0.5)
     values = case.values.copy().reshape(2, 12, -1)
     values[1, [3, 7, 11]] = 0.2  # added to black

@@ -31,7 +31,7 @@ def test_image_and_derivatives(device, rng, width, height):
     assert_within_bounds(check_response(device, rng, width, height))
 
 
-def test_the_reference_by_finite_differences(rng):
+def test_reference_against_finite_differences(rng):
     image, gradient, step = *rng.uniform(-0.3, 1.5, (2, 3, 5, 6)), 1e-6
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     for array, found in zip((image, row), taken_backward(image, row, (2.5, 4.0), gradient), strict=True):

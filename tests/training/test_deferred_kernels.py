@@ -111,7 +111,7 @@ def test_edits_apply_deferred_updates_first(device, rng, edit):
     assert_equal(device, behind_each_fifth(random_case(rng, 100)), edit=edit)
 
 
-def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
+def test_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     case = random_case(rng, 100)
     seen = [seen_rows(rng, 100) for _ in range(7)]
     gradients = [rng.normal(size=(100, 45)).astype(np.float32) * mask[:, None] for mask in seen]

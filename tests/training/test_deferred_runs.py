@@ -232,7 +232,7 @@ class OnHarmonics(Penalty):
         return LossValue("harmonics", lambda: 0.0)
 
 
-def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
+def test_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(few_steps, out)
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])

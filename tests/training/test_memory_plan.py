@@ -72,7 +72,7 @@ def test_too_many_points_are_refused_before_neighbor_search(tiny_scene, tmp_path
         train(tiny_scene, tmp_path / "run")
 
 
-def test_the_first_plan_has_the_tables_that_training_adds(tiny_scene, tmp_path):
+def test_first_plan_has_the_tables_that_training_adds(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", "optimize.steps=1")
     present = run.model.gaussians.components
     first = memory.first_tables(run.model_settings.sh_degree)

@@ -165,6 +165,6 @@ def test_metrics_and_tables_use_the_optimized_cameras(with_poses, tiny_scene, tm
 
 
 @pytest.mark.slow
-def test_a_sky_is_refused(tiny_scene, tmp_path):
+def test_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match=r"'camera_optimizer' cannot be combined with sky"):
         train(tiny_scene, tmp_path / "run", *ON, "model.background=envmap")

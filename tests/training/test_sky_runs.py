@@ -208,7 +208,7 @@ def test_best_model_has_the_sky_of_its_step(tiny_scene, tmp_path):
 # ---- where it goes
 
 
-def test_a_run_folder_is_rendered_and_measured_with_its_sky(sky_run):
+def test_run_folder_is_rendered_and_measured_with_its_sky(sky_run):
     measured = json.loads((sky_run / "metrics.json").read_text())["test"]["1"]
     assert evaluate(sky_run)["test"]["1"]["psnr"] == measured["psnr"]
     assert "point_cloud_sky.json" in json.loads((sky_run / "checksums.json").read_text())
@@ -295,13 +295,13 @@ def test_rotated_model_has_a_rotated_sky(rng, sky_run):
         '{"side": 8, "texels": 1}',
     ],
 )
-def test_a_damaged_sky_is_refused(tmp_path, damage):
+def test_damaged_sky_is_refused(tmp_path, damage):
     (tmp_path / "point_cloud_sky.json").write_text(damage)
     with pytest.raises(DataError, match=r"point_cloud_sky\.json: expected"):
         read_sky_file(tmp_path / "point_cloud.ply")
 
 
-def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
+def test_damaged_sky_in_a_checkpoint_is_refused(with_sky):
     _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
     behind, _ = split(tables, "modules/sky/")
     SkyModule.check_saved({}, behind)
@@ -314,7 +314,7 @@ def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
         SkyModule.check_saved({}, {"texels": behind["texels"], "biases": behind["biases"]})
 
 
-def test_a_sky_file_keeps_every_bit(rng, tmp_path):
+def test_sky_file_keeps_every_bit(rng, tmp_path):
     sky = Sky(rng.normal(size=(64, 3)).astype(np.float32))
     (tmp_path / "model.ply").write_bytes(b"a model")
     write_sky_file(sky, tmp_path / "model.ply", sha256(tmp_path / "model.ply"))

@@ -165,7 +165,7 @@ def test_nothing_is_written_after_the_end(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "status.json").read_text())["state"] == "failed"
 
 
-def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, caplog):
+def test_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, caplog):
     def write(path: Path, text: str) -> None:
         if json.loads(text)["state"] in ("preparing", "running"):
             raise OutputError(f"{path}: cannot be written (No space left on device)")

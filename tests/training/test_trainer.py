@@ -212,7 +212,7 @@ def test_numpy_loss_trains_like_the_device_loss(any_device, rng):
     assert seen[0][3] > 0.9
 
 
-def test_a_derivative_of_another_shape_is_refused(any_device, rng):
+def test_derivative_of_another_shape_is_refused(any_device, rng):
     x, y = images(rng, 5, 4)
     loss = HostLoss(lambda image, photograph: (0.0, np.zeros((3, 4, 5), np.float32)))
     with pytest.raises(ValueError, match=r"derivative of \(3, 4, 5\); expected \(4, 5, 3\), as the image"):

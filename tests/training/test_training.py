@@ -115,7 +115,7 @@ def test_interrupt_saves_and_resume_continues(few_steps, tiny_scene, tmp_path):
     assert steps == sorted(set(steps))
 
 
-def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeypatch):
+def test_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "FORMAT", 1)
     train(tiny_scene, tmp_path, *FEW, "optimize.steps=4")
     monkeypatch.undo()

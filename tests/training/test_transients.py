@@ -35,7 +35,7 @@ def test_all_pixels_count_without_outliers():
     assert settings.threshold(distribution(_40=995, _65=5), 1) is None, "beyond the 99 % quantile"
 
 
-def test_the_distribution_fades():
+def test_distribution_fades():
     settings, scalars = Transients(start=0, decay=0.5), {}
     for _ in range(2):
         settings.learn(scalars, np.eye(BINS, dtype=np.uint32)[3] * 8)
@@ -43,7 +43,7 @@ def test_the_distribution_fades():
 
 
 @pytest.mark.slow
-def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_steps):
+def test_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
     assert sum(run.modules["transients"].scalars[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)

@@ -125,7 +125,7 @@ def test_run_with_too_many_splats_shows_the_most_important(tiny_scene, tmp_path,
     assert any("most important splats of" in record.message for record in caplog.records)
 
 
-def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_path):
+def test_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_path):
     pairs = [
         ([run], {}),
         ([Path(shutil.copy(run / "point_cloud.ply", tmp_path))], {}),

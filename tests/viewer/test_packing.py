@@ -54,7 +54,7 @@ def test_packing_round_trips_within_its_steps(count, degree):
     assert (np.abs(found.sh[:, 1:].reshape(count, -1) - model.sh_rest) <= 1.02 * half_steps).all()
 
 
-def test_the_same_model_gives_the_same_bytes():
+def test_same_model_gives_the_same_bytes():
     packed = pack(cloud(500))
     assert packed == pack(cloud(500))
     assert packed.data[4:8] == bytes(4), "the time in the header of gzip"
@@ -66,7 +66,7 @@ def test_file_order_does_not_matter():
     assert pack(model).data == pack(model[RNG.permutation(700)]).data
 
 
-def test_the_first_parts_are_the_most_important():
+def test_first_parts_are_the_most_important():
     model = spread(800)
     packed = pack(model)
     found = unpacked(packed)
@@ -76,7 +76,7 @@ def test_the_first_parts_are_the_most_important():
     assert (parts[:-1].min(axis=1) >= 0.9 * parts[1:].max(axis=1)).all()
 
 
-def test_a_limit_keeps_the_most_important():
+def test_limit_keeps_the_most_important():
     model = spread(800)
     weight = model.opacities * np.sort(model.scales, axis=1)[:, 1:].prod(axis=1)
     kept = unpacked(pack(model, 200))

@@ -33,7 +33,7 @@ def page(tmp_path) -> Page:
     return Page("demo", {"model": pack(model)}, stand, "white", described(found, flat, "test"))
 
 
-def test_the_same_input_gives_the_same_page(page, tmp_path):
+def test_same_input_gives_the_same_page(page, tmp_path):
     page.write(tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text() == page.text()
 

@@ -53,7 +53,7 @@ def test_equal_frames_give_equal_bytes(suffix, tmp_path):
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
 
 
-def test_an_encoder_is_silent(tmp_path, capfd):
+def test_encoder_is_silent(tmp_path, capfd):
     clsplat.write_video(tmp_path / "a.webm", pictures())
     assert capfd.readouterr() == ("", "")
 

@@ -131,12 +131,12 @@ def test_nearly_parallel_axes_meet_within_the_visible_points(rng):
         assert view.world_to_camera[2, 2] < -0.7, "looking down"
 
 
-def test_a_ring_has_no_front_for_a_spiral(rng):
+def test_ring_has_no_front_for_a_spiral(rng):
     with pytest.raises(DataError, match="use ellipse or through"):
         PATHS["spiral"](rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False)), rng), 4, SIZE)
 
 
-def test_walk_goes_between_neighbors_whatever_their_names(rng):
+def test_walk_connects_neighbors_regardless_of_names(rng):
     views = ring(np.linspace(0, 4, 25))
     shuffled = [replace(views[i], name=f"{k:03d}") for k, i in enumerate(rng.permutation(25))]
     way = order(rig_of(shuffled, rng))
@@ -147,7 +147,7 @@ def test_walk_goes_between_neighbors_whatever_their_names(rng):
     assert by_name.tolist() == list(range(25))
 
 
-def test_a_walk_passes_near_the_views_and_looks_as_they_do(rng):
+def test_walk_passes_near_the_views_and_looks_as_they_do(rng):
     views = ring(np.linspace(0, 2.5, 20))
     found = PATHS["through"](rig_of(views, rng), 100, SIZE)
     place = positions(found)
@@ -215,7 +215,7 @@ def test_bad_rates_are_refused(fps):
         check_fps(fps)
 
 
-def test_an_unknown_path_and_a_path_without_a_scene_are_refused():
+def test_unknown_path_and_a_path_without_a_scene_are_refused():
     with pytest.raises(ConfigError, match="no path 'elipse'; there are ellipse, spiral, orbit, through, views"):
         VideoRequest.parse("elipse", None, None, None)
     with pytest.raises(ConfigError, match="needs the cameras of a scene"):

@@ -55,7 +55,7 @@ def test_time_advances_along_a_path_or_is_fixed(scene):
     assert len({view.position.tobytes() for view in frozen}) == 5
 
 
-def test_a_fixed_camera_is_one_view_over_time(scene):
+def test_fixed_camera_is_one_view_over_time(scene):
     views = plan_views(scene, "fixed")
     assert len({view.world_to_camera.tobytes() for view in views}) == 1
     assert [view.time for view in views] == [0, 0.25, 0.5, 0.75, 1]

@@ -55,7 +55,7 @@ def test_nonfinite_position_is_reported():
         assign_cells(means, cells(means[:1], np.ones(1), 1))
 
 
-def test_a_quantile_follows_the_weights():
+def test_quantile_follows_the_weights():
     assert quantile(np.array([3.0, 1, 2]), np.array([1.0, 8, 1]), 0.5) == 1
     assert quantile(np.array([3.0, 1, 2]), np.array([1.0, 1, 8]), 0.5) == 2
 
@@ -101,6 +101,6 @@ def test_incompatible_models_are_not_joined(rng, tmp_path):
     assert not (tmp_path / "all.ply").exists()
 
 
-def test_a_box_of_all_space_is_the_cell_of_one_block():
+def test_box_of_all_space_is_the_cell_of_one_block():
     (cell,) = cells(np.zeros((3, 3)), np.zeros(3), 1)
     assert cell.box == cell.extended(0.2) == Box()

@@ -107,7 +107,7 @@ def test_gaussian_limit_is_split_by_visible_pairs(most, tiny_scene, few_steps, t
         assert max(schedule_values(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
 
 
-def test_the_merged_run_is_measured_with_all_views(trained):
+def test_merged_run_is_measured_with_all_views(trained):
     out, found = trained
     assert Path(found["run"]) == out / "merged"
     assert found["metrics"] == json.loads((out / "merged" / "metrics.json").read_text())
@@ -131,7 +131,7 @@ def test_killed_and_missing_blocks_resume_with_equal_bits(trained, tiny_scene, f
     assert (out / "partition.json").read_bytes() == (trained[0] / "partition.json").read_bytes()
 
 
-def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_steps, tmp_path):
+def test_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_steps, tmp_path):
     scene, out = tmp_path / "scene", tmp_path / "moved"
     shutil.copytree(tiny_scene, scene)
     shutil.copytree(trained[0], out)
@@ -293,13 +293,13 @@ def test_settings_that_blocks_cannot_share_are_refused(override, message, tiny_s
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
+def test_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"empty: has no pipeline\.yaml; expected a model file or a run folder"):
         train(tiny_scene, tmp_path / "empty", tmp_path / "out")
 
 
-def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
+def test_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
     write_multiscale(tiny_scene, tmp_path / "scene", 2)
     with pytest.raises(DataError, match="has photos in several sizes; blocks need a single size"):
         train(tmp_path / "scene", few_steps, tmp_path / "out")
@@ -311,7 +311,7 @@ def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps,
         train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
 
 
-def test_a_plan_by_points_needs_points(tiny_scene, tmp_path):
+def test_plan_by_points_needs_points(tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "scene")
     (tmp_path / "scene" / "points3d.ply").unlink()
     refused = CliRunner().invoke(app, ["inspect", str(tmp_path / "scene"), "--blocks", "2"])
@@ -330,7 +330,7 @@ def test_inspect_shows_a_plan_by_the_points_before_training(tiny_scene, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
+def test_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     arguments = ["blocks", "--scene", str(tiny_scene), "--coarse", str(few_steps), "--out", str(tmp_path / "out")]
     shown = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
     assert shown.exit_code == 0, shown.output

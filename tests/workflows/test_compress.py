@@ -67,7 +67,7 @@ def test_invalid_target_is_refused(text):
         CompressionTarget.parse(text)
 
 
-def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
+def test_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
     sky = Sky(rng.random((64, 3), np.float32))
     replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "rung.sog")
     compress._copy(tmp_path / "rung.sog", tmp_path / "compressed.sog")
@@ -117,13 +117,13 @@ def test_every_file_is_measured_after_reading_it_back(searched, few_steps, tiny_
         assert evaluate(file, tiny_scene)["test"]["1"]["psnr"] == pytest.approx(one["psnr"], abs=1e-9)
 
 
-def test_the_chosen_file_is_the_best(searched):
+def test_chosen_file_is_the_best(searched):
     found = json.loads((searched / "compress.json").read_text())
     assert found["chosen"]["psnr"] == max(one["psnr"] for one in found["points"])
     assert (searched / "compressed.sog").read_bytes() == (searched / found["chosen"]["file"]).read_bytes()
 
 
-def test_the_page_shows_every_file_and_the_curve(searched):
+def test_page_shows_every_file_and_the_curve(searched):
     text = (searched / "compress.html").read_text()
     found = json.loads((searched / "compress.json").read_text())
     assert all(one["file"] in text for one in found["points"])
@@ -159,7 +159,7 @@ def test_repeated_search_trains_nothing_and_gives_the_same_bytes(searched, few_s
     assert found["chosen"]["bytes"] == min(one["bytes"] for one in found["points"])
 
 
-def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatch):
+def test_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatch):
     opened: list[Path] = []
 
     def load(path):
@@ -272,7 +272,7 @@ def test_spz_losses_are_reported_once_per_search(few_steps, tiny_scene, tmp_path
     assert "read with the axes of SPZ" not in caplog.text
 
 
-def test_the_command_prints_a_table(searched, few_steps):
+def test_command_prints_a_table(searched, few_steps):
     arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
     found = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
     assert found.exit_code == 0, found.output

@@ -66,7 +66,7 @@ def test_merged_pair_has_the_moments_of_its_mixture(rng):
 
 
 @pytest.mark.parametrize("size", [surface, volume])
-def test_a_mixture_is_symmetric_in_its_pair(rng, size):
+def test_mixture_is_symmetric_in_its_pair(rng, size):
     tables = float64_tables(model(rng, 20))
     one, two = np.arange(10), np.arange(10, 20)
     there, back = merge(tables, one, two, size), merge(tables, two, one, size)

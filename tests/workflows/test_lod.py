@@ -73,7 +73,7 @@ def test_sizes_match_the_files(trained):
     assert sum(level["bytes"] for level in found["levels"]) == found["bytes"] - meta
 
 
-def test_a_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
+def test_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
     sky = Sky(rng.random((64, 3), np.float32))
     replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "model.ply")
     caplog.set_level("INFO")
@@ -82,7 +82,7 @@ def test_a_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
     assert "the sky of the finest level is in lod-meta_sky.json" in caplog.text
 
 
-def test_the_written_level_0_is_a_model(trained, few_steps, tiny_scene):
+def test_written_level_0_is_a_model(trained, few_steps, tiny_scene):
     folder, found = trained
     psnr = evaluate(folder, tiny_scene)["test"]["1"]["psnr"]
     assert psnr == pytest.approx(found["levels"][0]["psnr"], abs=1)
@@ -136,7 +136,7 @@ def moved(few_steps: Path, tiny_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog):
+def test_zero_steps_need_no_photographs(there, moved, tmp_path, caplog):
     if there:
         (tmp_path / "gone").mkdir()
     found = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
@@ -255,7 +255,7 @@ def test_invalid_plan_is_refused(plan, message):
         LodPlan(**plan)
 
 
-def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
+def test_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
     model = clsplat.load(few_steps)
     model[:0].save(tmp_path / "empty.ply")
     with pytest.raises(DataError, match=r"empty\.ply: the model has no Gaussians to merge"):
