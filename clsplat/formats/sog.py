@@ -161,6 +161,13 @@ def read_sog(path: Path) -> SplatFile:
         return _Sog(path, meta, files).splats()
 
 
+def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
+    """Raise DataError if files of `size` bytes cannot have `count` splats, and MemoryLimitError."""
+    if count > ALIKE + PIXELS_PER_BYTE * size:
+        raise DataError(f"{path}: declares {count} splats, but its files have only {size} bytes; copy it again")
+    require_memory(path, count, degree)
+
+
 class _Sog:
     """A SOG: its meta.json and the files that it names."""
 
@@ -173,11 +180,7 @@ class _Sog:
             raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
         self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
-        if self.count > ALIKE + PIXELS_PER_BYTE * files.size:
-            raise DataError(
-                f"{path}: declares {self.count} splats, but its files have only {files.size} bytes; copy it again"
-            )
-        require_memory(path, self.count, MAX_DEGREE if "shN" in meta else 0)
+        require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
 
     def splats(self) -> SplatFile:
         """Decode all parameters."""

@@ -106,7 +106,6 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
 HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
 SH_ENDS = (-1.5, 1.5)
-EMPTY = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 0}  # columns
 RANGE = 32767
 KINDS = (
     ("<f4", "<f4", "<f4"),
@@ -165,11 +164,10 @@ def read_ksplat(path: Path) -> SplatFile:
     """Read a `.ksplat` file.  Raises DataError if it is missing or damaged."""
     data = read_file(path, "a .ksplat file", limit=MAX_FILE)
     most, sections, _, splats, level = struct.unpack_from("<4IH", data.ljust(HEADER, b"\xff"), 4)
-    is_empty = len(data) >= HEADER and data[0] == 0 and not sections and not splats
-    if not is_empty and not looks_like_ksplat(data, len(data)):
+    if len(data) >= HEADER and not data[0] and not sections + splats:
+        raise DataError(f"{path}: has no splats; export it again")
+    if not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
-    if is_empty:
-        return SplatFile({name: np.zeros((0, width), np.float32) for name, width in EMPTY.items()})
     sections = sections or most  # the number of those loaded so far, which some writers leave at 0
     ends = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * most

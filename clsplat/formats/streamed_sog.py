@@ -20,7 +20,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.files import invalid_name_reason, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats.packing import morton_order, write_bytes
-from clsplat.formats.sog import MAX_META, META, read_sog, sog_folder_files, write_as_ordered
+from clsplat.formats.sog import MAX_META, META, read_sog, require_plausible, sog_folder_files, write_as_ordered
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
     MAX_DEGREE,
@@ -50,6 +50,8 @@ def read_lod(path: Path) -> SplatFile:
     runs = _runs(path, meta)[0]
     if not runs:
         raise DataError(f"{path}: its leaves have no file of level 0; export it again")
+    count = sum(count for one in runs.values() for _, count in one)
+    require_plausible(path, count, sum(file.stat().st_size for file in lod_files(path) if file.is_file()))
     parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
     _require_count(path, meta, 0, runs)
     if "environment" in meta:
@@ -99,7 +101,7 @@ def _meta(path: Path) -> dict[str, Any]:
         version = quote(meta.get("version") if isinstance(meta, dict) else meta)
         raise DataError(f"{path}: streamed SOG of version {version}; expected 1; export it again")
     names, counts = meta.get("filenames"), meta.get("counts")
-    if not isinstance(names, list) or len({_inside(path, name) for name in names}) < len(names):
+    if not isinstance(names, list) or len({PureWindowsPath(_inside(path, name)) for name in names}) < len(names):
         raise DataError(f"{path}: filenames is {quote(names)}; expected distinct file names; export it again")
     if not isinstance(counts, list) or not 1 <= len(counts) <= MAX_LEVELS:
         raise DataError(

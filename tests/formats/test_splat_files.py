@@ -137,7 +137,8 @@ def test_ksplat_without_a_section_count_has_all_sections(tmp_path):
     (tmp_path / "a.ksplat").write_bytes(ksplat(sections=0))
     assert len(read(tmp_path / "a.ksplat")) == 3
     (tmp_path / "a.ksplat").write_bytes(ksplat(count=0, sections=0)[:4096])
-    assert len(read(tmp_path / "a.ksplat")) == 0
+    with pytest.raises(DataError, match=r"a\.ksplat: has no splats; export it again"):
+        read(tmp_path / "a.ksplat")
 
 
 def test_splat_is_recognized_unless_the_name_is_of_another(tmp_path):

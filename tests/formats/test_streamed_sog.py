@@ -271,6 +271,11 @@ WRONG = {
     "no number": ({"tree": {"lods": {"0": {"file": 0, "offset": "0", "count": 1}}}}, "offset of a leaf is '0'"),
     "a negative number": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": -1}}}}, "count of a leaf is -1"),
     "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "which has"),
+    "more than its files hold": (
+        {"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 10**8}}}},
+        "declares 100000000 splats, but its files have only",
+    ),
+    "a file twice": ({"filenames": ["0_0/meta.json", "0_0//meta.json"]}, "expected distinct file names"),
     "a run twice": ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}}, "in other"),
 }
 
