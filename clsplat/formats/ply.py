@@ -27,6 +27,7 @@ from clsplat.core.reading import open_file
 from clsplat.formats.packing import open_hashed
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
+    FLATNESS,
     MAX_DEGREE,
     MOTION,
     PARAMETERS,
@@ -370,7 +371,8 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     most = 3 * (sh_coefficients(MAX_DEGREE) - 1)
     parameters["sh_rest"] = np.ascontiguousarray(reorder_columns(by_channel, 3, len(columns) // 3)[:, :most])
     if parameters["log_scales"].shape[1] == 2:
-        parameters["log_scales"] = np.pad(parameters["log_scales"], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
+        thin = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
+        parameters["log_scales"] = np.hstack([parameters["log_scales"], thin]).astype(np.float32)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
         with np.errstate(over="ignore"):  # infinity is refused later

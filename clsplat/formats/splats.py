@@ -93,6 +93,7 @@ MOST = 0.5  # share of values outside of their range that shows another unit; mi
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
+FLATNESS = -6.907755  # log 1e-3: of that axis by the others, at most
 # axes in which the functions of bands 1 to 3 are odd
 PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
@@ -250,13 +251,16 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
     return found
 
 
+def typical_size(means: NDArray[np.floating]) -> float:
+    """Return the median distance of means, [N, 3], from their middle, or the largest one if that is 0, scene units."""
+    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
+    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1) if len(finite) else np.zeros(1)
+    return float(np.median(distances)) or float(distances.max()) or 1.0
+
+
 def usual_near(means: NDArray[np.floating]) -> float:
     """Return the near plane of Gaussians with these means, [N, 3], if no file or scene gives one, scene units."""
-    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
-    if not len(finite):
-        return NEAR_SHARE
-    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
-    return NEAR_SHARE * (float(np.median(distances)) or float(distances.max()) or 1.0)
+    return NEAR_SHARE * typical_size(means)
 
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:

@@ -61,6 +61,7 @@ from clsplat.formats.splats import (
     require_memory,
     sh_coefficients,
     transform,
+    typical_size,
     unit,
     warn_dropped,
 )
@@ -74,6 +75,7 @@ HEADER = 16  # bytes
 COLOR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
+COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units have more bits, up to those that readers take
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
 # steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
@@ -170,17 +172,19 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
     Raises DataError for positions that do not fit even without fractional bits.
     """
     largest = float(np.abs(means).max(initial=0))
-    bits = min(FINE_FRACTION if fine else FRACTION, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
+    more = max(0, round(-math.log2(typical_size(means))) - COARSE)  # in a small unit of length
+    wanted = min((FINE_FRACTION if fine else FRACTION) + more, MAX_FRACTION)
+    bits = min(wanted, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
     if bits < 0:
         raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {largest:g}; crop it")
-    if bits < FRACTION:
+    if bits < min(FRACTION + more, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
             "crop the model for more precision",
             path,
             largest,
             2.0**-bits,
-            2.0**-FRACTION,
+            2.0**-wanted,
         )
     return bits
 

@@ -29,6 +29,7 @@ from clsplat.formats.splats import (
     Writing,
     require_gaussians,
     require_in_range,
+    typical_size,
     unit,
     with_degree,
 )
@@ -201,7 +202,7 @@ class LeafLimits:
     """The limits of a leaf; the defaults are those of PlayCanvas."""
 
     splats: int = 512 * 1024  # of all levels; a file exceeds it by one leaf at most
-    extent: float = 16.0  # longest side of the bounding box of means, scene units
+    extent: float = 4.0  # longest side of the bounding box of means, in typical sizes: 16 scene units at a size of 4
     few: int = 1024  # splats that are never split because of their extent
 
 
@@ -225,12 +226,12 @@ class Node:
 def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
     """Build the tree of levels, finest first; no level may be empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
-    reach = np.concatenate([half_boxes(level) for level in levels])
+    reach, longest = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
 
     def node(rows: Rows) -> Node:
         span = np.ptp(means[rows], axis=0)
-        if len(rows) > limits.splats or (span.max() > limits.extent and len(rows) > limits.few):
+        if len(rows) > limits.splats or (span.max() > longest and len(rows) > limits.few):
             ordered = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
             halves = node(ordered[: len(rows) // 2]), node(ordered[len(rows) // 2 :])
             low = np.minimum(*(half.low for half in halves))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message
+from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message, typical_size
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
@@ -14,7 +14,7 @@ from clsplat.scene.scene import position_text
 
 OTHERS = (".usd", ".usdc", ".usdz", ".obj", ".fbx", ".las", ".laz", ".rad", ".lcc")  # models that cannot be read
 MIN_COUNT = 16  # Gaussians needed for statistics
-FLAT = 1e-6  # scene units; smaller scales are those of discs or needles
+FLAT = 1e-6  # relative to the typical size; smaller scales are those of discs or needles
 FAINT = 0.999 / 255  # opacities below are not rendered
 LARGE = 0.05  # relative to the extent; linear scales misread as logarithms exceed it
 NEARLY_ALL = 0.99
@@ -63,7 +63,7 @@ def examine(path: Path) -> dict[str, Any]:
         "degenerate": {
             "not_finite": int(bad.sum()),
             "no_rotation": zero,
-            "flat": int((finite.log_scales < np.log(FLAT)).any(axis=1).sum()),
+            "flat": int((finite.log_scales < np.log(FLAT * typical_size(finite.means))).any(axis=1).sum()),
             "invisible": int((finite.opacities < FAINT).sum()),
         },
         "findings": findings,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, NumericError, pluralize
+from clsplat.core.errors import DataError, NumericError, pluralize, quote
 from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison
@@ -317,6 +317,9 @@ def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> f
     return float(sums.get().sum(dtype=np.float64)) / (3 * camera.width * camera.height)
 
 
+EMPTY_PSNR, EMPTY_ALPHA = 20.0, 0.01  # dB and mean alpha, below which almost nothing is drawn of what a photo shows
+
+
 def measure(
     painter: Painter,
     views: Sequence[View],
@@ -333,7 +336,7 @@ def measure(
     for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
     views wrapped by a progress counter; trained: the training views, for metrics by timestamp.
     """
-    results, stillness = list[ViewMetrics](), Stillness(views)
+    results, stillness, empty = list[ViewMetrics](), Stillness(views), list[str]()
     for view in views if counted is None else counted:
         photograph = photographs.get(view)
         if photograph.empty:
@@ -353,6 +356,13 @@ def measure(
             similarity = ssim(rendered, image, mask)
         more = perceptual.measure(rendered, image)
         results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, color, still))
+        if results[-1].psnr < EMPTY_PSNR and painter.layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
+            empty.append(view.name)
+    if empty:
+        LOG.warning(
+            "almost nothing is drawn in %d of %s, such as %s; check that the model fits the cameras, and model.near",
+            *(len(empty), pluralize(len(views), "view"), quote(empty[0])),
+        )
     flicker, moments = stillness.figures(), by_moment({result.view: result.psnr for result in results}, views, trained)
     return [
         replace(result, still={**result.still, **flicker.get(result.view, {})}, moments=moments.get(result.view, {}))

@@ -250,7 +250,7 @@ def position_text(position: Floats) -> str:
     return f"({', '.join(f'{value:.15g}' for value in position)})"
 
 
-def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None) -> float:
+def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = None) -> float:
     """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
@@ -258,13 +258,17 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None) ->
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     middle = centers.mean(axis=0)
-    radius = 1.1 * float(np.linalg.norm(centers - middle, axis=1).max())
-    if radius > ROUNDING * float(np.abs(middle).max()):
-        return radius
+    if not share_center(centers):
+        return 1.1 * float(np.linalg.norm(centers - middle, axis=1).max())
     around = np.zeros((0, 3)) if points is None else points.astype(np.float64)
     around = around[np.isfinite(around).all(axis=1)]
     distances = np.linalg.norm(around - middle, axis=1) if len(around) else np.abs([views[0].world_to_camera[2, 3]])
     return float(np.median(distances)) or 1.0
+
+
+def share_center(centers: Floats) -> bool:
+    """Return whether camera centers, [V, 3], are one point, up to rounding."""
+    return bool(np.ptp(centers, axis=0).max() <= ROUNDING * np.abs(centers).max())
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:

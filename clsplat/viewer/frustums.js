@@ -48,5 +48,5 @@ class Frustums {
 // Project a point of the world to the canvas of a frame; null if it is behind the camera.
 function projected({rotation, translation, intrinsics: [fx, fy, cx, cy]}, point) {
   const [x, y, z] = [0, 1, 2].map(i => dot(rotation.slice(3 * i, 3 * i + 3), point) + translation[i]);
-  return z > 1e-3 ? [fx * x / z + cx, fy * y / z + cy] : null;
+  return z > 0 ? [fx * x / z + cx, fy * y / z + cy] : null;
 }

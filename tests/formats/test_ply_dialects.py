@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from clsplat.core.errors import DataError
 from clsplat.formats.ply import write_ply
-from clsplat.formats.splats import FLAT_LOG_SCALE
+from clsplat.formats.splats import FLAT_LOG_SCALE, FLATNESS
 from clsplat.formats.table import detect, read, write
 from tests.support.models import as_text, interop, round_trip, splats
 
@@ -35,15 +35,18 @@ def test_every_spelling_of_the_mip_mark_is_read(mark, tmp_path, rng):
     assert read(path).mode == MARKS[mark]
 
 
-def test_disc_gets_a_tiny_third_axis(tmp_path, rng):
+@pytest.mark.parametrize(("unit", "third"), [(0, FLAT_LOG_SCALE), (-10, -16 + FLATNESS)])
+def test_disc_gets_a_tiny_third_axis(tmp_path, rng, unit, third):
     path, source = tmp_path / "a.ply", splats(rng, 5).parameters
+    source["log_scales"] = np.maximum(source["log_scales"], -6) + np.float32(unit)
+    source["log_scales"][:, 0] = np.float32(unit - 6)
     write_ply(path, source, {})
     header, body = path.read_bytes().split(b"end_header\n", 1)
     rows = np.delete(np.frombuffer(body, "<f4").reshape(5, -1), 57, axis=1)
     path.write_bytes(header.replace(b"property float scale_2\n", b"") + b"end_header\n" + rows.tobytes())
     found = read(path).parameters
     np.testing.assert_array_equal(found["log_scales"][:, :2], source["log_scales"][:, :2])
-    np.testing.assert_array_equal(found["log_scales"][:, 2], np.float32(FLAT_LOG_SCALE))
+    np.testing.assert_allclose(found["log_scales"][:, 2], third, rtol=1e-6)
     np.testing.assert_array_equal(found["quats"], source["quats"])
 
 

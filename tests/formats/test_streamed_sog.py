@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError, DataError, OutputError
 from clsplat.core.files import new_folder
 from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
-from clsplat.formats.splats import SplatFile, Writing
+from clsplat.formats.splats import SplatFile, Writing, typical_size
 from clsplat.formats.streamed_sog import LeafLimits, half_boxes, tree, write_lod
 from clsplat.formats.table import detect, model_bytes, read, write
 from clsplat.gaussians.conversion import convert
@@ -100,7 +100,7 @@ def test_too_large_leaves_are_divided(rng):
         for leaf in found:
             span = np.ptp(parameters["means"][leaf.rows[0]], axis=0).max()
             assert len(leaf.rows[0]) <= limits.splats
-            assert span <= limits.extent or len(leaf.rows[0]) <= limits.few
+            assert span <= limits.extent * typical_size(parameters["means"]) or len(leaf.rows[0]) <= limits.few
             np.testing.assert_array_equal(morton_order(parameters["means"][leaf.rows[0]]), np.arange(len(leaf.rows[0])))
         np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in found])), np.arange(700))
 

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import Rendering, load
+from clsplat.formats.splats import SplatFile, Writing
+from clsplat.formats.table import write
+from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
 from clsplat.scene.quality import near_plane
 from clsplat.scene.scene import PointCloud, Scene, camera_extent
 from tests.support.commands import clsplat
+from tests.support.models import splats
 from tests.support.transforms_scene import scaled
 
 FACTORS = 1e-4, 1e5
@@ -99,3 +102,22 @@ def test_cameras_with_one_center_have_an_extent(tiny_scene, factor):
     assert extent(scene, 2, with_points=True) == extent(scene, 1, with_points=True)
     assert extent(scene, 1, with_points=True) / factor == pytest.approx(3.8, rel=0.1), "the distance of the points"
     assert extent(scene, 1, with_points=False) / factor == pytest.approx(3.8, rel=0.1), "the depth of zero"
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.sog", "a.glb", "a.splat"])
+def test_files_hold_positions_in_small_units(rng, tmp_path, name):
+    parameters = splats(rng, 200).parameters
+    means, log_scales = parameters["means"] * np.float32(1e-4), parameters["log_scales"] + np.float32(np.log(1e-4))
+    source = SplatFile({**parameters, "means": means, "log_scales": log_scales}, {}, "default")
+    write(tmp_path / name, source, Writing(quiet=True))
+    distances = np.linalg.norm(means[:, None] - load(tmp_path / name).means, axis=2).min(axis=1)
+    assert distances.max() < 5e-6
+
+
+def test_a_view_in_which_nothing_is_drawn_is_reported(tiny_scene, tmp_path, rng, caplog):
+    model = Model(**splats(rng, 50).parameters)
+    for distance, reported in ((0, False), (500, True)):
+        replace(model, means=model.means + np.float32(distance)).save(tmp_path / "a.ply")
+        caplog.clear()
+        evaluate(tmp_path / "a.ply", tiny_scene)
+        assert ("almost nothing is drawn in 2 of 2 views" in caplog.text) is reported

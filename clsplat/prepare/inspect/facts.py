@@ -25,7 +25,7 @@ from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.reader import Parts
 from clsplat.scene.reprojection import reprojection_errors, require_points_in_front
-from clsplat.scene.scene import camera_extent, outlier_cameras
+from clsplat.scene.scene import camera_extent, outlier_cameras, share_center
 from clsplat.scene.times import distinct_times, group_by_camera
 from clsplat.scene.view import NO_FILE, View, fits_camera, load_exposures
 
@@ -310,8 +310,8 @@ def measure_dataset(parts: Parts) -> Facts:
         else [],
         timestamps=len(distinct_times(views)),
         moving_cameras=len(group_by_camera(views)) if distinct_times(views) else 0,
-        same_center=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
-        same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
+        same_center=len(views) > 1 and share_center(centers),
+        same_pose=_repeated(names, [(v.time, v.downscale, *_pose(v, extent)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,
         hint=parts.hint,
@@ -335,6 +335,11 @@ def distortion(lens: Lens) -> float | None:
 
 def _relative(file: Path, parts: Parts) -> str:
     return os.path.relpath(file, parts.path).replace(os.sep, "/")
+
+
+def _pose(view: View, extent: float | None) -> tuple[float, ...]:
+    """Return the pose of a view in units of the extent, rounded."""
+    return tuple((view.world_to_camera / [1, 1, 1, extent or 1]).ravel().round(9))
 
 
 def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
