@@ -132,13 +132,13 @@ def test_photographs_without_features(tmp_path):
         map_photographs(tmp_path, tmp_path / "out")
 
 
-@pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
-def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, five, attempt):
+@pytest.mark.parametrize(("count", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
+def test_second_attempt_registers_more_photographs(photos, tmp_path, monkeypatch, count, attempt):
     """With few features per photograph."""
     monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(480, 1500))
     for name in ("features", "matches", "cameras"):
         (tmp_path / name).mkdir()
-    find_features(photos, tmp_path / "features", FeatureOptions(480, five))
+    find_features(photos, tmp_path / "features", FeatureOptions(480, count))
     match_features(tmp_path / "features", tmp_path / "matches")
     figures = map_cameras(tmp_path / "matches", tmp_path / "cameras")
     assert figures["attempt"] == attempt
