@@ -65,7 +65,8 @@ BY_POINTS = (
 )
 def inspect(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE", help="Dataset folder (COLMAP, Blender, nerfstudio, …) or run folder.")
+        Path,
+        typer.Argument(metavar="SCENE", help="Dataset folder (COLMAP, Blender, nerfstudio, …), photos, or run folder."),
     ],
     as_json: JsonOption = False,
     page: Annotated[
@@ -80,7 +81,7 @@ def inspect(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Report whether a dataset can be trained on, and its problems; exit code 3 if it cannot."""
+    """Report whether a dataset or photos can be trained on, and their problems; exit code 3 if not."""
     from clsplat.prepare.inspect.findings import show
     from clsplat.workflows.blocks import table
 
@@ -104,7 +105,7 @@ def inspect(
     else:
         show(inspection, terminal.CONSOLE)
         signals.check_output()
-    if not inspection.trainable:
+    if not inspection.trainable and not inspection.next_step:
         raise DataError(inspection.verdict)
 
 

@@ -28,6 +28,7 @@ from clsplat.scene.images import (
     write_exposures,
 )
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
+from clsplat.scene.quality import shows_nothing
 from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
@@ -78,7 +79,7 @@ def require_photographs(folder: Path, without: Path | None = None) -> None:
         more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
         raise DataError(
             f"{folder}: has {pluralize(len(names), 'photograph')}; "
-            f"expected at least {MIN_PHOTOGRAPHS} ({suffixes}){more}"
+            f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){more}"
         )
 
 
@@ -113,13 +114,14 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     Return the names of the readable photographs, and why the others cannot be read.
     """
     readable, damaged, count = [], dict[str, str](), Count("photographs read", len(names))
+    blank = 0
     for number, name in enumerate(names, 1):
         count.reach(number)
         if _is_there(photographs / name, images / name):
             readable.append(name)
             continue
         try:
-            _gather_one(photographs / name, images / name)
+            blank += _gather_one(photographs / name, images / name)
         except DataError as error:
             damaged[name] = why_unreadable(photographs / name, error)
             continue
@@ -128,6 +130,8 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     write_exposures(images, {name: read_exif_exposure(photographs / name) for name in readable})
     if times := read_times(photographs):
         write_times(images, {name: times[name] for name in readable if name in times})
+    if readable and blank == len(readable):
+        raise DataError(f"{photographs}: no photograph shows anything; export or take them again")
     if len(readable) < MIN_PHOTOGRAPHS:
         faults = first_few([f"{name} ({reason})" for name, reason in damaged.items()])
         raise DataError(
@@ -156,8 +160,11 @@ def remedy_for(damaged: Mapping[str, str]) -> str:
     return "; ".join(texts)
 
 
-def _gather_one(source: Path, target: Path) -> None:
-    """Link a photograph, or write it upright with its EXIF data.  Raises DataError when it cannot be read."""
+def _gather_one(source: Path, target: Path) -> bool:
+    """Link a photograph, or write it upright with its EXIF data; return whether it shows nothing.
+
+    Raises DataError when it cannot be read.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     data = read_file(source, "an image", limit=MAX_BYTES)
     if data.startswith(JPEG) and (header := parse_header(data, data[-TAIL_SIZE:], lambda: data)):
@@ -172,6 +179,7 @@ def _gather_one(source: Path, target: Path) -> None:
         _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
         with open_atomic(target) as file:
             file.write(copy_exif(data, encoded.tobytes()))
+    return shows_nothing(pixels)
 
 
 def link(source: Path, target: Path) -> None:

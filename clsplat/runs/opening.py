@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.conformance.quick import open_verified
-from clsplat.core.errors import ConfigError, DataError, pluralize
+from clsplat.core.errors import ConfigError, DataError, first_few, pluralize
 from clsplat.core.files import UNDISTORTED
 from clsplat.core.machine import Owner
 from clsplat.core.progress import Listener, listening, log_level
@@ -25,7 +25,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.run_folder import Start
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import Identity, decode_all, require_decodable
+from clsplat.scene.identity import Identity, decode_all, require_content, require_decodable
 from clsplat.scene.quality import Measures, measure_scene, near_depth, near_plane
 from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
@@ -79,6 +79,9 @@ class RunScene:
             view for version in (original, downscaled) for split in SPLITS for view in version.split(split)
         )
         require_decodable(scene.path, files)
+        if blank := require_content(scene.path, original.split("train"), files):
+            count = pluralize(len(blank), "photograph")
+            LOG.warning("%s: %s: black, of one color, or transparent: %s", scene.path, count, first_few(blank))
         return cls(original, downscaled, background, Identity.from_scene(original, files))
 
 

@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clsplat.core.errors import DataError, OutputError
+from clsplat.core.errors import DataError, OutputError, first_few, pluralize
 from clsplat.core.machine import cache_folder
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
+from clsplat.scene.quality import excludes_all, shows_nothing
 from clsplat.scene.scene import SPLITS, PointCloud, Scene
 from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
@@ -29,6 +30,7 @@ from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 MAX_THREADS = 8  # each has one photograph in memory
 MAX_REMEMBERED = 1 << 24  # bytes: about 200 000 photographs
 MAX_NAMES = 3  # in a message
+Entry = tuple[int, int, int]  # width and height, px, and bits: shows nothing, uses no pixel as a mask, is transparent
 
 
 @dataclass
@@ -40,6 +42,9 @@ class ImageFile:
     orientation: int = 1  # from EXIF; 1: upright
     cut: bool = False  # its end is missing
     fault: str = ""  # the error that training would report
+    blank: bool = False  # as a photograph: it shows nothing
+    excluded: bool = False  # as a mask: it uses no pixel
+    transparent: bool = False
 
 
 def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
@@ -75,6 +80,32 @@ def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
         raise DataError(f"{path}: {len(damaged)} of {len(files)} image files cannot be trained on: {named}{more}")
 
 
+def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:
+    """Return the names of the views whose photographs show nothing.
+
+    Raises DataError if all do, or if a mask excludes every pixel of a photograph, as training would.
+    """
+    masked = [view for view in views if _is_excluded(view, files)]
+    if masked:
+        named = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
+        raise DataError(
+            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photograph')}: {named}; masks are white "
+            "(255) in pixels to use: correct them, or remove these photographs"
+        )
+    blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
+    if blank and len(blank) == len(views):
+        raise DataError(
+            f"{path}: no photograph shows anything: {first_few(blank)} are black, of one color, or transparent; export "
+            "them again"
+        )
+    return blank
+
+
+def _is_excluded(view: View, files: Mapping[Path, ImageFile]) -> bool:
+    mask, image = (files.get(file) if file else None for file in (view.mask_path, view.image_path))
+    return bool((mask and mask.excluded) or (view.alpha == "mask" and image and image.transparent))
+
+
 def _examine(file: Path, views: list[View], result: ImageFile, known: "DecodedSizes") -> None:
     try:
         data = read_file(file, "an image", limit=MAX_BYTES)
@@ -82,6 +113,7 @@ def _examine(file: Path, views: list[View], result: ImageFile, known: "DecodedSi
         if header := parse_header(data, data[-TAIL_SIZE:], lambda: data):
             result.orientation, result.cut = header.orientation, not header.complete
         result.size = known.size(result.digest, data, file)
+        result.blank, result.excluded, result.transparent = known.contents(result.digest)
         for view in views:
             needs_rotation(view, file, lambda upright: known.size(result.digest, data, file, upright))
     except DataError as error:
@@ -89,17 +121,17 @@ def _examine(file: Path, views: list[View], result: ImageFile, known: "DecodedSi
 
 
 class DecodedSizes:
-    """A cache of the sizes of images that this version of the decoder has decoded, by content hash.
+    """A cache of the sizes of images that this version of the decoder has decoded, by content hash, and what they show.
 
     It is a text file in the user's cache folder; if that cannot be used, all images are decoded.
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, Size] = {}
-        self._new: dict[str, Size] = {}
+        self._known: dict[str, Entry] = {}
+        self._new: dict[str, Entry] = {}
         self.path: Path | None = None
         with suppress(DataError, OutputError):
-            self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-as-stored.txt"
+            self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-contents.txt"
             lines = read_file(self.path, limit=MAX_REMEMBERED).splitlines(keepends=True)
             self._known = dict(filter(None, map(_entry, lines)))
 
@@ -107,15 +139,23 @@ class DecodedSizes:
         """Return (width, height) of the content of `file`, decoding it if it is not cached.  Raises DataError."""
         key = f"{digest}-upright" if upright else digest
         if key not in self._known:
-            height, width = decode_image(data, file, upright).shape[:2]
-            self._known[key] = self._new[key] = width, height
-        return self._known[key]
+            pixels = decode_image(data, file, upright)
+            is_transparent = pixels.shape[2] == 4 and excludes_all(pixels[:, :, 3])
+            shown = shows_nothing(pixels), excludes_all(pixels[:, :, 0]), is_transparent
+            height, width = pixels.shape[:2]
+            self._known[key] = self._new[key] = width, height, sum(2**bit for bit, is_set in enumerate(shown) if is_set)
+        return self._known[key][:2]
+
+    def contents(self, digest: str) -> tuple[bool, bool, bool]:
+        """Return whether a known image shows nothing, uses no pixel as a mask, and is transparent."""
+        bits = self._known[digest][2]
+        return bool(bits & 1), bool(bits & 2), bool(bits & 4)
 
     def save(self) -> None:
         """Append the new sizes in one write, so that lines of two processes do not mix."""
         if self.path is None or not self._new:
             return
-        lines = "".join(f"{key} {width} {height}\n" for key, (width, height) in self._new.items())
+        lines = "".join(f"{key} {width} {height} {bits}\n" for key, (width, height, bits) in self._new.items())
         with suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             full = self.path.exists() and self.path.stat().st_size >= MAX_REMEMBERED
@@ -123,12 +163,12 @@ class DecodedSizes:
                 file.write(lines.encode())
 
 
-def _entry(line: bytes) -> tuple[str, Size] | None:
-    """Return the key and the size on a complete line, otherwise None."""
+def _entry(line: bytes) -> tuple[str, Entry] | None:
+    """Return the key and the entry on a complete line, otherwise None."""
     words = line.split()
-    if len(words) != 3 or not line.endswith(b"\n") or not re.fullmatch(rb"\d{1,7} \d{1,7}", b" ".join(words[1:])):
+    if len(words) != 4 or not line.endswith(b"\n") or not re.fullmatch(rb"\d{1,7} \d{1,7} [0-7]", b" ".join(words[1:])):
         return None
-    return words[0].decode(errors="replace"), (int(words[1]), int(words[2]))
+    return words[0].decode(errors="replace"), (int(words[1]), int(words[2]), int(words[3]))
 
 
 Row = dict[str, str]  # hashes of the photograph, mask and camera of a view, "" if there is none; its time if it has one

@@ -272,6 +272,7 @@ def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
 
 EXPOSURES_FILE = "exposures.json"  # in a folder of images
 EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
+GPS_IFD, LATITUDE, LONGITUDE = 0x8825, 2, 4
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm equivalent for 35 mm film
 TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # types of values
@@ -311,6 +312,24 @@ def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
     return tuple(values) if any(values[2:]) else None
 
 
+@dataclass(frozen=True)
+class ExifCamera:
+    """Which camera took a photograph."""
+
+    name: str  # make, model, and focal length; "" if unknown
+    is_located: bool  # whether there is a GPS position
+
+
+def read_exif_camera(path: Path) -> ExifCamera:
+    """Return the camera in the EXIF data of a JPEG file.  Raises DataError when it cannot be read."""
+    with open_file(path, "an image") as file:
+        tags = _read_tags(file.read(HEAD_SIZE))
+    make, model, focal = (tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL))
+    parts = [] if str(model).startswith(str(make)) else [str(make)]
+    parts += [str(model), f"{focal:g} mm" if isinstance(focal, float) else ""]
+    return ExifCamera(" ".join(filter(None, parts)), LATITUDE in tags and LONGITUDE in tags)
+
+
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:
     """Return the upright `jpeg` with the EXIF data in the first bytes of another file, without its rotation."""
     segment = find_exif_segment(head)
@@ -335,7 +354,9 @@ def _read_tags(head: bytes) -> dict[int, Value]:
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
         tags.update(_values(block, order, int(start)))
-        tags.update(_values(block, order, int(tags[EXIF_IFD])))
+        for pointer in (EXIF_IFD, GPS_IFD):
+            if pointer in tags:
+                tags.update(_values(block, order, int(tags[pointer])))
     return tags
 
 

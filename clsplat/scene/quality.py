@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.scene.images import read_gray
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.view import View, load_mask, load_transparency, sample_views
+from clsplat.scene.view import MIN_WHITE, View, load_mask, load_transparency, sample_views
 
 NEAREST = 0.01  # quantile of the depths of observed points: a few nearer ones are wrong
 NEAR_SHARE = 0.04  # of the extent
@@ -114,6 +115,29 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
     The first one is also small for a dark photograph, the second one for a bright photograph among dark ones.
     """
     return bool((values < BLURRED * median).all())
+
+
+# Photographs and masks that show nothing.
+
+DARK, PLAIN = 8, 2  # gray levels of 255: the brightest of a black image, and the range of an image of one color
+
+
+def shows_nothing(pixels: NDArray[Any]) -> bool:
+    """Return whether an image, [H, W] or [H, W, C], is black, of one color, or transparent everywhere."""
+    unit = 255 / np.iinfo(pixels.dtype).max
+    channels = pixels.reshape(*pixels.shape[:2], -1)
+    if channels.shape[2] == 4 and not channels[:, :, 3].all():  # a silhouette shows its outline
+        return not channels[:, :, 3].any()
+    for part in (channels[::16, ::16, :3], channels[:, :, :3]):  # the first one decides for nearly all photographs
+        low, high = part.min(axis=(0, 1)) * unit, part.max(axis=(0, 1)) * unit
+        if high.max() >= DARK and (high - low).max() > PLAIN:
+            return False
+    return True
+
+
+def excludes_all(layer: NDArray[Any]) -> bool:
+    """Return whether a mask, [H, W], uses no pixel."""
+    return bool(layer.max() <= MIN_WHITE * np.iinfo(layer.dtype).max)
 
 
 # Transparency of photographs.

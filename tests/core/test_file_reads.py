@@ -130,7 +130,7 @@ def test_records_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, ca
         os.mkfifo(tmp_path / "known.txt")
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()
-        os.mkfifo(tmp_path / "decoded" / f"opencv-{identity.cv2.__version__}-as-stored.txt")
+        os.mkfifo(tmp_path / "decoded" / f"opencv-{identity.cv2.__version__}-contents.txt")
         assert identity.DecodedSizes()._known == {}
 
 

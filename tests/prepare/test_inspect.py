@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 
 from clsplat.core.errors import DataError
 from clsplat.formats.table import write as write_splats
+from clsplat.pipeline.file import SceneSettings
 from clsplat.prepare.inspect.facts import distortion
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.prepare.inspect.page import MAX_NAMES, inspection_page
+from clsplat.runs.opening import RunScene
 from clsplat.scene.camera import Lens
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
@@ -380,6 +382,38 @@ def test_rotated_images_that_the_reader_turns(tmp_path):
     file.write_bytes(with_exif(file.read_bytes(), "<", 6))
     assert Inspection.from_folder(path).findings == []
     assert load_image(read_scene(path).views[6]).shape == (48, 64, 3)
+
+
+def make_blank(files: list[Path], kind: str) -> None:
+    for file in files:
+        pixels = cv2.imread(str(file))
+        if kind == "mask":
+            (file.parents[1] / "masks").mkdir(exist_ok=True)
+            file = file.parents[1] / "masks" / file.name
+            pixels = np.ones_like(pixels)
+        elif kind == "transparent":
+            pixels = np.dstack([pixels, np.zeros_like(pixels[:, :, :1])])
+        else:
+            pixels = np.full_like(pixels, {"black": 3, "one color": 130}[kind])
+        cv2.imwrite(str(file), pixels)
+
+
+@pytest.mark.parametrize("kind", ["black", "one color", "transparent", "mask"])
+def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, caplog):
+    files = sorted((scene / "images").iterdir())
+    make_blank([files[1]], kind)
+    inspection = Inspection.from_folder(scene)
+    if kind != "mask":
+        assert "1 photograph is black, of one color, or transparent (01.png)" in finding_text(inspection, "warning")
+        RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
+        assert "1 photograph: black, of one color, or transparent: 01.png" in caplog.text
+        make_blank(files, kind)
+        inspection = Inspection.from_folder(scene)
+    with pytest.raises(DataError) as error:
+        RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
+    words = "masks exclude every pixel of 1 photograph" if kind == "mask" else "no photograph shows anything"
+    assert words in str(error.value)
+    assert inspection.verdict.startswith(f"cannot train: {words}")
 
 
 def test_masks(scene):

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -16,13 +16,20 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.progress import captured_log, counted, log_level
-from clsplat.prepare.gather import list_photographs, why_unreadable
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
 from clsplat.scene.detect import find_dataset, read_scene
-from clsplat.scene.identity import ImageFile, decode_all
-from clsplat.scene.images import CameraExposure, is_image, read_exif_exposure, read_gray
+from clsplat.scene.identity import ImageFile, decode_all, require_content
+from clsplat.scene.images import (
+    CameraExposure,
+    is_image,
+    read_exif_camera,
+    read_exif_exposure,
+    read_gray,
+    read_header,
+)
 from clsplat.scene.points import MAX_VALUE
-from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred
+from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred, shows_nothing
 from clsplat.scene.reader import Parts
 from clsplat.scene.reprojection import reprojection_errors, require_points_in_front
 from clsplat.scene.scene import camera_extent, outlier_cameras, share_center
@@ -44,6 +51,7 @@ class PhotographMeasures:
     sharpness: NDArray[np.float64]  # [2], the two measures of both_sharpnesses
     brightness: NDArray[np.float64]  # [2], mean and median, gray levels
     thumbnail: NDArray[np.float32]  # [THUMBNAIL²], gray levels
+    is_blank: bool  # it shows nothing
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class ComparisonFacts:
         tuple[str, str, float]
     ]  # a photograph, the next one, and their brightness ratio, if EXIF lacks exposures
     unreadable: dict[str, str]  # the reason why they cannot be decoded
+    blank: list[str]  # black or of one color
 
 
 def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
@@ -95,6 +104,7 @@ def compare_photos(
         unreadable={
             name: why_unreadable(files[name], error) for name, error in measured.items() if isinstance(error, DataError)
         },
+        blank=[name for name, photo in photos.items() if photo.is_blank],
     )
 
 
@@ -106,7 +116,7 @@ def _measure(file: Path) -> PhotographMeasures | DataError:
         return error
     small = cv2.resize(gray, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     brightness = np.maximum([gray.mean(), np.median(gray)], 1.0)
-    return PhotographMeasures(both_sharpnesses(gray), brightness, small.astype(np.float32).ravel())
+    return PhotographMeasures(both_sharpnesses(gray), brightness, small.astype(np.float32).ravel(), shows_nothing(gray))
 
 
 def _brightness_steps(
@@ -231,6 +241,17 @@ class PhotographFacts:
     on_side: list[str]  # misfits whose width and height are swapped
     exif_turned: list[str]  # read as stored although EXIF contains a rotation
     masks: int
+    blank: list[str]  # of training views: black, of one color, or transparent
+    no_content: str  # why training cannot use them: masks exclude all pixels, or all are blank
+
+
+@dataclass(frozen=True)
+class CaptureFacts:
+    """What files without cameras tell about the capture, with the number of photographs."""
+
+    sizes: dict[str, int]  # as stored
+    cameras: dict[str, int]  # make, model, and focal length by EXIF
+    located: int  # photographs with a GPS position
 
 
 @dataclass(frozen=True)
@@ -250,6 +271,7 @@ class Facts:
     cameras: list[CameraFacts]
     photos: PhotographFacts
     comparison: ComparisonFacts
+    capture: CaptureFacts | None  # None when there are views
     points: PointFacts | None
     points_per_view: dict[str, int]  # sparse points that each view shows; empty if the dataset does not say
     extent: float | None  # scene units
@@ -265,6 +287,15 @@ class Facts:
     notes: list[str]  # sentences about files that are not where the dataset says
     faults: list[str]  # why parts of it cannot be read
     refusal: str  # why training does not start
+
+    @property
+    def unplaced(self) -> bool:
+        """Whether these are photographs whose cameras `clsplat run photos` can find."""
+        return (
+            self.kind == "none"
+            and not self.faults
+            and self.on_disk - len(self.comparison.unreadable) >= MIN_PHOTOGRAPHS
+        )
 
     @property
     def few_points(self) -> list[str]:
@@ -299,8 +330,9 @@ def measure_dataset(parts: Parts) -> Facts:
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
-        photos=_photographs(views, set(missing)),
+        photos=_photographs(parts, set(missing)),
         comparison=compare_views(parts, set(missing)),
+        capture=None if views else measure_capture(parts.on_disk),
         points=measure_points(parts, extent, centers) if parts.points else None,
         points_per_view=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
@@ -366,9 +398,28 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
     return sorted(cameras, key=lambda facts: -facts.views)
 
 
-def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
-    facts = PhotographFacts({}, [], {}, [], [], sum(view.mask_path is not None for view in views))
+def measure_capture(files: Sequence[Path]) -> CaptureFacts:
+    """Read the headers of image files, skipping unreadable ones."""
+    sizes, cameras, located = Counter[str](), Counter[str](), 0
+    for file in files:
+        with suppress(DataError):
+            header, exif = read_header(file), read_exif_camera(file)
+            sizes[f"{header.width}x{header.height}"] += 1
+            cameras[exif.name or "unknown"] += 1
+            located += exif.is_located
+    return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located)
+
+
+def _photographs(parts: Parts, missing: set[Path]) -> PhotographFacts:
+    views = parts.views
     decoded = decode_all(view for view in views if view.image_path not in missing)
+    blank, no_content = list[str](), ""
+    try:
+        blank = require_content(parts.path, parts.scene.split("train") if parts.scene else views, decoded)
+    except DataError as error:
+        no_content = str(error)
+    masks = sum(view.mask_path is not None for view in views)
+    facts = PhotographFacts({}, [], {}, [], [], masks, blank, no_content)
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         files[f"static mask of {view.name}"] = view.static_path

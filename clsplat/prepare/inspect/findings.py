@@ -1,6 +1,6 @@
 """Derive findings from the facts about a dataset: what is wrong for training, and how to fix it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -25,6 +25,7 @@ from clsplat.prepare.inspect.facts import (
 from clsplat.scene.reader import Parts
 from clsplat.scene.scene import position_text
 
+TAKE_MORE = "take 30 or more, each from a new position and overlapping the one before by two thirds"
 Level = Literal["error", "warning", "note"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note")
 
@@ -49,16 +50,28 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
     contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
-    readable = count - len(damaged)
-    if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
+    readable, texts = count - len(damaged), facts.left_out
+    if facts.unplaced:
+        yield from _capture(facts, readable)
+    elif count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
         remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
+        yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
     else:
-        remedy, texts = f"`clsplat run photos --scene {shell_quote(facts.path)}` finds the cameras", facts.left_out
-        if readable < MIN_PHOTOGRAPHS:
-            remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
-    yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
+        remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
+        yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
     for text in texts + warnings_for({"damaged": damaged, "photographs": readable}):
         yield Finding("warning", text.removeprefix(f"{facts.path}: "))
+
+
+def _capture(facts: Facts, readable: int) -> Iterator[Finding]:
+    """Yield findings about photographs whose cameras can be found."""
+    if readable < MIN_VIEWS:
+        fault = f"there {_are(readable, 'photograph', 'only ')}, from which cameras are often not found"
+        yield Finding("warning", fault, TAKE_MORE)
+    if blank := facts.comparison.blank:
+        every = len(blank) == readable
+        fault = "no photograph shows anything" if every else f"{_are(len(blank), 'photograph')} black or of one color"
+        yield Finding("error" if every else "warning", f"{fault} ({_listed(blank)})", "export or take them again")
 
 
 MAX_NAMES = 4  # names in a finding
@@ -77,7 +90,7 @@ def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
     parts = (unprepared, _unreadable, _photographs, _comparison, _cameras, _poses, _points)
     results = [finding for part in parts for finding in part(facts)]
-    if facts.refusal and not any(finding.level == "error" for finding in results):
+    if facts.refusal and not facts.unplaced and not any(finding.level == "error" for finding in results):
         results.append(Finding("error", facts.refusal))
     return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
@@ -106,6 +119,12 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
         fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
+    if photographs.no_content:
+        fault, _, remedy = photographs.no_content.removeprefix(f"{facts.path}: ").rpartition("; ")
+        yield Finding("error", fault, remedy)
+    if photographs.blank:
+        fault = f"{_are(len(photographs.blank), 'photograph')} black, of one color, or transparent"
+        yield Finding("warning", f"{fault} ({_listed(photographs.blank)})", "remove or export them again")
     if photographs.cut:
         fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
         yield Finding("error", fault, "copy them again")
@@ -272,17 +291,29 @@ class Inspection:
 
     @property
     def trainable(self) -> bool:
-        return all(finding.level != "error" for finding in self.findings)
+        """Whether it can be trained on as it is: photographs without cameras cannot."""
+        return self.next_step is None and all(finding.level != "error" for finding in self.findings)
+
+    @property
+    def next_step(self) -> str | None:
+        """What finds the cameras of photographs that have none; None for other datasets and unusable photographs."""
+        facts = self.facts
+        if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
+            return None
+        elsewhere = facts.refusal.partition("photographs without cameras; the cameras are ")[2]
+        command = f"`clsplat run photos --scene {shell_quote(facts.path)}`"
+        return f"use the cameras {elsewhere}" if elsewhere else command
 
     @property
     def verdict(self) -> str:
         """The findings in one sentence: the first error or warning, and the number of the others."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
         worst, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
-        if not worst:
-            return "ready to train"
         more = f" (and {pluralize(len(worst) - 1, f'more {kind}')})" if len(worst) > 1 else ""
-        return f"{start}{worst[0]}{more}"
+        if self.next_step:
+            but = f", and {worst[0]}{more}" if worst else ""
+            return f"cameras are not known yet{but}; next: {self.next_step}"
+        return f"{start}{worst[0]}{more}" if worst else "ready to train"
 
     def data(self) -> dict[str, Any]:
         """Return the verdict, findings and facts as plain data for JSON."""
@@ -301,7 +332,12 @@ MAX_CAMERAS = 4  # those with the most views
 
 def summarize(facts: Facts) -> dict[str, str]:
     """Return the main facts as text, by name."""
-    lines = {"dataset": facts.kind if facts.kind != "none" else "none found", "images": _images(facts)}
+    none = "photographs without cameras" if facts.unplaced else "none found"
+    lines = {"dataset": facts.kind if facts.kind != "none" else none, "images": _images(facts)}
+    if capture := facts.capture:
+        lines["sizes"] = _counts(capture.sizes)
+        lines["cameras by EXIF"] = _counts(capture.cameras)
+        lines["GPS positions"] = f"{capture.located}" if capture.located else "none"
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if facts.timestamps:
@@ -329,6 +365,11 @@ def summarize(facts: Facts) -> dict[str, str]:
     if counts := list(facts.points_per_view.values()):
         lines["points per view"] = f"{min(counts):,} to {max(counts):,}, median {median(counts):,.0f}"
     return lines
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """Return what there is, with the number of photographs if there are several kinds."""
+    return _listed([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
 
 
 def camera_line(camera: CameraFacts) -> str:
@@ -363,6 +404,6 @@ def show(inspection: Inspection, console: Console) -> None:
     for finding in inspection.findings:
         table.add_row(Text(finding.level, STYLES[finding.level]), Text(finding.text))
     console.print(table, soft_wrap=not console.is_terminal)
-    if inspection.trainable:
+    if inspection.trainable or inspection.next_step:
         ready = inspection.verdict.startswith("ready")
         console.print(Text(inspection.verdict, "bold green" if ready else "bold yellow"))
