@@ -1,8 +1,8 @@
 """Pinhole cameras for rendering, and lenses with distortion for photographs."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property, lru_cache
 from numbers import Integral
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote
 
 MAX_SIDE = 4096 * 8  # px: tiles that cl_kernels/tiles.h can number, times the smallest tile size of a device
+MAX_SOURCE = 32764  # px: a larger photograph cannot be cut by OpenCV
 MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover half of all directions
 
 
@@ -64,7 +65,7 @@ class Camera:
 # Lenses with distortion: COLMAP's camera models, and undistortion of photographs.
 
 Floats = NDArray[np.float64]
-Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
+Distortion = Callable[..., tuple[Floats, Floats]]  # (u, v, k), or (x, y, k, z) of a direction for models of WIDE
 BORDER_POINTS = 200  # per edge of a photograph
 MAX_ROUNDS = 50  # iterations of Newton's method
 MAX_ERROR = 1.0e-6  # of its result, normalized units
@@ -96,28 +97,51 @@ def _full_opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floa
     return u * factor + dx, v * factor + dy
 
 
-def _fisheye(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+def _fisheye(u: Floats, v: Floats, k: Sequence[float], z: Floats | None = None) -> tuple[Floats, Floats]:
     r = np.hypot(u, v)
-    theta = np.arctan(r)
+    theta = np.arctan(r) if z is None else np.arctan2(r, z)
     angle = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
     factor = np.where(r > 1e-12, angle / np.maximum(r, 1e-12), 1.0)
     return u * factor, v * factor
 
 
-def _thin_prism(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
-    u, v = _fisheye(u, v, ())
+def _thin_prism(u: Floats, v: Floats, k: Sequence[float], z: Floats | None = None) -> tuple[Floats, Floats]:
+    u, v = _fisheye(u, v, (), z)
     r2 = u * u + v * v
     (x, y), (dx, dy) = _radial(u, v, (k[0], k[1], k[4], k[5])), _tangential(u, v, k[2], k[3])
     return x + dx + k[6] * r2, y + dy + k[7] * r2
 
 
-def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+def _rad_tan_thin_prism(u: Floats, v: Floats, k: Sequence[float], z: Floats | None = None) -> tuple[Floats, Floats]:
+    x, y = _radial(*_fisheye(u, v, (), z), k[:6])
+    r2, (dx, dy) = x * x + y * y, _tangential(x, y, k[7], k[6])
+    return x + dx + k[8] * r2 + k[9] * r2**2, y + dy + k[10] * r2 + k[11] * r2**2
+
+
+def _fov(u: Floats, v: Floats, k: Sequence[float], z: Floats | None = None) -> tuple[Floats, Floats]:
     r, omega = np.hypot(u, v), k[0]
     if abs(omega) < 1e-9:
-        return u, v
-    radius = np.arctan(2 * r * np.tan(omega / 2)) / omega
+        return (u, v) if z is None else (u / z, v / z)
+    slope = 2 * r * np.tan(omega / 2)
+    radius = (np.arctan(slope) if z is None else np.arctan2(slope, z)) / omega
     factor = np.where(r > 1e-12, radius / np.maximum(r, 1e-12), 2 * np.tan(omega / 2) / omega)
     return u * factor, v * factor
+
+
+def _division(u: Floats, v: Floats, k: Sequence[float], z: Floats | float | None = None) -> tuple[Floats, Floats]:
+    z = 1.0 if z is None else z
+    factor = 2 / (z + np.sqrt(z * z - 4 * k[0] * (u * u + v * v)))
+    return u * factor, v * factor
+
+
+def _eucm(u: Floats, v: Floats, k: Sequence[float], z: Floats | float | None = None) -> tuple[Floats, Floats]:
+    z = 1.0 if z is None else z
+    depth = k[0] * np.sqrt(k[1] * (u * u + v * v) + z * z) + (1 - k[0]) * z
+    return u / depth, v / depth
+
+
+def _equirectangular(u: Floats, v: Floats, k: Sequence[float], z: Floats | float = 1.0) -> tuple[Floats, Floats]:
+    return np.arctan2(u, z), np.arctan2(v, np.hypot(u, z))
 
 
 MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and the distortion function
@@ -132,6 +156,35 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and th
     "SIMPLE_RADIAL_FISHEYE": (1, _fisheye),
     "RADIAL_FISHEYE": (1, _fisheye),
     "THIN_PRISM_FISHEYE": (2, _thin_prism),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (2, _rad_tan_thin_prism),
+    "SIMPLE_DIVISION": (1, _division),
+    "DIVISION": (2, _division),
+    "SIMPLE_FISHEYE": (1, _fisheye),
+    "FISHEYE": (2, _fisheye),
+    "EUCM": (2, _eucm),
+    "EQUIRECTANGULAR": (2, _equirectangular),  # focal lengths in px per radian, instead of COLMAP's image size
+}
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models of directions next to and behind the camera, too
+
+# Wide photographs: panoramas, and fisheyes of about 180 degrees and more, are cut into the faces of a cube.
+
+MIN_WIDE = math.radians(80)  # to a side of the image: a pinhole image would be 3.6 times as wide
+MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
+FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
+FACE_GRID = 128  # directions to a side at which the part of a face that the photograph shows is looked for
+MIN_SHOWN = 0.02  # share of a face; one that shows less is left out
+ANGLES = 1801  # from 0 to 180 degrees
+BLOCK = 1 << 20  # samples at a time
+FACES: dict[
+    str, Floats
+] = {  # rotations from the camera of the photograph to that of the face: its right, down, forward
+    "front": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "back": np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
+    "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "up": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
 
 
@@ -144,6 +197,7 @@ class Lens:
     model: str
     params: tuple[float, ...]
     whole: bool = False  # keep the whole photograph, with undefined pixels, instead of cropping them away
+    face: str = field(default="", repr=False)  # of FACES, cut from a wide photograph; "": the photograph
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -154,7 +208,117 @@ class Lens:
     @property
     def has_distortion(self) -> bool:
         """Whether the lens has distortion; a fisheye lens always has."""
-        return "FISHEYE" in self.model or any(self._split[4])
+        return "FISHEYE" in self.model or self.model == "EQUIRECTANGULAR" or any(self._split[4])
+
+    @cached_property
+    def _angles(self) -> tuple[Floats, float]:
+        """The angles (rad) that the lens shows left, right, up and down, [4], and that beyond which it folds back."""
+        fx, fy, cx, cy, rest = self._split
+        angle = np.linspace(0, np.pi, ANGLES)
+        sides, folds = [], []
+        for x, y, size in (
+            (-1, 0, cx / fx),
+            (1, 0, (self.width - cx) / fx),
+            (0, -1, cy / fy),
+            (0, 1, (self.height - cy) / fy),
+        ):
+            with np.errstate(all="ignore"):
+                u, v = MODELS[self.model][1](x * np.sin(angle), y * np.sin(angle), rest, np.cos(angle))
+                radius = x * u + y * v
+                rises = np.diff(radius) > 0
+            folds.append(angle[np.argmin(rises)] if not rises.all() else np.pi)
+            beyond = radius > size
+            sides.append(min(folds[-1], angle[np.argmax(beyond)] if beyond.any() else np.pi))
+        return np.array(sides), min(folds)
+
+    @cached_property
+    def is_wide(self) -> bool:
+        """Whether the photograph shows too much for one pinhole image, and is cut into faces."""
+        if self.model not in WIDE:
+            return False
+        return self.model == "EQUIRECTANGULAR" or bool(self._angles[0].max() > MIN_WIDE)
+
+    @cached_property
+    def faces(self) -> tuple["Lens", ...]:
+        """The faces of a wide photograph that show MIN_SHOWN or more.  Raises DataError without any."""
+        lenses = [replace(self, face=face, whole=self.model != "EQUIRECTANGULAR") for face in FACES]
+        faces = tuple(intern_lens(lens) for lens in lenses if lens._shows(*_face_grid()).mean() >= MIN_SHOWN)
+        if not faces:
+            raise DataError(f"the lens {self.model} {quote(self.params)} shows nothing; calibrate the camera again")
+        return faces
+
+    def _shows(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
+        """Return whether the wide photograph shows the rays with these normalized coordinates of the face."""
+        if self.model == "EQUIRECTANGULAR":
+            return np.ones(u.shape, bool)
+        sides, fold = self._angles
+        directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"]
+        angle = np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), directions[..., 2])
+        with np.errstate(all="ignore"):
+            x, y = self._pixels(directions)
+            inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
+        return np.asarray(inside & (angle < min(fold, max(sides.min(), MIN_CIRCLE))))
+
+    def shows_white(self, mask: NDArray[Any]) -> bool:
+        """Return whether a face shows a white pixel of a mask, [H, W, C], of the photograph."""
+        u, v = np.stack(_face_grid())[:, self._shows(*_face_grid())]
+        x, y = self._pixels(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face])
+        height, width = mask.shape[:2]
+        rows, columns = (y * height / self.height).astype(int), (x * width / self.width).astype(int)
+        return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
+
+    def _pixels(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Return the pixel coordinates in a wide photograph of directions in its camera, [..., 3]."""
+        fx, fy, cx, cy, rest = self._split
+        x, y = MODELS[self.model][1](directions[..., 0], directions[..., 1], rest, directions[..., 2])
+        return fx * x + cx, fy * y + cy
+
+    def _face_camera(self) -> Camera:
+        """Return the camera of the smallest part of a face that contains what the photograph shows.
+
+        Its pixels are as large in the center as those of the photograph, and smaller elsewhere.
+        """
+        focal = max(self._split[:2])
+        side = 2 * math.ceil(FACE_TANGENT * focal)
+        if side > MAX_SIDE or max(self.width, self.height) > MAX_SOURCE:
+            raise DataError(
+                f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
+                f"at most {MAX_SOURCE} px to a side, and faces of at most {MAX_SIDE}: reduce the photographs"
+            )
+        shows = self._shows(*_face_grid())
+        if not shows.any():
+            return Camera(side, side, focal, focal, side / 2, side / 2)
+        spans = [np.flatnonzero(shows.any(axis=axis)) for axis in (0, 1)]  # columns, rows
+        (x0, x1), (y0, y1) = (
+            (max(0, int((i[0] - 1) / FACE_GRID * side)), min(side, int((i[-1] + 2) / FACE_GRID * side))) for i in spans
+        )
+        return Camera(x1 - x0, y1 - y0, focal, focal, side / 2 - x0, side / 2 - y0)
+
+    def _blocks(self, samples: int) -> Iterator[tuple[slice, Floats, Floats]]:
+        """Yield some rows of the face, and the normalized coordinates of samples x samples rays in each pixel."""
+        camera = self.pinhole
+        across = (np.arange(camera.width * samples) + 0.5) / samples
+        step = max(1, BLOCK // (len(across) * samples))
+        for row in range(0, camera.height, step):
+            rows = slice(row, min(row + step, camera.height))
+            down = (np.arange(rows.start * samples, rows.stop * samples) + 0.5) / samples
+            u, v = np.meshgrid((across - camera.cx) / camera.fx, (down - camera.cy) / camera.fy)
+            yield rows, u, v
+
+    def _cut(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the face of a wide photograph, [H, W, C]; each pixel is the mean of 2 x 2 rays."""
+        camera, border = self.pinhole, int(self.model == "EQUIRECTANGULAR")
+        if border:  # a column from the other side, where the two sides of a panorama meet
+            pixels = np.concatenate([pixels[:, -1:], pixels, pixels[:, :1]], axis=1)
+        face = np.empty((camera.height, camera.width, pixels.shape[2]), pixels.dtype)
+        for rows, u, v in self._blocks(2):
+            directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"]
+            with np.errstate(all="ignore"):
+                x, y = (np.nan_to_num(value - 0.5).astype(np.float32) for value in self._pixels(directions))
+            rays = cv2.remap(pixels, x + np.float32(border), y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            size = camera.width, rows.stop - rows.start
+            face[rows] = cv2.resize(rays, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
+        return face
 
     def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Return the pixel coordinates of normalized coordinates."""
@@ -163,7 +327,9 @@ class Lens:
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Return the pixel coordinates, [M, 2], of points in front of the camera, [M, 3] in camera space."""
+        """Return the pixel coordinates, [M, 2], of points, [M, 3] in camera space, behind a wide lens too."""
+        if self.is_wide:
+            return np.stack(self._pixels(points), axis=1)
         return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -197,8 +363,10 @@ class Lens:
 
         It shows the largest rectangle in which all pixels are defined.  With `whole`, it shows the smallest rectangle
         that contains the photograph, up to 60 degrees to each side and twice the size.  Raises DataError when there is
-        no such rectangle.
+        no such rectangle.  For a wide photograph, it is the camera of the face.
         """
+        if self.is_wide:
+            return self._face_camera()
         fx, fy, _, _, _ = self._split
         along_x, along_y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
         left = self.undistort(np.zeros(BORDER_POINTS), along_y)[0]
@@ -225,12 +393,16 @@ class Lens:
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
         camera = self.pinhole
+        if self.is_wide:
+            return self._cut(pixels)
         undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return undistorted.reshape(camera.height, camera.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
         """Which pixels of `pinhole`, [H, W], the photograph covers: those whose ray distorts into it and back."""
+        if self.is_wide:
+            return np.concatenate([self._shows(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
@@ -245,6 +417,18 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
         (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
     )
     return u, v
+
+
+def _face_grid() -> tuple[Floats, Floats]:
+    """The normalized coordinates of FACE_GRID x FACE_GRID points of a face."""
+    along = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
+    u, v = np.meshgrid(along, along)
+    return u, v
+
+
+def panorama_lens(width: int, height: int) -> Lens:
+    """Return the lens of a panorama that covers the sphere; the middle of the image is forward, its top is up."""
+    return Lens(width, height, "EQUIRECTANGULAR", (width / math.tau, height / math.pi, width / 2, height / 2))
 
 
 def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:

@@ -55,6 +55,11 @@ def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
     for one in views:
         if one.view.image_path == NO_FILE:
             raise DataError(f"the view {quote(one.name)} has no photograph to copy; write the cameras alone")
+        if one.view.lens is not None and one.view.lens.is_wide:
+            raise DataError(
+                f"the view {quote(one.name)} is a part of a wide photograph; `clsplat data undistort` first, "
+                "or write the cameras alone"
+            )
     return {folder / one.name: one.view.image_path for one in views}
 
 

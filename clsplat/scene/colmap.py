@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
-from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, intern_lens
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, intern_lens, panorama_lens
 from clsplat.scene.camera import MODELS as LENS_MODELS
 from clsplat.scene.lookup import FileLookup
 from clsplat.scene.photographs import find_masks
@@ -340,7 +340,8 @@ class ColmapReader(Reader):
         points, tracks = (table.cloud(), tracks_of(images, table, original)) if table else (None, None)
         views = [fit_to_photograph(view) if view.image_path in files.reduced else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
-        return replace(scene, tracks=tracks and tracks.shifted(scene.origin), skipped=files.skipped)
+        tracks = tracks and tracks.shifted(scene.origin).on_faces(scene.views)
+        return replace(scene, tracks=tracks, skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         models = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
@@ -385,10 +386,9 @@ def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[
         nearest = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
         known = ids[order][nearest] == named if len(ids) else np.zeros(len(named), bool)
         rows = seen[image.name] = order[nearest[known]] if len(ids) else np.empty(0, np.int64)
-        if len(rows) and len(image.pixels) and image.name in by_name:
-            residuals[image.name] = reprojection_residuals(
-                by_name[image.name], positions[rows], image.pixels[first[known]]
-            )
+        view = by_name.get(image.name)
+        if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
+            residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[known]])
     return Tracks(positions, seen, residuals) if any(map(len, seen.values())) else None
 
 
@@ -440,12 +440,7 @@ def view_of(
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
-    """Return the lens of a camera.  Raises DataError for unsupported models and invalid numbers."""
-    if camera.model not in LENS_MODELS:
-        raise DataError(
-            f"{camera.where}: camera {number} is {camera.model}; expected one of {', '.join(LENS_MODELS)}: "
-            "undistort the images first with `colmap image_undistorter`"
-        )
+    """Return the lens of a camera.  Raises DataError for invalid numbers."""
     sizes = camera.width, camera.height
     valid = (
         min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(camera.params[: LENS_MODELS[camera.model][0]]) >= MIN_FOCAL
@@ -456,7 +451,14 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
             f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
             f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
         )
-    return Lens(camera.width, camera.height, camera.model, camera.params)
+    if camera.model != "EQUIRECTANGULAR":
+        return Lens(camera.width, camera.height, camera.model, camera.params)
+    if camera.params != sizes:
+        raise DataError(
+            f"{camera.where}: camera {number} is EQUIRECTANGULAR with parameters {quote(camera.params)}; expected the "
+            f"size of its images, {camera.width}, {camera.height}: {REMEDY}"
+        )
+    return panorama_lens(*sizes)
 
 
 def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from clsplat.core.errors import DataError, pluralize
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.lookup import FileLookup
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View, load_image, load_mask
+from clsplat.scene.view import View, load_image, load_mask, photograph_of
 
 
 def load_photograph(
@@ -73,9 +73,10 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
             f"{scene.path}: the dataset already has masks, such as {existing}; remove scene.masks, "
             "or the masks of the dataset"
         )
-    masks = find_masks(folder, [view.name for view in scene.views])
+    photographs = [view.name if view.lens is None else photograph_of(view.name) for view in scene.views]
+    masks = find_masks(folder, photographs)
     views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
-    count, missing = len(views), [view.name for view in views if view.mask_path is None]
+    count, missing = len(views), [name for name, mask in zip(photographs, masks, strict=True) if mask is None]
     if len(missing) == count:
         fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
         names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))

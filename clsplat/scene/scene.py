@@ -11,9 +11,10 @@ Conventions of the whole project
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
-from clsplat.scene.view import Alpha, Floats, View, load_image
+from clsplat.scene.view import Alpha, Floats, View, load_image, photograph_of
 
 LOG = logging.getLogger("clsplat")
 
@@ -38,6 +39,19 @@ class Tracks:
     def shifted(self, origin: Floats) -> "Tracks":
         """Return the tracks in coordinates whose zero is at `origin`, [3] in the present coordinates."""
         return replace(self, positions=self.positions - origin) if origin.any() else self
+
+    def on_faces(self, views: Iterable["View"]) -> "Tracks":
+        """Return the tracks with those of wide photographs divided among the views of their faces."""
+        seen = dict(self.seen)
+        for view in views:
+            if view.lens is not None and view.lens.face and photograph_of(view.name) in self.seen:
+                rows, camera = self.seen[photograph_of(view.name)], view.camera
+                x, y, z = view.world_to_camera @ np.vstack([self.positions[rows].T, np.ones(len(rows))])
+                with np.errstate(all="ignore"):
+                    x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+                    seen[view.name] = rows[(z > 0) & (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)]
+        names = {view.name for view in views}
+        return replace(self, seen={name: rows for name, rows in seen.items() if name in names or name in self.seen})
 
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
         """Return the tracks of the views in `names`, with their new names by the old ones."""
@@ -191,10 +205,14 @@ def make_scene(
 ) -> Scene:
     """Return a scene of `views`, with its split, its extent and its origin, which is subtracted from all positions.
 
+    Wide photographs become views of their faces, in the split of the photograph.
     Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
     if not views:
         raise DataError(f"{path}: the dataset has no images; expected at least one image with a pose")
+    faces = [view.faces() for view in views]
+    counted = np.cumsum([0, *map(len, faces)]).tolist()
+    views, test = list(chain.from_iterable(faces)), {i for n in test for i in range(counted[n], counted[n + 1])}
     seen: set[str] = set()
     for view in views:
         if view.name in seen:
@@ -283,11 +301,15 @@ def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
 
 
 def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
-    """Return the indices of the held-out names: every `holdout`-th in order of name, starting at `offset`."""
+    """Return the indices of the held-out names: every `holdout`-th in order of name, starting at `offset`.
+
+    The faces of a wide photograph count as one name.
+    """
     if holdout <= 0:
         return set()
-    order = sorted(range(len(names)), key=lambda i: names[i])
-    return set(order[offset::holdout])
+    photographs = [photograph_of(name) for name in names]
+    held_out = set(sorted(set(photographs))[offset::holdout])
+    return {i for i, photograph in enumerate(photographs) if photograph in held_out}
 
 
 def scene_name(folder: str | Path) -> str:

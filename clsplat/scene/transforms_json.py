@@ -14,7 +14,7 @@ import numpy as np
 
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
-from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens, panorama_lens
 from clsplat.scene.images import stored_size
 from clsplat.scene.lookup import FileLookup, Missing, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
@@ -27,7 +27,8 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
     "FULL_OPENCV": DISTORTION,
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), ("k1", "k2", "k3", "k4")),
+    "EQUIRECTANGULAR": (),
 }
 COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
 MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; they take some 15 s
@@ -206,6 +207,8 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
     default_width, default_height = size or (0, 0)
     width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
+    if frame.value("camera_model") == "EQUIRECTANGULAR" and 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
+        return panorama_lens(width, height).camera  # other programs write a focal length, which says nothing
     fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
@@ -231,7 +234,7 @@ def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> fl
 
 
 def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
-    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
+    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one, or a panorama.  Raises DataError."""
     named = frame.value("camera_model")
     model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if named is None else named
     used = LENSES.get(model) if isinstance(model, str) else None
@@ -241,10 +244,11 @@ def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
         fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
-            "undistort the images first, for example with `colmap image_undistorter`"
+            "export the cameras with one of these, or pinhole images without distortion"
         )
     params = (camera.fx, camera.fy, camera.cx, camera.cy, *(given[key] for key in used))
-    return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
+    known = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)]
+    return Lens(camera.width, camera.height, known, params)
 
 
 def camera_to_world_of(frame: JsonFrame) -> Floats:

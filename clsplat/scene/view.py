@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
-from clsplat.scene.camera import MODELS, Camera, Lens, intern_lens
+from clsplat.scene.camera import FACES, MODELS, Camera, Lens, intern_lens
 from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image, stored_size
 
 Floats = NDArray[np.floating]
@@ -112,6 +112,37 @@ class View:
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return replace(self, world_to_camera=np.column_stack([rotation, translation + rotation @ origin]))
 
+    def faces(self) -> list["View"]:
+        """Return the views of the faces of a wide photograph, without those that show nothing; of others, the view.
+
+        Raises DataError when the lens or the mask shows nothing.
+        """
+        if self.lens is None or not self.lens.is_wide or self.lens.face:
+            return [self]
+        mask = None if self.mask_path is None else read_image(self.mask_path)
+        path, views = PurePosixPath(self.name), list[View]()
+        for lens in self.lens.faces if mask is None else [face for face in self.lens.faces if face.shows_white(mask)]:
+            rotation, to_world = FACES[lens.face], self.camera_to_world
+            if to_world is not None:
+                to_world = np.column_stack([to_world[:, :3] @ rotation.T, to_world[:, 3]])
+            name, pose = f"{path.with_suffix('')}/{CUBE}{lens.face}{path.suffix}", rotation @ self.world_to_camera
+            view = replace(self, name=name, camera=lens.pinhole, world_to_camera=pose, lens=lens)
+            views.append(replace(view, camera_to_world=to_world))
+        if not views:
+            raise DataError(
+                f"{self.mask_path}: the mask excludes every pixel of {quote(self.name)}; "
+                "fix the mask, or remove the photograph from the dataset"
+            )
+        return views
+
+    def whole_photograph(self) -> "View":
+        """Return the view of the wide photograph that this face is cut from; other views as they are."""
+        if self.lens is None or not self.lens.face:
+            return self
+        lens, pose = intern_lens(replace(self.lens, face="", whole=False)), FACES[self.lens.face].T
+        name = photograph_of(self.name)
+        return replace(self, name=name, camera=lens.pinhole, world_to_camera=pose @ self.world_to_camera, lens=lens)
+
     @property
     def position(self) -> Floats:
         """Camera center in world coordinates, [3]."""
@@ -140,6 +171,17 @@ class View:
         """
         red, green, blue = color_of(background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
+
+
+CUBE = "cube_"  # before the name of a face
+
+
+def photograph_of(name: str) -> str:
+    """Return the name of the photograph that a view shows: `a/cube_front.png` is a face of `a.png`."""
+    path = PurePosixPath(name)
+    stem, dot, suffix = path.name.partition(".")
+    is_face = stem.startswith(CUBE) and stem.removeprefix(CUBE) in FACES and path.parent.name
+    return f"{path.parent}{dot}{suffix}" if is_face else name
 
 
 def color_of(background: ArrayLike) -> Floats:
@@ -337,10 +379,11 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
 def photo_lens(view: View) -> Lens:
     """Return the lens of a view's photograph on disk, a pinhole lens if it has no distortion.
 
+    The lens of a face of a wide photograph is that of the undistorted face.
     Raises DataError when the focal length was optimized and the model of the lens does not support that.
     """
     c, lens = view.camera, view.lens
-    if lens is None:
+    if lens is None or lens.is_wide:
         return Lens(c.width, c.height, "PINHOLE", (c.fx, c.fy, c.cx, c.cy))
     factor = c.fx / lens.pinhole.resized(c.width, c.height).fx  # 1, unless the focal length was learned
     return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoom_lens(lens, factor)
@@ -364,7 +407,7 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
 
 def _below(view: View) -> Iterator[tuple[Path, str]]:
     """The folders that contain the image, up to the one that the view's name starts from, and its path below each."""
-    parts = PurePosixPath(view.name).parts
+    parts = PurePosixPath(view.name if view.lens is None else photograph_of(view.name)).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:
             yield folder, "/".join(parts[-number:])

@@ -15,6 +15,7 @@ from clsplat.core.settings import InputPath, Settings, in_one_sentence
 from clsplat.scene.images import is_image
 from clsplat.scene.lookup import Missing
 from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_views
+from clsplat.scene.view import photograph_of
 
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
@@ -98,7 +99,7 @@ class ViewSelection(Settings):
                 del matches_of[name]
         if lost := len({*listed}) - len(matches_of):
             LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(lost, "name"))
-        return {_only_match(name, matches, names, source) for name, matches in matches_of.items()}
+        return {i for name, matches in matches_of.items() for i in _only_match(name, matches, names, source)}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
         """Return the listed names, some of which may be left out later; none for every n-th.
@@ -155,9 +156,13 @@ def choose(
 
 
 class _NameIndex:
-    """Find views by the last parts of their names: `a/b.png`, `b.png` and `b` name the same view."""
+    """Find views by the last parts of their photographs' names: `a/b.png`, `b.png` and `b` name the same view."""
 
     def __init__(self, names: Sequence[str]):
+        self._views: dict[str, list[int]] = {}
+        for i, name in enumerate(names):
+            self._views.setdefault(photograph_of(name), []).append(i)
+        names = self._names = list(self._views)
         paths = [PurePosixPath(name) for name in names]
         stems = [path.with_suffix("") for path in paths]
         self._at = {name: i for i, name in reversed([*enumerate(names)])}
@@ -169,6 +174,9 @@ class _NameIndex:
 
         If there are none, the suffix may differ, since prepared images are PNG.
         """
+        return [i for match in self._matches_of(listed) for i in self._views[self._names[match]]]
+
+    def _matches_of(self, listed: str) -> list[int]:
         if listed in self._at:
             return [self._at[listed]]
         wanted = PurePosixPath(listed.replace("\\", "/"))
@@ -189,10 +197,10 @@ def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, 
     return groups
 
 
-def _only_match(listed: str, matches: Sequence[int], names: Sequence[str], source: str) -> int:
-    """Return the only match.  Raises DataError for none or several."""
-    if len(matches) == 1:
-        return matches[0]
+def _only_match(listed: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
+    """Return the views of the only photograph that matches.  Raises DataError for none or several."""
+    if len({photograph_of(names[i]) for i in matches}) == 1:
+        return matches
     if matches:
         candidates = " and ".join(quote(names[i]) for i in matches[:2])
         raise MissingViewError(f"{source}: {quote(listed)} matches {candidates}; give more of the path")
@@ -348,13 +356,15 @@ def _select(
 
 
 def _validation_fold(scene: Scene) -> set[int]:
-    """Return every 8th training view, and at least two."""
-    count = len(scene.train)
+    """Return the views of every 8th training photograph by name, and of at least two."""
+    names = [photograph_of(scene.views[i].name) for i in scene.train]
+    order = sorted(set(names))
+    count = len(order)
     if count < MIN_TRAIN:
         raise DataError(
             f"{scene.path}: has {pluralize(count, 'training photograph')}; expected at least {MIN_TRAIN} to hold "
             "some out for validation: take more, or set scene.validation to 0"
         )
-    order = sorted(scene.train, key=lambda i: scene.views[i].name)
     fold = order[FOLD_OFFSET::FOLD]
-    return set(fold if len(fold) > 1 else [order[count // 4], order[3 * count // 4]])
+    fold = fold if len(fold) > 1 else [order[count // 4], order[3 * count // 4]]
+    return {i for i, name in zip(scene.train, names, strict=True) if name in fold}

@@ -135,17 +135,6 @@ def test_unknown_camera(tmp_path: Path) -> None:
     assert "'d.jpg' names camera 7" in message
 
 
-@pytest.mark.parametrize(("model", "params"), [("SIMPLE_DIVISION", (50, 32, 24, 0)), ("FISHEYE", (50, 50, 32, 24))])
-def test_unsupported_lenses_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
-    camera = CameraEntry(3, model, 64, 48, params)
-    message = refusal(
-        read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
-    )
-    assert "camera 3" in message
-    assert model in message
-    assert "colmap image_undistorter" in message
-
-
 def test_nan_distortion_is_refused(tmp_path: Path) -> None:
     camera = CameraEntry(3, "OPENCV", 64, 48, (50, 50, 32, 24, math.nan, 0, 0, 0))
     message = refusal(read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3)])))

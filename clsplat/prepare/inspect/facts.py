@@ -177,7 +177,8 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     good = positions[finite].astype(np.float64)
     distance = np.linalg.norm(good - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
-    in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
+    views = list(parts.scene.views) if parts.scene else parts.views  # with the faces of wide photographs
+    in_two, behind = _coverage(sample, views) if len(sample) and views else (None, None)
     return PointFacts(
         count=len(positions),
         not_finite=int(np.count_nonzero(~finite)),
@@ -229,6 +230,7 @@ class CameraFacts:
     distortion: float | None  # px, the largest displacement by the lens along the border; None if it overflows
     kept: float  # share of the photograph that undistortion keeps
     centered: bool  # whether the principal point is inside the photograph
+    faces: int  # views that a wide photograph is cut into; 0: none
 
 
 @dataclass(frozen=True)
@@ -394,7 +396,9 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         kept = camera.width * camera.height / (original.width * original.height)
         centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
-        cameras.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centered))
+        faces = len(lens.faces) if lens and lens.is_wide else 0
+        moved, kept = (0.0, 1.0) if faces or not lens else (distortion(lens), kept)
+        cameras.append(CameraFacts(len(views), model, *size, focal, moved, kept, centered, faces))
     return sorted(cameras, key=lambda facts: -facts.views)
 
 
@@ -477,7 +481,7 @@ def read_parts(path: Path) -> Parts:
         folders = sorted({file.parent for file in parts.expected})
         parts.on_disk = [file for folder in folders for file in image_files(folder, deep=False)]
     if parts.scene:  # list_parts may also list views that belong to no split
-        parts.views = list(parts.scene.views)
+        parts.views = list({view.name: view for view in map(View.whole_photograph, parts.scene.views)}.values())
     return parts
 
 

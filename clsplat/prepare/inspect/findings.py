@@ -185,7 +185,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
         name = f"the {camera.model} camera {camera.width}x{camera.height} of {pluralize(camera.views, 'view')}"
-        if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
+        if not camera.faces and not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
             yield Finding("warning", fault, "calibrate it again, or compute the poses with the correct focal length")
         if not camera.centered:
@@ -378,6 +378,7 @@ def camera_line(camera: CameraFacts) -> str:
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     distortion = "unbounded" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
     lens = f", distortion {distortion}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
+    lens += f", cut into {pluralize(camera.faces, 'face')} of a cube" if camera.faces else ""
     size = f"{camera.width}x{camera.height}"
     return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 
