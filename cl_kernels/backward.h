@@ -25,8 +25,11 @@ static inline VF view_direction(
 
 /* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and that by a factor
  * of both focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change. */
-static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m, const float compensate,
-                                  VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale, VF *grad_focal)
+static inline void shape_backward(
+    const shape_t *s, __constant camera_t *camera,
+    const VF *m,  // [PIXEL_SUMS] see splat.h
+    const float screen_variance, const float compensate,
+    VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale, VF *grad_focal)
 {
     __constant const float *w = camera->world_to_camera;
 #if PIXEL_BOX
@@ -43,22 +46,29 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
     const VF gu = -(a * m[SUM_X] + b * m[SUM_Y]);
     const VF gv = -(b * m[SUM_X] + c * m[SUM_Y]);
 
-    /* conic -> covariance: -K G K with G = ((gA, gB/2), (gB/2, gC)) */
-    const VF ga = -0.5f * m[SUM_XX], gb = -0.5f * m[SUM_XY], gc = -0.5f * m[SUM_YY];
-    const VF k00 = a * ga + b * gb, k01 = a * gb + b * gc, k10 = b * ga + c * gb, k11 = b * gb + c * gc;
-    /* energy of the screen filter: ratio = det0 / det1, d ratio = tr((adj(V0) / det1 - ratio K) dV) */
+    /* conic = (yy + s, -xy, xx + s) / det with det = det0 + s (xx + yy + s) and det0 = |V0 x V1|^2.  Its numerators and
+     * the determinants are differentiated, since terms of -K G K cancel for long splats.  g_det0 is doubled. */
+    const VF ga = -0.5f * m[SUM_XX], gb = -m[SUM_XY], gc = -0.5f * m[SUM_YY];
     const VF energy2 = larger(1.0f + compensate * (s->ratio - 1.0f), (VF)(1.0e-12f));
-    const VF g_ratio = compensate * 0.5f * m[SUM_POWER] / energy2;
-    const VF g00 = g_ratio * (s->yy / s->determinant - s->ratio * a) - (k00 * a + k01 * b);
-    const VF g01 = g_ratio * (-s->xy / s->determinant - s->ratio * b) - (k00 * b + k01 * c);
-    const VF g11 = g_ratio * (s->xx / s->determinant - s->ratio * c) - (k10 * b + k11 * c);
+    const VF g_ratio = compensate * 0.5f * m[SUM_POWER] / energy2, inverse = 1.0f / s->determinant;
+    const VF g_det = -(a * ga + b * gb + c * gc + g_ratio * s->ratio) * inverse;
+    const VF g_det0 = 2.0f * (g_det + g_ratio * inverse);
+    const VF g00 = gc * inverse + screen_variance * g_det, g11 = ga * inverse + screen_variance * g_det;
+    const VF g01 = -0.5f * gb * inverse;
+    VF normal[3], by_normal[6];
+    cross_product(s->v, s->v + 3, normal);
+    cross_product(s->v + 3, normal, by_normal);
+    cross_product(normal, s->v, by_normal + 3);
 #endif
 
     /* covariance -> V = T M -> T, rotation, scales */
     VF gt[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gr[9];
     for (uint k = 0; k < 3; k++) {
-        const VF v0 = 2.0f * (g00 * s->v[k] + g01 * s->v[3 + k]);
-        const VF v1 = 2.0f * (g01 * s->v[k] + g11 * s->v[3 + k]);
+        VF v0 = 2.0f * (g00 * s->v[k] + g01 * s->v[3 + k]), v1 = 2.0f * (g01 * s->v[k] + g11 * s->v[3 + k]);
+#if !PIXEL_BOX
+        v0 += g_det0 * by_normal[k];
+        v1 += g_det0 * by_normal[3 + k];
+#endif
         VF g_filtered = (VF)(0.0f);
         for (uint j = 0; j < 3; j++) {
             const VF axis = s->rotation[3 * j + k] * s->filtered[k];
@@ -68,8 +78,8 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
             g_filtered += gm * s->rotation[3 * j + k];
             gr[3 * j + k] = gm * s->filtered[k];
         }
-        const VF inverse = 1.0f / s->filtered[k];
-        grad_scale[k] = (g_filtered * s->scale2[k] + m[SUM_POWER] * s->filter * inverse) * inverse;
+        const VF inverse_scale = 1.0f / s->filtered[k];
+        grad_scale[k] = (g_filtered * s->scale2[k] + m[SUM_POWER] * s->filter * inverse_scale) * inverse_scale;
     }
     rotation_backward(s->unit, s->inverse_norm, gr, grad_quat);
 
@@ -173,7 +183,7 @@ static inline void gradient_of(
     VF m[PIXEL_SUMS];
     for (uint k = 0; k < PIXEL_SUMS; k++)
         m[k] = VLOAD(pixel_sums + k * stride + i);
-    shape_backward(&s, camera, m, compensate, g->mean2d, g->means, g->quats, g->log_scales, &g->focal);
+    shape_backward(&s, camera, m, screen_variance, compensate, g->mean2d, g->means, g->quats, g->log_scales, &g->focal);
     VF d[3], gd[3] = {0.0f, 0.0f, 0.0f};
     const VF inverse_distance = view_direction(means, camera, stride, i, d);
     harmonics_basis(degree, d[0], d[1], d[2], g->basis);

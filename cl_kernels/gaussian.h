@@ -36,6 +36,13 @@ static inline void rotation_backward(const VF *q, const VF inverse_norm, const V
     grad[3] = (gz - z * along) * inverse_norm;
 }
 
+static inline void cross_product(const VF *a, const VF *b, VF *product)
+{
+    product[0] = a[1] * b[2] - a[2] * b[1];
+    product[1] = a[2] * b[0] - a[0] * b[2];
+    product[2] = a[0] * b[1] - a[1] * b[0];
+}
+
 /* All values between a Gaussian's parameters and its screen ellipse; the forward and the backward pass compute them. */
 typedef struct {
     VI valid;                 // in front of the near plane, with a direction and a shape
@@ -115,10 +122,9 @@ static inline void shape_of(
     s.xx = s.v[0] * s.v[0] + s.v[1] * s.v[1] + s.v[2] * s.v[2];
     s.xy = s.v[0] * s.v[3] + s.v[1] * s.v[4] + s.v[2] * s.v[5];
     s.yy = s.v[3] * s.v[3] + s.v[4] * s.v[4] + s.v[5] * s.v[5];
-    const VF cx = s.v[1] * s.v[5] - s.v[2] * s.v[4];
-    const VF cy = s.v[2] * s.v[3] - s.v[0] * s.v[5];
-    const VF cz = s.v[0] * s.v[4] - s.v[1] * s.v[3];
-    const VF determinant0 = cx * cx + cy * cy + cz * cz;
+    VF normal[3];
+    cross_product(s.v, s.v + 3, normal);
+    const VF determinant0 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
     s.determinant = determinant0 + screen_variance * (s.xx + s.yy + screen_variance);
     s.valid = s.valid & (s.determinant > 0.0f) & (s.determinant < INFINITY);
     s.ratio = determinant0 / s.determinant;

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.reference import Splats
@@ -105,6 +106,19 @@ def with_world_filter(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
 
 
+def needles(rng: np.random.Generator, count: int, aspect: float, **changes: Any) -> Case:
+    """Return Gaussians that are nearly parallel to the image, with this ratio of axes on the screen after filtering."""
+    case = random_case(rng, count, **changes)
+    pose, focal, p = case.view.world_to_camera, case.view.camera.fx, case.parameters
+    depth = p["means"] @ pose[2, :3] + pose[2, 3]
+    short = np.exp(rng.normal(-0.7, 0.1, (count, 3)))  # px
+    short[:, 0] = aspect * np.sqrt(short[:, 1] ** 2 + case.variance)
+    turns = Rotation.from_euler("zyx", rng.uniform([-np.pi, -0.2, -0.2], [np.pi, 0.2, 0.2], (count, 3)))
+    p["quats"][:] = (Rotation.from_matrix(pose[:, :3].T) * turns).as_quat(scalar_first=True)
+    p["log_scales"][:] = np.log(short / focal * depth[:, None])
+    return case
+
+
 def _orthogonal(matrix: NDArray[Any]) -> NDArray[Any]:
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt
@@ -142,6 +156,26 @@ def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
     a, b, c = splats.conic.T
     mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
     return mean2d, np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+
+
+def sums_of_gradients(splats: Splats, gradients: ref.SplatGradients) -> Floats:
+    """Convert gradients of splats to sums over pixels, [N, PIXEL_SUMS]: the inverse of gradients_of_sums."""
+    shape, mean2d = gradients.conic, gradients.mean2d
+    a, b, c = np.where(splats.visible[:, None], splats.conic, [1.0, 0.0, 1.0]).T
+    if splats.pixel_box:
+        swapped = a > c
+        yy, k = np.where(swapped, a, c), b / np.where(swapped, a, c)
+        t2 = (a * c - b * b) / yy
+        by_t2, by_xy, by_yy = np.where(swapped, shape[:, ::-1].T, shape.T)
+        by_k = yy * (by_xy + 2 * k * by_t2)
+        by_s = 2 * (yy * (by_yy - k * k * by_t2) + k * by_k)
+        position, second = mean2d, np.stack([by_k, by_s, 2 * t2 * by_t2], axis=1)
+    else:
+        u, v = mean2d.T
+        position = np.stack([b * v - c * u, b * u - a * v], axis=1) / (a * c - b * b)[:, None]
+        second = shape * [-2.0, -1.0, -2.0]
+    power = (gradients.opacity * splats.opacity)[:, None]
+    return np.concatenate([power, position, second, gradients.color], axis=1) * splats.visible[:, None]
 
 
 def _covariance_gradient(splats: Splats, m: Floats) -> Floats:

@@ -259,6 +259,17 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
     "blend_backward simt, what is left": ("blend_simt.cl", "own.rest + behind[at]", "own.rest - behind[at]"),
     "sky_forward, the lower half": ("sky.cl", "a = (x - run->sign_x * below)", "a = (x + run->sign_x * below)"),
     "sky_cover, most of nine": ("sky.cl", "MOST_OF_BOX 0.6f", "MOST_OF_BOX 0.5f"),
+    "project_backward, needles": (
+        "backward.h",
+        "v0 += g_det0 * by_normal[k];\n        v1 += g_det0 * by_normal[3 + k];",
+        "v0 += g_det0 * (s->yy * s->v[k] - s->xy * s->v[3 + k]);"  # the same without rounding
+        "v1 += g_det0 * (s->xx * s->v[3 + k] - s->xy * s->v[k]);",
+    ),
+    "project_backward, needles by the inverse": (
+        "backward.h",
+        "-(a * ga + b * gb + c",
+        "-(a * ga + 0.999f * b * gb + c",
+    ),
     "blend_backward, entropy": ("splat.h", "(log_weight(k.weight) + 1.0f)", "log_weight(k.weight)"),
 }
 

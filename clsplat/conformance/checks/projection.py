@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
@@ -20,7 +21,14 @@ from clsplat.conformance.check import (
     equal,
     wrong,
 )
-from clsplat.conformance.scenes import Case, gradients_of_sums, random_case, with_world_filter
+from clsplat.conformance.scenes import (
+    Case,
+    gradients_of_sums,
+    needles,
+    random_case,
+    sums_of_gradients,
+    with_world_filter,
+)
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
 from clsplat.render.filters import FilterViews, Smoothing
@@ -31,6 +39,14 @@ CHECKS = Checks()
 CULLED = 0xFFFFFFFF  # depth key
 COUNTS = (1, 15, 17, 65)
 FILTERS = ((0.3, 1.0), (0.1, 1.0), (0.0, 0.0))  # variance, compensate
+ASPECTS = 30, 70, 150  # of long splats on the screen
+LONG_FILTERS: dict[str, dict[str, float]] = {
+    "dilation": {"variance": 0.3},
+    "ewa": {"variance": 0.3, "compensate": 1.0},
+    "mip": {"variance": 0.1, "compensate": 1.0},
+    "box": {"variance": 0.0, "pixel_box": 1.0},
+}
+LONG = 1e-3  # the largest error of a gradient of a long splat, relative to the largest gradient
 
 
 def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -114,6 +130,25 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
     yield by_norm("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
 
 
+def check_long(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
+    """Compare gradients by Gaussian, relative to the largest one, from the sums for a loss Σ weights · image."""
+    model, rasterizer, (width, height) = case.model(device), Rasterizer(device, "radix"), case.size
+    frame, truth = rasterizer.forward(model, case.device_camera(device), device.zeros(3)), case.project()
+    weights, gaussians = scipy.ndimage.gaussian_filter(rng.normal(size=(3, height, width)), (0, 2, 2)), model.gaussians
+    exact = ref.blend_backward(truth, width, height, np.zeros(3), weights)
+    m = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
+    m[:, : gaussians.count] = sums_of_gradients(truth, exact).T
+    gradients = rasterizer.gradients(model, frame, device.upload(m))
+    expected = expected_gradients(case, truth, m[:, : gaussians.count].astype(np.float64).T)
+    for name in ("means", "quats", "log_scales"):
+        value = gradients.arrays[name].get()[:, : gaussians.count].T
+        error = np.abs(value - expected[name]).max(axis=1) / np.abs(expected[name]).max()
+        yield Deviation("project_backward", f"the worst gradient of {name}, {label}", float(error.max()), LONG)
+        yield Deviation(
+            "project_backward", f"the median gradient of {name}, {label}", float(np.median(error)), LONG / 10
+        )
+
+
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Return the gradients of all parameters, and of the projected means, from sums over pixels, [N, PIXEL_SUMS]."""
     grad_mean2d, grad_conic = gradients_of_sums(truth, m)
@@ -145,6 +180,18 @@ def not_drawable(rng: np.random.Generator) -> Case:
     p["logit_opacity"][7] = -9
     p["logit_opacity"][8] = np.nan
     return case
+
+
+def wide_view(rng: np.random.Generator) -> Case:
+    """Return Gaussians all over a view of 170 degrees."""
+    case = random_case(rng, 40)
+    camera, pose, (width, height) = case.view.camera, case.view.world_to_camera, case.size
+    camera = replace(camera, fx=0.045 * width, fy=0.045 * width)
+    depth = rng.uniform(0.3, 1, 40)
+    rays = rng.uniform(-0.5, 0.5, (40, 2)) * [width / camera.fx, height / camera.fy]
+    case.parameters["means"][:] = (np.column_stack([rays * depth[:, None], depth]) - pose[:, 3]) @ pose[:, :3]
+    case.parameters["log_scales"][:] = np.log(3 / camera.fx * depth[:, None]) + rng.normal(-0.3, 0.6, (40, 3))
+    return replace(case, view=replace(case.view, camera=camera))
 
 
 def beyond_the_clamp(rng: np.random.Generator) -> Case:
@@ -214,6 +261,16 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
         case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
         yield from check_gradient(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
     yield from check_gradient(device, beyond_the_clamp(rng), rng, "rays beyond the image")
+
+
+@CHECKS.add("project_backward")
+def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
+    """Compare gradients of long splats, whose terms cancel in other formulas, from the sums of a blended image."""
+    for aspect in ASPECTS:
+        for name, settings in LONG_FILTERS.items():
+            case = needles(rng, 12, aspect, **settings)
+            yield from check_long(device, case, rng, f"needles of {aspect} to 1, filter {name}")
+    yield from check_long(device, wide_view(rng), rng, "a view of 170 degrees")
 
 
 @CHECKS.add("sampling_interval", "filter_variance")
