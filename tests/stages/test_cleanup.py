@@ -126,7 +126,7 @@ def test_undeclared_rewriting_rule_does_not_change_the_model(tiny_scene, flawed_
     monkeypatch.setattr(MergeNeighbors, "rewrites", False)
     run = opened(tiny_scene, flawed_model, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
-    with pytest.raises(ConfigError, match=r"a rule changes .* of Gaussians that stay; use it in densify"):
+    with pytest.raises(ConfigError, match=r"a rule changes .* of Gaussians that it does not remove; use it in densify"):
         Cleanup(stage="cleanup", rules=[MergeNeighbors()]).act(run)
     for name, table in before.items():
         np.testing.assert_array_equal(run.model.gaussians.get(name), table)
