@@ -262,7 +262,7 @@ def python_interrupts() -> None:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """Random numbers that depend on the test's name only."""
+    """Random numbers that depend only on the test's name: a renamed test gets other data."""
     return np.random.default_rng(list(request.node.name.encode()))
 
 

@@ -106,7 +106,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def test_known_exposures_are_recovered(rng, info):
+def test_known_exposures_are_found_again(rng, info):
     truth = draw_gains(rng, 0.25, 0.05)
     found = Capture(rng, info, truth).learned(rng)
     assert rms(truth) > 0.15
@@ -133,7 +133,7 @@ def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
     assert np.median((model - capture.colors)[seen]) == pytest.approx(0, abs=0.03)
 
 
-def test_grids_recover_known_exposures(rng, info):
+def test_grids_find_known_exposures_too(rng, info):
     """By what a grid makes of the whole image; it has 768 numbers for what three say."""
     truth = draw_gains(rng, 0.25, 0.05)
     capture = Capture(rng, info, truth)

@@ -118,5 +118,5 @@ def test_training_uses_depth_maps_and_detects_changes(yard, tmp_path):
     write_map(tmp_path / "maps" / yard.views[0].name, ground(yard, yard.views[0]), bits=8)
     assert contents(asked) != before
     two = losses.replace("%s}]", f"{folder}}}, {{type: inverse_depth}}]")
-    with pytest.raises(ConfigError, match="is listed with two folders; keep one"):
+    with pytest.raises(ConfigError, match="is listed with two folders; keep only one"):
         train(scene, tmp_path / "c", *TWO_DOZEN, f"optimize.losses={two}")

@@ -55,7 +55,7 @@ def held_out(run: Path) -> float:
     return float(np.mean(found))
 
 
-def test_known_exposures_are_recovered_from_scratch(plain_scene, rng, tmp_path):
+def test_known_exposures_are_found_again_from_scratch(plain_scene, rng, tmp_path):
     """Exposures begin alike, for the dataset has no tracks."""
     truth = write_with_gains(plain_scene, tmp_path / "gain_scene", rng)
     shutil.copytree(tmp_path / "gain_scene", tmp_path / "none_scene")

@@ -41,7 +41,7 @@ class Case:
 
 @on_devices("seed", [(0,), (1,)])
 @pytest.mark.usefixtures("without_plugins")
-def test_step_gradients_are_those_of_its_losses(device, rng, seed):
+def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
     _, row, of_weight, (wait,) = view.step.saved(case.state)

@@ -93,7 +93,7 @@ def test_exact_cameras_do_not_drift(rng, info):
     assert factor == pytest.approx(1, abs=1e-4)
 
 
-def test_wrong_focal_length_is_recovered_with_poses(rng, info):
+def test_a_wrong_focal_length_is_found_again_beside_poses(rng, info):
     before, after, factor = pose_errors(rng, info, 1.0, 0.98)
     print(factor, np.degrees(after[0]), after[1])
     assert np.degrees(before[0]) > 0.4
