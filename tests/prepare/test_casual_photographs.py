@@ -334,7 +334,8 @@ def test_unusable_sets_end_with_one_sentence(tmp_path, dense, pixels, sentence):
 
 def test_featureless_photographs_end_with_one_sentence(tmp_path, dense):
     """Photographs without features are matched with more pairs."""
-    plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
+    ramp = np.linspace(60, 120, 240)[None, :, None] * np.ones((180, 1, 3))
+    plain = [(ramp + number).astype(np.uint8) for number in range(12)]
     matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbors=2)
     with pytest.raises(DataError, match="none has features, where thousands"):
         map_cameras(matches, cameras)

@@ -127,7 +127,7 @@ def test_other_matching_modes(photos, tmp_path, matching):
 def test_photographs_without_features(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64), np.linspace(60, 90, 64)).astype(np.uint8))
     with pytest.raises(DataError, match="none has features"):
         map_photographs(tmp_path, tmp_path / "out")
 

@@ -47,6 +47,9 @@ def scene(path: Path, model: ColmapModel | None = None, kind: str = "bin", newli
     return path
 
 
+PIXELS = np.arange(48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
+
+
 def photo(path: Path, pixels: np.ndarray) -> None:
     _, encoded = cv2.imencode(path.suffix, pixels)
     path.write_bytes(encoded.tobytes())
@@ -102,7 +105,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
         images[2] = replace(images[2], **fields)
         write_scene(path, healthy(images=images))
         for name in NAMES:
-            photo(path / "images" / name, np.zeros((48, 64, 3), np.uint8))
+            photo(path / "images" / name, PIXELS)
 
     return damage
 
@@ -111,7 +114,7 @@ def transforms(**changes: object) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
         path.mkdir()
         for name in NAMES:
-            photo(path / name, np.full((48, 64, 3), 90, np.uint8))
+            photo(path / name, PIXELS)
         frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in NAMES]
         table = {"fl_x": 60, "w": 64, "h": 48, "frames": frames}
         first = {key: value for key, value in changes.items() if key != "table"}

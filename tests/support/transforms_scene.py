@@ -51,7 +51,9 @@ def write(path: Path, name: str = "transforms.json", size: tuple[int, int] = (64
     for frame in table["frames"]:
         file = (path / frame["file_path"]).with_suffix(Path(frame["file_path"]).suffix or ".png")
         file.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(file), np.full((size[1], size[0], 3), 128, np.uint8))
+        pixels = np.full((size[1], size[0], 3), 128, np.uint8)
+        pixels[-1, -1] = 200  # an image of one color is refused before training
+        cv2.imwrite(str(file), pixels)
     return path
 
 
