@@ -28,10 +28,12 @@ from clsplat.prepare.database import (
 )
 from clsplat.prepare.gather import gather, list_photographs, log_warnings
 from clsplat.prepare.shared_intrinsics import Cameras, group_photos, shared_camera_note
-from clsplat.scene.images import read_gray
+from clsplat.scene.images import read_gray, read_header
 
 LOG = logging.getLogger("clsplat")
-CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
+CameraModel = Literal[
+    "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"
+]
 LAYERS, MAX_EDGE, BLUR = 3, 10.0, 1.6  # Lowe 2004: scales of an octave, ratio of curvatures, px
 LEVELS = 512  # scale of RootSIFT values, as COLMAP stores them; values above 255 are clipped
 
@@ -64,6 +66,11 @@ def find_features(
     groups = group_photos(out / IMAGES, names, cameras)
     figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
     log_warnings(figures)
+    if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
+        LOG.warning(
+            "the photographs are twice as wide as high, as panoramas are; "
+            "for panoramas, --set find_features.camera_model=EQUIRECTANGULAR"
+        )
     if note := shared_camera_note(out / IMAGES, groups):
         LOG.info("%s", note)
     with explained(photographs, "find features"):
@@ -72,6 +79,12 @@ def find_features(
             _register(pycolmap, out, groups, camera_model)
     add_features(out / IMAGES, out / DATABASE, options)
     return figures
+
+
+def _is_panorama(photograph: Path) -> bool:
+    """Return whether a photograph is twice as wide as high."""
+    header = read_header(photograph)
+    return header.width == 2 * header.height
 
 
 def add_features(images: Path, database: Path, options: FeatureOptions) -> None:

@@ -74,7 +74,7 @@ class FindFeatures(Step):
     features: Positive = 12288
     """Maximum number of features per photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
-    """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses."""
+    """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses, EQUIRECTANGULAR for panoramas."""
     cameras: Cameras = "auto"
     """Which photographs of the same size share a camera; auto: those with the same lens in EXIF, or with none."""
 
@@ -177,4 +177,4 @@ class Undistort(Step):
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
 
     def summary(self, figures: dict[str, Any]) -> str:
-        return f"{pluralize(figures['images'], 'photograph')} undistorted"
+        return f"photographs undistorted to {pluralize(figures['images'], 'pinhole image')}"

@@ -171,6 +171,7 @@ WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models of directions next t
 
 MIN_WIDE = math.radians(80)  # to a side of the image: a pinhole image would be 3.6 times as wide
 MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
+RIM = 1.5  # px: a sample at the edge of what a fisheye shows would mix with the dark beyond
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
 FACE_GRID = 128  # directions to a side at which the part of a face that the photograph shows is looked for
 MIN_SHOWN = 0.02  # share of a face; one that shows less is left out
@@ -257,7 +258,8 @@ class Lens:
         with np.errstate(all="ignore"):
             x, y = self._pixels(directions)
             inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
-        return np.asarray(inside & (angle < min(fold, max(sides.min(), MIN_CIRCLE))))
+        circle = max(sides.min(), MIN_CIRCLE) - RIM / self._split[0]
+        return np.asarray(inside & (angle < min(fold, circle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
         """Return whether a face shows a white pixel of a mask, [H, W, C], of the photograph."""
@@ -280,10 +282,11 @@ class Lens:
         """
         focal = max(self._split[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
-        if side > MAX_SIDE or max(self.width, self.height) > MAX_SOURCE:
+        longest = max(self.width, self.height)
+        if side > MAX_GROWTH * longest or longest > MAX_SOURCE:
             raise DataError(
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
-                f"at most {MAX_SOURCE} px to a side, and faces of at most {MAX_SIDE}: reduce the photographs"
+                f"at most {MAX_SOURCE} px to a side and focal lengths that fit: calibrate the camera again"
             )
         shows = self._shows(*_face_grid())
         if not shows.any():
