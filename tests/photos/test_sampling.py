@@ -87,7 +87,7 @@ def masked_everywhere(source: Path, out: Path, name: str) -> Path:
 
 def test_fully_masked_photograph_ends_the_run_with_a_sentence(tiny_scene, tmp_path):
     scene = masked_everywhere(tiny_scene, tmp_path / "scene", "r_003")
-    with pytest.raises(DataError, match=r"003\.png: the mask excludes every pixel of '.*003'") as error:
+    with pytest.raises(DataError, match=r"masks exclude every pixel of 1 photograph: .*003") as error:
         train(scene, tmp_path / "run", "scene.alpha=mask")
     assert "\n" not in str(error.value)
     status = json.loads((tmp_path / "run" / "status.json").read_text())

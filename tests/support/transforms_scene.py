@@ -51,10 +51,15 @@ def write(path: Path, name: str = "transforms.json", size: tuple[int, int] = (64
     for frame in table["frames"]:
         file = (path / frame["file_path"]).with_suffix(Path(frame["file_path"]).suffix or ".png")
         file.parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.full((size[1], size[0], 3), 128, np.uint8)
-        pixels[-1, -1] = 200  # an image of one color is refused before training
-        cv2.imwrite(str(file), pixels)
+        cv2.imwrite(str(file), _nearly_plain(size, 128))
     return path
+
+
+def _nearly_plain(size: tuple[int, int], level: int) -> np.ndarray:
+    """An image of one color but for one pixel: photographs of one color are refused before training."""
+    pixels = np.full((size[1], size[0], 3), level, np.uint8)
+    pixels[-1, -1] = 200
+    return pixels
 
 
 # A dataset of nerfstudio that is moved as a whole, with four cameras around a few points.
@@ -71,7 +76,7 @@ def write_shifted(folder, shift=0.0):
         matrix[:3, 3] = center + shift
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        write_image(folder / "images" / f"{i}.png", np.full((48, 64, 3), 50 * i, np.uint8))
+        write_image(folder / "images" / f"{i}.png", _nearly_plain((64, 48), 50 * i))
     (folder / "transforms.json").write_text(json.dumps(LENS | {"frames": frames, "ply_file_path": "p.ply"}))
     write_points_ply(folder / "p.ply", PointCloud(SHIFTED_POINTS + shift, np.full((3, 3), 0.5)))
     return read_scene(folder, holdout=0)
