@@ -46,7 +46,7 @@ def test_cells_of_pipelines_and_scenes(write, tmp_path):
     assert [cell.pipeline.settings.name for cell in found.cells] == ["smoke", "smoke", "other", "other"]
 
 
-def test_cells_in_another_number_of_steps(write):
+def test_cells_with_other_step_counts(write):
     (cell,) = load_experiment(write("name: s\nmatrix: {pipelines: [splat_7k], seeds: [3], steps: 700}\n")).cells
     training = cell.pipeline.settings.training
     assert (training.steps, training.during[1].every, training.during[1].stop) == (700, 10, 400)
