@@ -74,7 +74,7 @@ def test_cameras_and_positions_are_read_from_exif(tmp_path):
 
 
 @pytest.mark.parametrize("level", [0, 5, 120])
-def test_photographs_that_show_nothing_are_refused_as_in_preparation(tmp_path, level):
+def test_blank_photographs_are_refused_as_in_preparation(tmp_path, level):
     photos = tmp_path / "photos"
     photos.mkdir()
     for i in range(10):
