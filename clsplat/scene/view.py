@@ -252,10 +252,10 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     """
     layers = []
     if view.mask_path is not None:
-        layers.append(_as_taken(view, view.mask_path)[:, :, :1])
+        layers.append(_as_taken(view, view.mask_path, slice(1)))
     if view.alpha == "mask":
-        pixels = _as_taken(view, view.image_path)
-        layers += [pixels[:, :, 3:]] if pixels.shape[2] == 4 else []
+        pixels = _as_taken(view, view.image_path, slice(3, 4))
+        layers += [pixels] if pixels.size else []
     if view.lens is not None and view.lens.whole:
         layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
     size = view.camera.width, view.camera.height
@@ -266,8 +266,8 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     return np.logical_and.reduce(masks) if masks else None
 
 
-def _as_taken(view: View, path: Path) -> NDArray[Any]:
-    """The pixels of a file at the size of its camera before downscaling: upright and undistorted.
+def _as_taken(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
+    """Some channels of a file's pixels at the size of its camera before downscaling: upright and undistorted.
 
     Raises DataError as is_turned does.
     """
@@ -280,8 +280,8 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
         height, width = decoded[upright].shape[:2]
         return width, height
 
-    pixels = decoded[needs_rotation(view, path, size)]
-    return view.lens.undistort_image(pixels) if view.lens else pixels
+    pixels = decoded[needs_rotation(view, path, size)][:, :, channels]
+    return view.lens.undistort_image(np.ascontiguousarray(pixels)) if view.lens and pixels.size else pixels
 
 
 def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
