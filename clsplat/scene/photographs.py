@@ -5,6 +5,7 @@ import logging
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -62,8 +63,9 @@ def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
     """Return the scene with the masks in a folder; without a folder, the scene.
 
-    All pixels of a photograph without a mask are used.  Raises DataError if the folder does not exist or contains no
-    mask of a photograph, and if the dataset already has masks.
+    All pixels of a photograph without a mask are used.  Faces of a wide photograph that its mask hides are left out.
+    Raises DataError if the folder does not exist or contains no mask of a photograph, and if the dataset already has
+    masks.
     """
     if folder is None:
         return scene
@@ -76,7 +78,8 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     photographs = [view.name if view.lens is None else photograph_of(view.name) for view in scene.views]
     masks = find_masks(folder, photographs)
     views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
-    count, missing = len(views), [name for name, mask in zip(photographs, masks, strict=True) if mask is None]
+    mask_of = dict(zip(photographs, masks, strict=True))
+    count, missing = len(mask_of), [name for name, mask in mask_of.items() if mask is None]
     if len(missing) == count:
         fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
         names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))
@@ -89,7 +92,20 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
         LOG.warning(
             "%s: contains masks for %s; all pixels of the others are used, such as %s", folder, masked, missing[0]
         )
-    return replace(scene, views=views)
+    return _without_hidden_faces(replace(scene, views=views))
+
+
+def _without_hidden_faces(scene: Scene) -> Scene:
+    read = lru_cache(1)(read_image)
+    rows = [
+        i
+        for i, (mask, lens) in enumerate((view.mask_path, view.lens) for view in scene.views)
+        if mask is None or lens is None or not lens.face or lens.shows_white(read(mask))
+    ]
+    new = {old: i for i, old in enumerate(rows)}
+    train, test, validation = (tuple(new[i] for i in old if i in new) for old in scene.indices.values())
+    views = tuple(scene.views[i] for i in rows)
+    return replace(scene, views=views, train=train, test=test, validation=validation)
 
 
 def _mask_names(name: str) -> list[str]:

@@ -12,6 +12,7 @@ from clsplat.scene.camera import FACES, Lens, panorama_lens
 from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
+from clsplat.scene.photographs import with_masks
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View, load_image, load_mask, photograph_of
 from clsplat.scene.view_selection import Split, ViewSelection
@@ -220,6 +221,15 @@ def test_impossible_wide_lenses_are_refused(tmp_path: Path, model: str, params: 
     images = [ImageEntry("a.png"), ImageEntry("b.png")]
     with pytest.raises(DataError, match=message):
         read_scene(write_scene(tmp_path, ColmapModel([camera], images), "txt"), 0)
+
+
+def test_masks_of_a_folder_hide_faces(panoramas: Path) -> None:
+    folder = (panoramas / "masks").rename(panoramas / "my_masks")
+    scene = with_masks(read_scene(panoramas, 8), folder)
+    assert [len(scene.views), len(scene.train), len(scene.test)] == [53, 41, 12]
+    assert photographs(scene, "test") == ["IMG_0000.jpg", "IMG_0008.jpg"]
+    assert not any(view.name == "IMG_0002/cube_down.jpg" for view in scene.views)
+    assert load_mask(next(view for view in scene.views if view.name == "IMG_0002/cube_left.jpg")) is not None
 
 
 def test_mask_that_hides_all_faces_is_refused(panoramas: Path) -> None:
