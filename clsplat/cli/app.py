@@ -11,7 +11,8 @@ from typer.core import TyperGroup
 
 from clsplat.api import arguments, tools
 from clsplat.core import terminal
-from clsplat.core.errors import ConfigError
+from clsplat.core.errors import ConfigError, MemoryLimitError
+from clsplat.core.machine import process_limit
 from clsplat.core.resources import full_version
 from clsplat.core.signals import stop_with_input
 from clsplat.pipeline.files import shipped
@@ -36,6 +37,7 @@ SYNONYMS = {
     "version": "--version",
 }
 
+MIN_ADDRESS_SPACE = 1 << 30  # bytes; OpenCL runtimes need more
 
 ORDER = [
     *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
@@ -139,6 +141,12 @@ def common(
     ] = False,
 ) -> None:
     terminal.start_logging(debug)
+    limit = process_limit("RLIMIT_AS")
+    if limit is not None and limit < MIN_ADDRESS_SPACE:
+        raise MemoryLimitError(
+            f"`ulimit -v` limits clsplat to {limit >> 20} MiB of address space; libraries crash with less than "
+            f"{MIN_ADDRESS_SPACE >> 20}: raise it"
+        )
     if attended:
         stop_with_input()
     context.obj = Common(device)

@@ -242,3 +242,10 @@ def test_too_long_input_name_is_reported_like_a_missing_file(arguments, code, mo
 def test_too_long_output_name_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match=r"xxx\.ply: cannot be written \(File name too long\)"):
         write_text(tmp_path / f"{LONG}.ply", "")
+
+
+def test_too_little_address_space_is_reported_before_libraries_crash(monkeypatch):
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr(resource, "getrlimit", lambda number: (500 << 20, 500 << 20))
+    message = "limits clsplat to 500 MiB of address space; libraries crash with less than 1024: raise it"
+    assert message in clsplat("pipelines", expect=5).stderr
