@@ -312,22 +312,17 @@ def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
     return tuple(values) if any(values[2:]) else None
 
 
-@dataclass(frozen=True)
-class ExifCamera:
-    """Which camera took a photograph."""
+def read_exif_camera(path: Path) -> tuple[str, bool]:
+    """Return make, model and focal length by the EXIF data of a JPEG file, and whether it has a GPS position.
 
-    name: str  # make, model, and focal length; "" if unknown
-    is_located: bool  # whether there is a GPS position
-
-
-def read_exif_camera(path: Path) -> ExifCamera:
-    """Return the camera in the EXIF data of a JPEG file.  Raises DataError when it cannot be read."""
+    Raises DataError when it cannot be read.
+    """
     with open_file(path, "an image") as file:
         tags = _read_tags(file.read(HEAD_SIZE))
     make, model, focal = (tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL))
     parts = [] if str(model).startswith(str(make)) else [str(make)]
     parts += [str(model), f"{focal:g} mm" if isinstance(focal, float) else ""]
-    return ExifCamera(" ".join(filter(None, parts)), LATITUDE in tags and LONGITUDE in tags)
+    return " ".join(filter(None, parts)), LATITUDE in tags and LONGITUDE in tags
 
 
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:

@@ -407,10 +407,10 @@ def measure_capture(files: Sequence[Path]) -> CaptureFacts:
     sizes, cameras, located = Counter[str](), Counter[str](), 0
     for file in files:
         with suppress(DataError):
-            header, exif = read_header(file), read_exif_camera(file)
+            header, (camera, has_position) = read_header(file), read_exif_camera(file)
             sizes[f"{header.width}x{header.height}"] += 1
-            cameras[exif.name or "unknown"] += 1
-            located += exif.is_located
+            cameras[camera or "unknown"] += 1
+            located += has_position
     return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located)
 
 

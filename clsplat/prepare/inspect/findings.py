@@ -53,11 +53,10 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     readable, texts = count - len(damaged), facts.left_out
     if facts.unplaced:
         yield from _capture(facts, readable)
-    elif count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
-        remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
-        yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
     else:
         remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
+        if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
+            remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
         yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
     for text in texts + warnings_for({"damaged": damaged, "photographs": readable}):
         yield Finding("warning", text.removeprefix(f"{facts.path}: "))
