@@ -241,12 +241,13 @@ class Lens:
 
     @cached_property
     def faces(self) -> tuple["Lens", ...]:
-        """The faces of a wide photograph that show MIN_SHOWN or more.  Raises DataError without any."""
+        """The front of a wide photograph, and the other faces that show MIN_SHOWN or more.  Raises DataError."""
         lenses = [replace(self, face=face, whole=self.model != "EQUIRECTANGULAR") for face in FACES]
-        faces = tuple(intern_lens(lens) for lens in lenses if lens._shows(*_face_grid()).mean() >= MIN_SHOWN)
-        if not faces:
-            raise DataError(f"the lens {self.model} {quote(self.params)} shows nothing; calibrate the camera again")
-        return faces
+        return tuple(
+            intern_lens(lens)
+            for lens in lenses
+            if lens.face == "front" or lens._shows(*_face_grid()).mean() >= MIN_SHOWN
+        )
 
     def _shows(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
         """Return whether the wide photograph shows the rays with these normalized coordinates of the face."""
@@ -290,7 +291,7 @@ class Lens:
             )
         shows = self._shows(*_face_grid())
         if not shows.any():
-            return Camera(side, side, focal, focal, side / 2, side / 2)
+            raise DataError(f"the lens {self.model} {quote(self.params)} shows nothing; calibrate the camera again")
         spans = [np.flatnonzero(shows.any(axis=axis)) for axis in (0, 1)]  # columns, rows
         (x0, x1), (y0, y1) = (
             (max(0, int((i[0] - 1) / FACE_GRID * side)), min(side, int((i[-1] + 2) / FACE_GRID * side))) for i in spans

@@ -115,7 +115,7 @@ class View:
     def faces(self) -> list["View"]:
         """Return the views of the faces of a wide photograph, without those that show nothing; of others, the view.
 
-        Raises DataError when the lens or the mask shows nothing.
+        Raises DataError when the mask shows nothing.
         """
         if self.lens is None or not self.lens.is_wide or self.lens.face:
             return [self]

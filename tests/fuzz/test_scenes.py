@@ -23,12 +23,25 @@ WORDS = [
 ]
 WORDS += [
     '"OPENCV_FISHEYE"',
+    '"EQUIRECTANGULAR"',
     '"a.png"',
     "[[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5]]",
     '{"file_path": "a.png"}, ',
     "[],",
 ]
-MODELS = ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "PINHOLE", "7", "a.jpg", "# "]
+MODELS = [
+    "SIMPLE_RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "EQUIRECTANGULAR",
+    "EUCM",
+    "PINHOLE",
+    "7",
+    "a.jpg",
+    "# ",
+]
 
 
 def read_and_inspect(path: Path) -> None:
@@ -57,6 +70,9 @@ def colmap(folder: Path, kind: str) -> tuple[Path, dict[str, list[bytes]]]:
         CameraEntry(1, "SIMPLE_RADIAL", 64, 48, (50.0, 30.5, 25.25, 0.01)),
         CameraEntry(1, "OPENCV_FISHEYE", 64, 48, (50.0, 51.0, 30.5, 25.25, 0.01, 0, 0, 0)),
         CameraEntry(1, "FOV", 64, 48, (50.0, 51.0, 30.5, 25.25, 0.1)),
+        CameraEntry(1, "FISHEYE", 64, 48, (20.0, 21.0, 30.5, 25.25)),
+        CameraEntry(1, "EUCM", 64, 48, (20.0, 21.0, 30.5, 25.25, 0.6, 1.1)),
+        CameraEntry(1, "EQUIRECTANGULAR", 64, 48, (64, 48)),
     ]
     models: list[ColmapModel] = [*(replace(tiny_model(), cameras=[camera]) for camera in cameras), tiny_model()]
     seeds: dict[str, list[bytes]] = {"cameras": [], "images": [], "points3D": []}
@@ -95,6 +111,7 @@ def tables() -> list[bytes]:
         {"frames": own, "ply_file_path": "points.ply"},
         {"camera_angle_x": 0.7, "frames": [{**frame, "file_path": f"./{frame['file_path'][0]}"} for frame in frames]},
         {**lens, "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001, "frames": masked},
+        {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 48, "frames": frames},
         {**lens, "frames": [{**frame, "time": i, "static_path": "a.png"} for i, frame in enumerate(frames)]},
     ]
     return [json.dumps(table, indent=i % 2 or None).encode() for i, table in enumerate(found)]

@@ -9,7 +9,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
-IDS |= {"FULL_OPENCV": 6, "FOV": 7, "SIMPLE_DIVISION": 12, "FISHEYE": 15}
+IDS |= {"FULL_OPENCV": 6, "FOV": 7, "SIMPLE_DIVISION": 12, "FISHEYE": 15, "EUCM": 16, "EQUIRECTANGULAR": 17}
 
 
 @dataclass
