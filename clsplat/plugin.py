@@ -1,6 +1,6 @@
-"""Export what plug-ins may import: the base classes, and the names that these need.
+"""Export the names that plug-ins may import: base classes, and the types in their signatures.
 
-Other modules of clsplat may move between versions, but the names in this module stay.  Nothing in clsplat imports it.
+Other modules of clsplat may change between versions, but the names in this module remain.  No module imports it.
 """
 
 from clsplat.core.errors import (

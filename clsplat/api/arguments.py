@@ -1,4 +1,4 @@
-"""Convert arguments of the API to the forms that the rest of the package takes."""
+"""Convert arguments of the API to the types used in the rest of the package."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,9 +12,9 @@ Overrides = Mapping[str, Any] | Sequence[str]  # values by key, or 'key=value' a
 
 
 def overrides(values: Overrides) -> list[str]:
-    """Return settings as for `--set`; paths become text, and NumPy numbers become numbers.
+    """Return settings in the notation of `--set`, with paths and NumPy numbers converted to text and numbers.
 
-    Raises ConfigError for a value that YAML cannot hold.
+    Raises ConfigError for a value that YAML cannot represent.
     """
     if isinstance(values, str):
         return [values]
@@ -41,17 +41,17 @@ def load_plugins() -> None:
     """Import the plug-ins of installed packages, once."""
     from importlib.metadata import entry_points
 
-    if entry_points(group="clsplat.plugins"):  # without plug-ins, the command line starts without OpenCL and pydantic
+    if entry_points(group="clsplat.plugins"):  # without any, the command line starts without OpenCL and pydantic
         from clsplat.pipeline import plugins
 
         plugins.load_installed()
 
 
-def path_of(value: PathLike | None) -> Path | None:
-    """Return a path as a Path; None stays None."""
+def to_path(value: PathLike | None) -> Path | None:
+    """Convert a path to `Path`; None stays None."""
     return None if value is None else Path(value)
 
 
 def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
-    """Return the names of the layers to render."""
-    return ("color", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))
+    """Return the names of the layers to render: color, and the requested ones."""
+    return ("color", *(name for name, is_wanted in (("depth", depth), ("alpha", alpha)) if is_wanted))

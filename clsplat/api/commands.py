@@ -1,16 +1,16 @@
 """Provide the commands as functions, from paths and plain values to files and plain values.
 
-The command line prints what they return.  They raise the errors of `clsplat.core.errors`: ConfigError for a pipeline or
-an argument, DataError for a dataset or a model, DeviceError for a device, OutputError for a file that cannot be
-written.  `device` is part of a device's name, as in `devices`, or a `Device`; the default is CLSPLAT_DEVICE, or else
-the strongest GPU that works, or else the first CPU.
+The command line prints their results.  They raise the errors of `clsplat.core.errors`: ConfigError for a pipeline or an
+argument, DataError for a dataset or a model, DeviceError for a device, OutputError for a file that cannot be written.
+`device` is part of a device's name, as in `devices`, or a `Device`; the default is CLSPLAT_DEVICE, or else the
+strongest working GPU, or else the first CPU.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, path_of
+from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, to_path
 from clsplat.core.errors import ConfigError
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
@@ -37,10 +37,10 @@ def run(
     scene: folder of the dataset; default: the scene of the pipeline
     out: the run folder; default: runs/NAME
     set: settings by key, such as {"optimize.steps": 3000}
-    start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" starts over where `out`
-        has a run, and removes its checkpoints and metrics
+    start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" starts over if `out` has
+        a run, and removes its checkpoints and metrics
     live: port of a web page on this machine that shows the model while it trains; 0: the default port
-    minutes: train in as many steps as fit into this time, counted from when the photos are read
+    minutes: choose the number of steps to fit this time, counted from the reading of the photos
     on: a file that says where the cells of a matrix run, instead of its `execution`
     """
     return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
@@ -72,7 +72,7 @@ def resume(
 ) -> Path:
     """Continue a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
 
-    scene: where its photos are, if they have moved; steps: train up to this step; set, live, on: as for `run`.
+    scene: the new folder of the photos, if they were moved; steps: train up to this step; set, live, on: as for `run`.
     """
     return run_job(resume_job(folder, scene, set, steps, on), device, live)
 
@@ -85,16 +85,16 @@ def resume_job(
     from clsplat.sweeps.experiment import Job
 
     load_plugins()
-    return Job.resume(Path(folder), overrides(set), path_of(scene), read_execution(path_of(on)), steps)
+    return Job.resume(Path(folder), overrides(set), to_path(scene), read_execution(to_path(on)), steps)
 
 
 def status(folder: PathLike) -> dict[str, Any]:
     """Return the state of a run or a matrix from its files: the content of status.json, `last` report, and `metrics`.
 
-    A matrix has `cells`, `done` and `failed` instead of a step.  `silent` is the time in seconds since the last
-    heartbeat of a run that has not ended, and `ahead` how far that is in the future, if more than a minute; the state
-    is `killed` if the process is gone.  `advice` says how to continue.  The store of a sweep has `cells`, `counts` of
-    their states and `events`; a scene in blocks has `state` and `parts`.
+    A matrix has `cells`, `done`, and `failed` instead of a step.  `silent` is the time since the last heartbeat of an
+    unfinished run, s, and `ahead` the time by which it is in the future, if more than a minute; the state is "killed"
+    if the process is gone.  `advice` says how to continue.  The store of a sweep has `cells`, `counts` of their states,
+    and `events`; a scene in blocks has `state` and `parts`.
     """
     from clsplat.workflows.folder import status_of
 
@@ -111,7 +111,7 @@ def status_schema() -> dict[str, Any]:
 def check(pipeline: PathLike) -> dict[str, Any]:
     """Validate a pipeline or a matrix, verify a run folder, or inspect a model file.
 
-    A pipeline or a matrix returns `path`, `name`, `stages` or `cells`, and in `adapts` the keys that the photos will
+    A pipeline or a matrix returns `path`, `name`, `stages` or `cells`, and `adapts`: the keys that the photos will
     decide.  The folder of a run, or of a scene in blocks, returns `whole`, `state`, and `objects`: each file, whether
     it is `whole`, and a `detail`.  A model file returns `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
     and `valid`.
@@ -131,7 +131,7 @@ def pipeline_schema() -> dict[str, Any]:
 
 
 def pipelines(name: PathLike | None = None) -> Any:
-    """Return `name`, `summary` and `path` of each shipped pipeline, or of one of them, with its `stages` and `keys`."""
+    """Return `name`, `summary`, and `path` of all shipped pipelines, or those and `stages` and `keys` of one."""
     from clsplat.pipeline import recipes
 
     load_plugins()
@@ -165,10 +165,10 @@ def evaluate(
     load_plugins()
     return model_file.evaluate(
         Path(model),
-        path_of(scene),
+        to_path(scene),
         downscales=downscales,
         metrics=metrics,
-        lpips=path_of(lpips),
+        lpips=to_path(lpips),
         lpips_input=lpips_input,
         device=device,
     )
@@ -186,7 +186,7 @@ def _job(
     from clsplat.sweeps.experiment import Job
 
     load_plugins()
-    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, read_execution(path_of(on)))
+    return Job.open(str(pipeline), to_path(scene), to_path(out), overrides(values), start, read_execution(to_path(on)))
 
 
 def run_job(job: "Job", device: "str | Device | None", live: int | None = None, minutes: float | None = None) -> Path:
@@ -201,9 +201,9 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
     if live is not None or minutes is not None:
         raise ConfigError("--live and --minutes are for single runs; the cells of a store run in other processes")
     if isinstance(device, Device):
-        raise ConfigError("device: expected a name, as the cells of a store run in other processes")
+        raise ConfigError("device: expected a name, because the cells of a store run in other processes")
     if device is not None and work.execution.has_workers:
-        raise ConfigError("--device: with a scheduler, workers choose the devices: use `clsplat worker --device NAME`")
+        raise ConfigError("--device: with a scheduler, workers choose the devices; use `clsplat worker --device NAME`")
     from clsplat.sweeps.batch import run_sweep  # slow to import, and not needed for a single run
 
     run_sweep(work, job.state, work.execution, device, job.start)
@@ -226,7 +226,7 @@ def compress_model(
 ) -> dict[str, Any]:
     """Find the smallest file of a model within a loss of quality, or the best file of a size.
 
-    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: folder for the file, a page and all trials;
+    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: folder for the file, a page, and all trials;
     keep: fractions of the Gaussians to try; steps: training steps after each pruning, default 1000, and a fifth of that
     for each palette.  Returns the content of compress.json, with `file` and `page`.  Raises ConfigError for a target
     that no file meets.
@@ -234,10 +234,10 @@ def compress_model(
     from clsplat.workflows import compress
 
     load_plugins()
-    shares = compress.KEEPS if keep is None else keep
+    keeps = compress.KEEPS if keep is None else keep
     folder = Path(out)
     return compress.compress(
-        Path(model), path_of(scene), target, folder, form=format, keeps=shares, steps=steps, device=device
+        Path(model), to_path(scene), target, folder, form=format, keeps=keeps, steps=steps, device=device
     )
 
 
@@ -255,16 +255,16 @@ def write_levels(
     """Write a model in levels of detail, as streamed SOG (lod-meta.json).
 
     model, scene: as for `render_views`, but without a scene nothing is trained, and ConfigError is raised for `steps`,
-    `downscale` or `device`; levels: their number, including the model itself; keep: fraction of the Gaussians of the
+    `downscale`, or `device`; levels: their number, including the model itself; keep: fraction of the Gaussians of the
     previous level; steps: training steps of each coarser level, default 500, 0 for none; downscale: divisor of the
-    image size in training, by default that of the run.  Returns `folder`, `bytes`, the `split` that is measured, and
-    `levels` with `gaussians`, `bytes`, and in dB `merged_psnr`, before training, and `psnr`.
+    image size in training, by default that of the run.  Returns `folder`, `bytes`, the measured `split`, and
+    `levels` with `gaussians`, `bytes`, `merged_psnr`, before training, and `psnr`, dB.
     """
     from clsplat.workflows.lod import LodPlan, levels_of_detail
 
     load_plugins()
     plan = LodPlan(levels, keep, steps, downscale)
-    return levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)
+    return levels_of_detail(Path(model), Path(folder), to_path(scene), plan, device)
 
 
 # Training a large scene in blocks.
@@ -273,8 +273,9 @@ def write_levels(
 def plan_in_blocks(
     scene: PathLike, pipeline: str = "blocks", *, blocks: int = 4, device: "str | Device | None" = None
 ) -> dict[str, Any]:
-    """Return how a scene would be cut by its points, without training it: the content of partition.json, and the
-    time of each block in `seconds`, extrapolated from some steps on the device.  Nothing is written.
+    """Partition a scene by its points, without training it or writing files.
+
+    Returns the content of partition.json, with the estimated time of each block as `seconds`.
     """
     from clsplat.workflows.blocks import plan_blocks
 
@@ -297,11 +298,11 @@ def train_in_blocks(
     on: PathLike | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Train a scene in blocks: cut a coarse model, train each block with the views that see it, and merge them.
+    """Train a scene in blocks: partition a coarse model, train each block with the views that see it, and merge them.
 
     out: a folder; an interrupted call continues there; coarse: a pipeline that trains the coarse model, or a model file
     or run; min_coverage: a view trains a block that covers more than this fraction of its pixels; steps: "each": all
-    steps of the pipeline for each block, "shared": a share of them by its number of views; overrides:
+    steps of the pipeline for each block, "shared": a fraction in proportion to its number of views; overrides:
     'stage.key=value'; only_plan: stop after the partition; on: a file that says where to train the blocks.
     Returns the content of partition.json, `run`, the folder of the merged model, and `metrics`.
     """
@@ -310,7 +311,7 @@ def train_in_blocks(
 
     load_plugins()
     plan = BlocksPlan(pipeline, str(coarse), blocks, min_coverage, steps, list(overrides), list(coarse_overrides))
-    values = read_execution(path_of(on))
+    values = read_execution(to_path(on))
     execution = None if values is None else Execution.model_validate(values)
     return train_in_blocks(Path(scene), Path(out), plan, device, only_plan=only_plan, execution=execution)
 
@@ -327,7 +328,7 @@ def run_cell(
     set: Overrides = (),
     device: str | None = None,
 ) -> Path:
-    """Run one cell of a matrix, or a pipeline as a cell, and store it; return the folder of its result.
+    """Run a cell of a matrix, or a pipeline as a cell, and store its result; return the folder of the result.
 
     index: of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
     """
@@ -335,7 +336,7 @@ def run_cell(
     from clsplat.sweeps.batch import run_one
 
     load_plugins()
-    return run_one(str(pipeline), Path(store), with_scene_path(overrides(set), path_of(scene)), index, device)
+    return run_one(str(pipeline), Path(store), with_scene_path(overrides(set), to_path(scene)), index, device)
 
 
 def cancel(store: PathLike, cell: str | None = None) -> str:
@@ -383,12 +384,12 @@ def convert(
     frames: int | None = None,
     world: bool = False,
 ) -> dict[str, Any]:
-    """Merge models and write them as one file, in the format of its name; return `format`, `gaussians`, `bytes`.
+    """Merge models into one file, in the format of its extension; return `format`, `gaussians`, and `bytes`.
 
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
     drop_below: an opacity.  Gaussians that are not finite are dropped.
     time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
-    timestamp: `out` is a folder, for PLY, or a file name to which the numbers are added; world: write world coordinates
+    timestamp, to the folder `out` as PLY, or to files named `out` with a number added; world: write world coordinates
     instead of an origin.
     """
     from clsplat.gaussians import conversion
@@ -416,7 +417,7 @@ def convert(
 
 
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", published: PathLike | None = None) -> int:
-    """Write a page that compares runs; return their number.  The folder of a matrix means all its runs.
+    """Write a page that compares runs; return their number.  A matrix folder is replaced by its finished runs.
 
     published: a YAML file with published metrics, which are shown in a separate table.
     """
@@ -437,9 +438,9 @@ def view(
     photograph_budget: float = 4.0,
     splats: int | None = None,
 ) -> Path:
-    """Write a page that shows one model, or two side by side, in any browser, offline; return the page.
+    """Write a page that shows one model, or two side by side, offline in any browser; return its path.
 
-    models: files or run folders; scene: its views and photos are in the page, by default that of a run folder;
+    models: files or run folders; scene: the page includes its views and photos; default: that of a run folder;
     photographs: which photos to include, up to `photograph_budget` MB; splats: include only this number of Gaussians,
     the most important ones.
     """
@@ -448,7 +449,7 @@ def view(
     load_plugins()
     return videos.view(
         [Path(model) for model in models],
-        path_of(scene),
+        to_path(scene),
         Path(out),
         photographs=photographs,
         photograph_budget=photograph_budget,

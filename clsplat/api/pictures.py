@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from clsplat.api.arguments import PathLike, layer_names, load_plugins, path_of
+from clsplat.api.arguments import PathLike, layer_names, load_plugins, to_path
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     import numpy as np
@@ -34,7 +34,7 @@ def render_views(
 
     model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the image size, by
     default that of the run, or 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth, alpha:
-    also write NAME_depth and NAME_alpha, as arrays [height, width] in scene units and in [0, 1]; time: of a moving
+    also write NAME_depth and NAME_alpha, as arrays [height, width] in scene units and in [0, 1]; time: for a moving
     model, in [0, 1], instead of the times of the views.
     """
     from clsplat.runs import model_file
@@ -42,7 +42,7 @@ def render_views(
     load_plugins()
     return model_file.render(
         Path(model),
-        path_of(scene),
+        to_path(scene),
         Path(out),
         split=split,
         downscale=downscale,
@@ -77,28 +77,28 @@ def render_path(
     `took`, s.
 
     model, scene: a file and its scene, or a run folder
-    video: a file that ends in .webm, or .mp4 with the extra `video`; None: images of this `kind` in the folder `out`
+    video: a .webm file, or a .mp4 file with the extra `video`; None: images of this `kind` in the folder `out`
     path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME of a view, or a camera_path.json file
     frames: default 120; fps: default 30; size: even numbers; default: the image size divided by `downscale`
-    times: of a moving model, one time in [0, 1], or those of the first and last frame, such as (0, 1) or "0..1";
+    times: for a moving model, one time in [0, 1], or those of the first and last frame, such as (0, 1) or "0..1";
         default: the whole range, or the times of the views
-    side: shown on the right: "photograph", that of the nearest camera, or another model
-    depth, alpha: write videos of these too
+    side: what to show on the right: "photograph", the photo with the nearest camera, or another model
+    depth, alpha: also write videos of these layers
 
-    Raises ConfigError for values out of range, without a scene that the path needs, and if other files would be
-    replaced; DataError for unreadable files, and if the path is impossible with the cameras; NumericError for
-    images that are not finite; OutputError if files cannot be written; and errors of the device.
+    Raises ConfigError for values out of range, a missing scene, and files that must not be replaced; DataError for
+    unreadable files, and if the path is impossible with the cameras; NumericError for images that are not finite;
+    OutputError if files cannot be written; and errors of the device.
     """
     from clsplat.runs import video as videos
     from clsplat.viewer.video.plan import VideoRequest
 
     load_plugins()
-    request, place = (
+    request, target = (
         VideoRequest.parse(str(path), frames, fps, size, times),
-        videos.VideoTarget(path_of(video), Path(out), kind),
+        videos.VideoTarget(to_path(video), Path(out), kind),
     )
     extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, alpha))
-    return videos.make_video(Path(model), path_of(scene), place, request, extras, downscale=downscale, device=device)
+    return videos.make_video(Path(model), to_path(scene), target, request, extras, downscale=downscale, device=device)
 
 
 def camera_path(

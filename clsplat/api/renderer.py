@@ -28,26 +28,26 @@ from clsplat.scene.view import View, color_of
 Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
-_OPENING = threading.Lock()
-GEOMETRY = 6  # of the pixel sums: the ones of the geometry, not of the color (cl_kernels/splat.h)
+_OPEN_LOCK = threading.Lock()
+GEOMETRY = 6  # number of pixel sums for the geometry; the others are for the color (cl_kernels/splat.h)
 
 
 def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
-    """Return an open device, a device by name, or `default_device`, after a check against the reference.
+    """Open a device by name, or the default device, and check it against the reference; return it.
 
-    The check runs once per device, as for a run.  Raises DeviceError if it computes wrongly.
+    The check runs once per device, as for a run.  Raises DeviceError if the device computes wrongly.
     """
     return open_verified(default_device(schedule) if device is None else device, schedule, sort)
 
 
 def default_device(schedule: Schedule = "auto") -> Device:
-    """Return the device that is used by default, which is opened on first use."""
-    with _OPENING:  # so that all threads get the same one
-        return _opened(schedule)
+    """Return the default device, which is opened on first use."""
+    with _OPEN_LOCK:  # so that all threads get the same device
+        return _open_default(schedule)
 
 
 @cache
-def _opened(schedule: Schedule) -> Device:
+def _open_default(schedule: Schedule) -> Device:
     return Device(schedule=schedule)
 
 
@@ -74,18 +74,17 @@ class RenderResult:
 
     image: Floats  # [height, width, 3], with the background
     alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
-    depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where nothing is
+    depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 for empty pixels
     view: View
     background: Floats  # [3]
-    model: DeviceModel  # as it was rendered; this keeps it on the device
+    model: DeviceModel  # the rendered version, which this reference keeps on the device
     renderer: "Renderer"
 
     def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
         """Return the gradients of a loss with respect to all parameters.
 
         image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  May be called repeatedly, also after
-        the renderer got another model: the gradients are those of the model that was rendered.
-        Raises ValueError for other shapes.
+        an update of the renderer: the gradients are those of the rendered model.  Raises ValueError for other shapes.
         """
         return self.renderer.backward(self, image, alpha)
 
@@ -103,7 +102,7 @@ class RenderResult:
 
 
 def serialized(method: Method) -> Method:
-    """Decorate a method so that only one thread at a time runs the decorated methods of an object with a `_lock`."""
+    """Decorate methods so that one thread at a time runs any of them; the object must have a `_lock`."""
 
     @wraps(method)
     def locked(self: Any, *arguments: Any, **options: Any) -> Any:
@@ -114,7 +113,7 @@ def serialized(method: Method) -> Method:
 
 
 class Renderer:
-    """A model on a device.
+    """Renders a model on a device.
 
     Threads may share a renderer; it renders one image at a time.  Several renderers can share a device.
     """
@@ -136,10 +135,10 @@ class Renderer:
 
     @serialized
     def render(self, view: View, background: Color | None = None, depth: bool = False) -> RenderResult:
-        """Render a view; a moving model at the time of the view.
+        """Render a view, with a moving model at the time of the view.
 
         background: a color in [0, 1], one number or three; default: the model's sky or color, or else black; depth:
-        whether to compute it, which takes another pass.  Raises ValueError for an invalid camera or background, and
+        whether to compute the depth, in another pass.  Raises ValueError for an invalid camera or background, and
         NumericError if a value of the result is not finite.
         """
         view.camera.check()
@@ -159,11 +158,11 @@ class Renderer:
         sums = np.zeros((0, 0), np.float32)
         if alpha is not None:  # alpha is the second channel of a render of (depth, 1, 0) on black
             planes = np.zeros((*size, 3), np.float32)
-            planes[:, :, 1] = _checked("alpha", alpha, size)
+            planes[:, :, 1] = _check_shape("alpha", alpha, size)
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
             sums = self._pixel_sums(model, frame, planes).get()[:GEOMETRY]
         frame = self._forward(model, camera, result.background)
-        planes = np.zeros((*size, 3), np.float32) if image is None else _checked("image", image, (*size, 3))
+        planes = np.zeros((*size, 3), np.float32) if image is None else _check_shape("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)
         if alpha is not None:
             both = pixel_sums.get()
@@ -191,10 +190,10 @@ class Renderer:
         return np.ascontiguousarray(color_of(background), np.float32)
 
 
-def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
+def _check_shape(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
     array = np.asarray(derivative, np.float32)
     if array.shape != shape:
-        raise ValueError(f"gradient of {name}: expected shape {shape}, as the render has, got {array.shape}")
+        raise ValueError(f"gradient of {name}: expected the shape of the render, {shape}, got {array.shape}")
     return array
 
 
@@ -202,7 +201,7 @@ def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 class FieldRenderer:
-    """A field on a device.  Threads may share it; it renders one image at a time."""
+    """Renders a field on a device.  Threads may share it; it renders one image at a time."""
 
     def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
         """Copy a field to a device, given by name or open; default: `default_device()`.

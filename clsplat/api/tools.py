@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from clsplat.api.arguments import PathLike, load_plugins, path_of
+from clsplat.api.arguments import PathLike, load_plugins, to_path
 from clsplat.opencl.runtimes import no_device_advice as no_device_advice
 from clsplat.opencl.runtimes import no_device_error as no_device_error
 
@@ -18,9 +18,9 @@ ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the OpenCL devices: name, limits in bytes and items, and `fault`, why it does not work, or None.
+    """Return the OpenCL devices: name, limits in bytes and items, and `fault`, the reason if it does not work, or None.
 
-    Each device is tested once, in its own process.
+    Each device is tested once, in a separate process.
     """
     from dataclasses import asdict
 
@@ -32,9 +32,9 @@ def devices() -> list[dict[str, Any]]:
 
 
 def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "DeviceReport":
-    """Compare all kernels with the reference on a device; return `verdict`, `usable` and `data()`.
+    """Compare all kernels with the reference on a device; return a report with `verdict`, `usable`, and `data()`.
 
-    This takes a minute or two on a CPU.  page: an HTML report to write, to attach to an issue.
+    This takes a minute or two on a CPU.  page: an HTML report to write, for attaching to an issue.
     """
     from clsplat.conformance.doctor import check_html_path, examine, write_page
 
@@ -48,7 +48,7 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
 
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
-    """Inspect a dataset; return `verdict`, `findings`, `trainable` and `data()`.
+    """Inspect a dataset; return an inspection with `verdict`, `findings`, `trainable`, and `data()`.
 
     scene: a dataset folder, or a run folder, for the scene it was trained on; page: an HTML page to write, with the
     cameras and points in 3D.  Raises DataError only if the folder does not exist.
@@ -77,18 +77,18 @@ def measure_speed(
     schedule: ScheduleName = "auto",
     device: "str | Device | None" = None,
 ) -> "Measurement":
-    """Time the stages of a training step, as `clsplat bench` does; return times in ms, as `data()` and `text()`.
+    """Time the stages of a training step, as `clsplat bench` does; return times in ms, with `data()` and `text()`.
 
-    scenes: some of the fixed scenes A, B and C; model, scene: a splat or point cloud and its scene, to time as well;
-    pipeline: its losses, statistics and filters are used; repeats: steps per scene.
+    scenes: any of the fixed scenes A, B, and C; model, scene: a splat or point cloud and its scene, to time as well;
+    pipeline: the source of losses, statistics, and filters; repeats: steps per scene.
     """
     from clsplat.conformance.bench.measurement import measure
 
     load_plugins()
     return measure(
         scenes,
-        model=path_of(model),
-        scene=path_of(scene),
+        model=to_path(model),
+        scene=to_path(scene),
         pipeline=str(pipeline),
         repeats=repeats,
         schedule=schedule,

@@ -43,11 +43,11 @@ from clsplat.training.status import StatusFile
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """One training step."""
+    """The result of a training step."""
 
     step: int  # global, from 1
     gaussians: int
-    view: ViewLosses  # of this step, ViewGradients unless it was skipped; valid until the next
+    view: ViewLosses  # of this step, ViewGradients unless it was skipped; valid until the next step
 
     @property
     def loss(self) -> float:
@@ -61,9 +61,9 @@ class Report:
 class Trainer:
     """Trains a scene with a pipeline; a trainer and `clsplat run` give the same bits.
 
-    Stages before the training run at once, and those that edit the model after it run with its last step.  Other
-    stages, such as `evaluate` and `export`, do not run: use the methods `evaluate` and `model`.  On Ctrl-C a step
-    finishes, and training can continue.  Threads may share a trainer, one at a time.
+    Stages before the training run in the constructor, and those that edit the model after it run with its last step.
+    Other stages, such as `evaluate` and `export`, do not run; use the methods `evaluate` and `model`.  On Ctrl-C a step
+    finishes, and training can continue.  Threads may share a trainer; calls run one at a time.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Trainer:
     ) -> None:
         """Prepare training.
 
-        scene: a folder, or the result of `read_scene`, whose split is kept
+        scene: a folder, or a scene of `read_scene`, with its split
         pipeline: a file, or the name of a shipped one
         set: settings by key, such as {"optimize.steps": 3000}
         device: part of its name, or an open device with the schedule of the pipeline
@@ -86,40 +86,42 @@ class Trainer:
         start: as for `clsplat.run`
 
         A trainer locks its folder until its training ends, or until `close()`, or until it is deleted.
-        Raises ConfigError, DataError and DeviceError.
+        Raises ConfigError, DataError, and DeviceError.
         """
         self._lock = threading.RLock()
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
-        place = [f"scene.path={path_setting(folder)}"] if folder.is_dir() else []
-        self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
-        _check(self.pipeline)
+        scene_path = [f"scene.path={path_setting(folder)}"] if folder.is_dir() else []
+        self.pipeline = load(str(pipeline), [*scene_path, *overrides(set or {})])
+        _check_pipeline(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
-        if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
-            raise DataError(f"{self.scene.path}: the view '{without[0]}' has no image, which training needs")
+        if missing := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
+            raise DataError(f"{self.scene.path}: the view '{missing[0]}' has no image, which training needs")
         if start != "new" and out is None:
             raise ConfigError(f"start='{start}': expected a run folder as `out`")
         if out is None:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        before = RunState.read(self.out)
-        outputs.check_output_paths(self.pipeline, before)
+        state = RunState.read(self.out)
+        outputs.check_output_paths(self.pipeline, state)
         rasterizer = self.pipeline.settings.rasterizer
         opened = open_checked(device, rasterizer.schedule, rasterizer.sort)
-        with ExitStack() as holding:
-            status = holding.enter_context(run_folder.open_run_folder(before, start, step=0))
+        with ExitStack() as stack:
+            status = stack.enter_context(run_folder.open_run_folder(state, start, step=0))
             with recording_failures(status, as_raised=True):
-                scene_of_run = RunScene.from_scene(self.pipeline.settings.scene, self.scene)
-                self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
+                run_scene = RunScene.from_scene(self.pipeline.settings.scene, self.scene)
+                self._run = opening.make_run(self.pipeline, run_scene, opened, self.out, status)
                 self.pipeline = resolve_choices(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
-                (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists files of stages that a trainer does not run
+                (self.out / CHECKSUMS).unlink(
+                    missing_ok=True
+                )  # the list includes files of stages that a trainer does not run
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
-            holding.callback(_left, status)
-            self._holding = holding.pop_all()
-        weakref.finalize(self, self._holding.close)
+            stack.callback(_record_closed, status)
+            self._resources = stack.pop_all()
+        weakref.finalize(self, self._resources.close)
         self._steps = train(self.pipeline, self._run)
         self._state: Literal["open", "done", "failed", "closed"] = "open"
         self._record_end()
@@ -128,20 +130,20 @@ class Trainer:
     def close(self) -> None:
         """Unlock the run folder and end the training, which can be resumed from `out`.
 
-        Before its last step status.json says `interrupted` then.  After it, and after an error, a trainer is closed by
-        itself.
+        If it is called before the last step, the state in status.json is "interrupted".  After the last step, and after
+        an error, a trainer closes automatically.
         """
         if self._state == "open":
             self._state = "closed"
         self._steps = iter(())
-        self._holding.close()
+        self._resources.close()
 
     @serialized
     def step(self) -> Report:
         """Train one step.  Raises StopIteration when the training is finished.
 
-        After an error in a step, the trainer cannot continue.  status.json in `out` has the
-        error, or `done` after the last step.
+        After an error in a step, the trainer cannot continue.  The state in status.json is "failed" after an error, and
+        "done" after the last step.
         """
         interrupts: list[bool] = []
 
@@ -153,8 +155,8 @@ class Trainer:
         if self._state == "done":
             raise StopIteration
         if self._state != "open":
-            why = "ended with an error" if self._state == "failed" else "is closed"
-            raise ClsplatError(f"{self!r} {why}; create another, with start='resume' if `out` has a checkpoint")
+            reason = "ended with an error" if self._state == "failed" else "is closed"
+            raise ClsplatError(f"{self!r} {reason}; create another, with start='resume' if `out` has a checkpoint")
         try:
             with (
                 recording_failures(self._run.status, as_raised=True),
@@ -193,7 +195,7 @@ class Trainer:
     @property
     @serialized
     def model(self) -> Model:
-        """A copy of the current model; `model.baked()` makes a world filter part of its scales, as a run does."""
+        """A copy of the current model; `model.baked()` bakes a world filter into its scales, as a run does."""
         return host_model(self._run)
 
     @serialized
@@ -201,7 +203,7 @@ class Trainer:
         """Add a loss in NumPy: `function(image, photograph) -> (value, gradient with respect to the image)`.
 
         Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
-        host and the gradient back, which a plug-in with a kernel avoids.
+        host and the gradient back; a plug-in with a kernel avoids these copies.
         Raises ConfigError for a negative weight.  A step raises ValueError if the function returns anything else, and
         NumericError for values that are not finite.
         """
@@ -229,7 +231,7 @@ class Trainer:
             return checkpoint.save(self._run, keep=2)
 
     def _record_end(self) -> None:
-        """Write `done` to status.json if no steps are left."""
+        """Set the state in status.json to "done" if no steps are left."""
         if is_trained(self.pipeline, self._run):
             self._run.status.end("done", exit_code=0)
             self._state = "done"
@@ -239,17 +241,17 @@ class Trainer:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
 
 
-def _left(status: StatusFile) -> None:
-    """Record that a trainer was closed or deleted before its end, unless its folder is gone."""
+def _record_closed(status: StatusFile) -> None:
+    """Record that a trainer was closed or deleted before its end, unless its folder was removed."""
     if status.now.state not in END_STATES and status.out.is_dir():
         with suppress(OutputError):
             status.end("interrupted", Interrupted.exit_code, "the trainer was closed before its last step")
 
 
-def _check(pipeline: Pipeline) -> None:
-    """Raise ConfigError if a pipeline has no training, or prepares its scene."""
+def _check_pipeline(pipeline: Pipeline) -> None:
+    """Raise ConfigError if a pipeline has no training, or has `prepare` steps."""
     if pipeline.settings.prepare:
-        raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train on the result")
+        raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train with the result")
     if not any(isinstance(stage, Optimize) for stage in pipeline.stages):
         raise ConfigError(f"{pipeline.path}: expected a stage 'optimize'")
     for stage in pipeline.stages:

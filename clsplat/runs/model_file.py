@@ -407,9 +407,9 @@ def render(
     device: str | Device | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
-    for option, value, choices in (("split", split, SPLITS), ("format", kind, KINDS)):
+    for option, value, choices in (("split", split, SPLITS), ("kind", kind, KINDS)):
         if value not in choices:
-            raise ConfigError(f"--{option}: expected {' or '.join(choices)}, got '{value}'")
+            raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
     return ModelFile(model, scene, device, downscale).render(split, out, kind, layers, time)
 
 

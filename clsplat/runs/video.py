@@ -41,7 +41,7 @@ from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
+from clsplat.viewer.page import BUDGET, Page, Which, is_viewer, view_entries
 from clsplat.viewer.video.frames import Canvas, Image, letterbox
 from clsplat.viewer.video.paths import Floats, nearest_view
 from clsplat.viewer.video.plan import Side, VideoPlan, VideoRequest, layer_files, plan_video, render_video
@@ -209,7 +209,7 @@ def view(
     def read_photo(view: View) -> NDArray[np.uint8]:
         return load_photograph(view, BACKGROUNDS[background])[:, :, :3]
 
-    views = described(used_scene, read_photo, photographs, photograph_budget) if used_scene else []
+    views = view_entries(used_scene, read_photo, photographs, photograph_budget) if used_scene else []
     start = (used_scene.split("test") or used_scene.views)[0] if used_scene else None
     viewpoint = Viewpoint.from_points(next(iter(loaded.values())).means, used_scene.views if used_scene else (), start)
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")

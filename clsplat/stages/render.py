@@ -20,7 +20,7 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import BUDGET, MAX_SIZE, Page, Which, described
+from clsplat.viewer.page import BUDGET, MAX_SIZE, Page, Which, view_entries
 
 LOG = logging.getLogger("clsplat")
 
@@ -91,7 +91,7 @@ class Viewer(Stage):
         def through(views: Iterable[View]) -> Iterable[View]:
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))
 
-        views = described(scene, read, self.photographs, self.photograph_budget, through)
+        views = view_entries(scene, read, self.photographs, self.photograph_budget, through)
         viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
         packed = pack(model)
         page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views, scene.origin)

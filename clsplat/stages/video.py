@@ -19,7 +19,7 @@ from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 from clsplat.viewer.video import encoding
 from clsplat.viewer.video.frames import Canvas, letterbox
-from clsplat.viewer.video.paths import MAX_FRAMES, RATES, check_size, size_of
+from clsplat.viewer.video.paths import MAX_FRAMES, RATES, check_size, validate_size
 from clsplat.viewer.video.plan import FPS, FRAMES, VideoPlan, VideoRequest, plan_video, render_video, resize_view
 
 LOG = logging.getLogger("clsplat")
@@ -48,7 +48,7 @@ class Snapshot(Scheduled):
     @field_validator("size")
     @classmethod
     def _even(cls, size: str | None) -> str | None:
-        return None if size is None else size_of(size)
+        return None if size is None else validate_size(size)
 
     def check_run(self, run: Run) -> None:
         self._view(run)
@@ -132,7 +132,7 @@ class Video(Stage):
     @field_validator("size")
     @classmethod
     def _even(cls, size: str | None) -> str | None:
-        return None if size is None else size_of(size)
+        return None if size is None else validate_size(size)
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
         return None if key == "path" and not self._request().is_file else super().input_path(key, scene)

@@ -1,4 +1,4 @@
-"""Draw small charts as inline SVG: lines, histograms, plans of cameras."""
+"""Draw small charts as inline SVG: lines, histograms, and camera plans."""
 
 import html
 import math
@@ -16,27 +16,27 @@ LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
 COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
 DASHES = (("", ""), ("7 4", "dashed"), ("2 3", "dotted"), ("9 3 2 3", "dash-dotted"))  # stroke-dasharray, in words
 MAX_MARKED_POINTS = 12  # lines with more points have no circles
-LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px of a row; approximate number of letters in one
+LEGEND_ROW, LEGEND_LETTERS = 14, 66  # height of a row, px; approximate number of characters per row
 
 
 @dataclass(frozen=True)
 class Line:
-    """Points (x, y) in the order in which they are connected."""
+    """A line of a chart: points (x, y), in order, and its name and style."""
 
     points: Sequence[tuple[float, float]]
     name: str = ""  # in the legend
-    color: str = ""  # default: the next one
+    color: str = ""  # default: the next of COLORS
     dash: int = 0  # index into DASHES, for lines of the same color
 
 
 def curve(
     title: str, lines: Sequence[Line], logarithmic: bool = False, ticks: Mapping[float, str] | None = None
 ) -> str:
-    """Draw lines over common axes; return "" if all points have the same x or the same y, which show nothing.
+    """Draw lines over common axes; return "" if all points have the same x or the same y.
 
     logarithmic: the y axis, which drops values that are not positive.  ticks: labels on the x axis; default: numbers.
     """
-    drawn = [_in_axes(line, logarithmic) for line in lines]
+    drawn = [_to_axes(line, logarithmic) for line in lines]
     drawn = [line for line in drawn if line.points]
     xs = [x for line in drawn for x, _ in line.points]
     ys = [y for line in drawn for _, y in line.points]
@@ -55,12 +55,12 @@ def curve(
     parts = _start(title)
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    counts = not logarithmic and _are_whole(ys)
+    counts = not logarithmic and _are_integers(ys)
     rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, counts)
     for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows], counts), strict=True):
         _, y = pixel(x_low, tick)
         parts += _row(y, label)
-    steps = _are_whole(xs)
+    steps = _are_integers(xs)
     columns = _ticks(x_low, x_high, steps)
     for tick, label in (ticks or dict(zip(columns, _numbers(columns, steps), strict=True))).items():
         x, _ = pixel(tick, y_low)
@@ -77,7 +77,7 @@ def curve(
 
 
 def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
-    """Draw the number of values in each of `bins` equal intervals from zero; return "" if all values are equal."""
+    """Draw a histogram with `bins` equal intervals from zero; return "" if all values are equal."""
     if len(set(values)) < 2:
         return ""
     high = max(values)
@@ -86,8 +86,8 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
         counts[min(bins - 1, int(bins * value / high))] += 1
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     parts = _start(title)
-    rows = _ticks(0, max(counts), whole=True)
-    for tick, label in zip(rows, _numbers(rows, whole=True), strict=True):
+    rows = _ticks(0, max(counts), integers=True)
+    for tick, label in zip(rows, _numbers(rows, integers=True), strict=True):
         parts += _row(HEIGHT - BOTTOM - tick / max(counts) * height, label)
     for i, count in enumerate(counts):
         if count:
@@ -113,7 +113,7 @@ def _row(y: float, label: str) -> list[str]:
     return [line, f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>']
 
 
-def _in_axes(line: Line, logarithmic: bool) -> Line:
+def _to_axes(line: Line, logarithmic: bool) -> Line:
     """Return the finite points of a line, in the coordinates of the axes."""
     points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y)]
     return replace(line, points=[(x, math.log10(y)) for x, y in points if y > 0] if logarithmic else points)
@@ -128,7 +128,7 @@ def _dash(line: Line) -> tuple[str, str]:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Return rows of names in the colors of their lines; no row for a single line."""
+    """Return the rows of the legend, with names in the colors of their lines; none for a single line."""
     rows: list[str] = []
     room = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):
@@ -144,13 +144,13 @@ def _legend(lines: Sequence[Line]) -> list[str]:
     return rows
 
 
-def _are_whole(values: Sequence[float]) -> bool:
+def _are_integers(values: Sequence[float]) -> bool:
     return all(float(value).is_integer() for value in values)
 
 
-def _ticks(low: float, high: float, whole: bool = False) -> list[float]:
-    """Return three to six round numbers between low and high, or fewer if `whole` leaves fewer."""
-    rough = max((high - low) / 4, 1.0 if whole else 0.0)
+def _ticks(low: float, high: float, integers: bool = False) -> list[float]:
+    """Return three to six round numbers between low and high, or fewer if only integers are allowed."""
+    rough = max((high - low) / 4, 1.0 if integers else 0.0)
     power = 10 ** math.floor(math.log10(rough))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
     first = math.ceil(low / step - 1e-9)
@@ -158,15 +158,15 @@ def _ticks(low: float, high: float, whole: bool = False) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Return logarithms of 1, 2 and 5 times powers of ten, or of round numbers if fewer than two of them fit."""
+    """Return logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two of them fit."""
     powers = range(math.floor(low), math.ceil(high) + 1)
     ticks = [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
-def _numbers(values: Sequence[float], whole: bool = False) -> list[str]:
-    """Return labels of ticks with as many digits as distinguish them: 100k, 100.2k; whole: 8,040, not 8.04k."""
-    if whole and any(value % 100 for value in values):
+def _numbers(values: Sequence[float], integers: bool = False) -> list[str]:
+    """Return tick labels with enough digits to tell them apart: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
+    if integers and any(value % 100 for value in values):
         return [f"{value:,.0f}" for value in values]
     candidates = [[_number(value, digits) for value in values] for digits in range(3, 10)]
     return next((labels for labels in candidates if len(set(labels)) == len(set(values))), candidates[-1])
@@ -182,26 +182,26 @@ def _number(value: float, digits: int) -> str:
 # Cameras and points on a plane.
 
 PLAN_WIDTH, PLAN_HEIGHT, MARGIN, TITLE = 460, 340, 18, 26  # px
-LENGTH, SPREAD = 11.0, 0.45  # of a camera's triangle, px; half of its width by its length
+LENGTH, SPREAD = 11.0, 0.45  # length of a camera's triangle, px; half of its width relative to its length
 MAX_PLAN_POINTS = 1500
-MAX_POINT_DISTANCE = 3.0  # of drawn points from the center of the cameras, in radii of the cameras
+MAX_POINT_DISTANCE = 3.0  # of points from the center of the cameras, relative to the cameras' radius
 
 
 def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floating]) -> list[str]:
     """Draw cameras, and points [N, 3] around them, from above and from the side.
 
-    views: the views of each group, by the name in the legend.  Each camera shows its name on hover.
+    views: the views of each group, by its name in the legend.  Each camera shows its name on hover.
     """
-    views = {name: of_kind for name, of_kind in views.items() if of_kind}
-    everything = [view for of_kind in views.values() for view in of_kind]
-    if len(everything) < 2:
+    views = {name: group for name, group in views.items() if group}
+    all_views = [view for group in views.values() for view in group]
+    if len(all_views) < 2:
         return []
-    up = up_direction(everything)
+    up = up_direction(all_views)
     right = perpendicular(up)
-    centers = np.stack([view.position for view in everything])
+    centers = np.stack([view.position for view in all_views])
     reach = MAX_POINT_DISTANCE * float(np.abs(centers - centers.mean(axis=0)).max())
-    some = points[:: max(1, len(points) // MAX_PLAN_POINTS)].astype(np.float64)
-    near = some[(np.abs(some - centers.mean(axis=0)) < max(reach, 1e-9)).all(axis=1)]
+    sample = points[:: max(1, len(points) // MAX_PLAN_POINTS)].astype(np.float64)
+    near = sample[(np.abs(sample - centers.mean(axis=0)) < max(reach, 1e-9)).all(axis=1)]
     planes = {"cameras from above": np.cross(right, up), "cameras from the side": -up}
     return [_plan(title, views, near, np.stack([right, down])) for title, down in planes.items()]
 
@@ -209,10 +209,10 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
 def _plan(
     title: str, views: Mapping[str, Sequence[View]], points: NDArray[np.float64], axes: NDArray[np.float64]
 ) -> str:
-    """Draw points, and each camera as a triangle that opens where it looks.  axes: right and down, [2, 3]."""
-    centers = {name: np.stack([view.position for view in of_kind]) @ axes.T for name, of_kind in views.items()}
-    everything = np.concatenate([points @ axes.T, *centers.values()])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    """Draw points, and each camera as a triangle that opens in its view direction.  axes: right and down, [2, 3]."""
+    centers = {name: np.stack([view.position for view in group]) @ axes.T for name, group in views.items()}
+    positions = np.concatenate([points @ axes.T, *centers.values()])
+    low, high = positions.min(axis=0), positions.max(axis=0)
     room = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
     scale = float((room / np.maximum(high - low, 1e-12)).min())
     corner = np.array([MARGIN, MARGIN + TITLE]) + (room - scale * (high - low)) / 2
@@ -224,19 +224,19 @@ def _plan(
     parts.append(f'<text x="{MARGIN}" y="18" class="title">{html.escape(title)}</text>')
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels(points @ axes.T))
     parts.append(f'<path d="{dots}" class="dots"/>')
-    for i, (name, of_kind) in enumerate(views.items()):
+    for i, (name, group) in enumerate(views.items()):
         color = COLORS[i % len(COLORS)]
         parts.append(f'<g fill="{color}" fill-opacity=".75" stroke="{color}">')
-        for view, center in zip(of_kind, pixels(centers[name]), strict=True):
+        for view, center in zip(group, pixels(centers[name]), strict=True):
             shape = _triangle(center, axes @ view.world_to_camera[2, :3])
             parts.append(f'<path d="{shape}"><title>{html.escape(view.name)}</title></path>')
         legend = f'x="{PLAN_WIDTH - MARGIN}" y="{18 + 14 * i}" text-anchor="end" style="fill:{color}"'
-        parts.append(f"</g><text {legend}>{len(of_kind)} {html.escape(name)}</text>")
+        parts.append(f"</g><text {legend}>{len(group)} {html.escape(name)}</text>")
     return "".join([*parts, "</svg>"])
 
 
 def _triangle(center: NDArray[np.float64], direction: NDArray[np.float64]) -> str:
-    """Return the path of a camera, shorter if it looks toward or away from the reader.  Both arguments: [2]."""
+    """Return the SVG path of a camera, foreshortened by its direction.  center, direction: [2]."""
     ahead = LENGTH * direction
     aside = SPREAD * LENGTH * np.array([-direction[1], direction[0]]) / (float(np.linalg.norm(direction)) or 1.0)
     (x, y), (a, b), (c, d) = center, center + ahead + aside, center + ahead - aside

@@ -1,4 +1,4 @@
-"""Pack a model into bytes that a page decodes: a header, and planes with one component of all splats each.
+"""Pack a model into bytes that a page decodes: a header, and planes that hold one component of all splats.
 
     tables    [4, 256] float32: scale, opacity, color of band 0, color of the other bands; bytes below are indices
     blocks    [B, 6] float32: smallest t of x, y, z, then step, of each BLOCK consecutive splats
@@ -32,9 +32,9 @@ MIN_OPACITY = 1 / 255  # fainter Gaussians are never drawn (ALPHA_MIN in cl_kern
 MIN_NORM2 = 1e-12  # shorter quaternions have no direction (QUAT_NORM2_MIN)
 MAX_LOG_RATIO = 9.0  # of scales: flatter Gaussians look the same under the screen filter
 STEPS = 2**14 - 1  # across a block
-RANK_WEIGHT = 0.25  # spacing of a table: part by rank, the rest by value
+RANK_WEIGHT = 0.25  # weight of the rank in the spacing of a table; the rest is by value
 KNEE = 0.5  # of colors of bands above 0: the table is linear below, logarithmic above
-MIN_RANGE = 3.0  # of that table: steps finer than 0.01 cost bytes and are invisible
+MIN_RANGE = 3.0  # of that table, because steps finer than 0.01 cost bytes and are invisible
 BITS = 10  # per component of a quaternion
 MAX_HALF = 65504.0  # largest float16
 
@@ -44,19 +44,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Packed:
-    """A packed model."""
+    """A packed model: the header, and the compressed planes."""
 
     header: dict[str, Any]
     data: bytes  # gzip of the planes
 
     @property
     def count(self) -> int:
-        """Number of splats that some view shows."""
+        """The number of splats in the data."""
         return int(self.header["count"])
 
     @property
     def count_text(self) -> str:
-        """The number in words: "8,389 Gaussians and 10,000 of the sky"."""
+        """The number of splats as text: "8,389 Gaussians and 10,000 of the sky"."""
         faint, sky = self.header["faint"], self.header.get("sky", 0)
         text = f"{self.count - sky:,} Gaussians" + (f" and {sky:,} of the sky" if sky else "")
         return text + (f" + {faint:,} too faint to draw" if faint else "")
@@ -85,7 +85,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     planes += [_codes(table, column) for table, values in columns for column in values.T]
     header = {
         "count": count,
-        "faint": faint,  # Gaussians too faint to draw: without a limit, a valid model loses only these
+        "faint": faint,  # Gaussians too faint to draw; without a limit, a valid model loses only these
         **({"sky": sky} if sky else {}),
         "degree": model.sh_degree,
         "near": model.near,
@@ -104,14 +104,14 @@ def pack(model: Model, limit: int | None = None) -> Packed:
 
 
 def _visible(model: Model) -> NDArray[np.intp]:
-    """Return the indices of the Gaussians that views can show."""
-    finite = np.logical_and.reduce([np.isfinite(table).all(axis=1) for table in model.tables().values()])
-    direction = (model.quats.astype(np.float64) ** 2).sum(axis=1) >= MIN_NORM2
-    return np.flatnonzero(finite & direction & (model.opacities > MIN_OPACITY))
+    """Return the indices of the Gaussians that are finite and not too faint."""
+    is_finite = np.logical_and.reduce([np.isfinite(table).all(axis=1) for table in model.tables().values()])
+    has_direction = (model.quats.astype(np.float64) ** 2).sum(axis=1) >= MIN_NORM2
+    return np.flatnonzero(is_finite & has_direction & (model.opacities > MIN_OPACITY))
 
 
 def _order(model: Model, limit: int | None) -> NDArray[np.intp]:
-    """Return visible indices in LEVELS parts of decreasing importance, along a curve in each part."""
+    """Return visible indices in LEVELS parts of decreasing importance, in Morton order within each part."""
     visible = _visible(model)
     means = model.means[visible].astype(np.float64)
     areas = np.sort(model.log_scales[visible].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
@@ -161,7 +161,7 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
 
 
 def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
-    """Return the columns of the motion, [columns, N], with the rotation relative to the stored quaternion."""
+    """Return the columns of the motion, [columns, N], with rotations relative to the stored quaternions."""
     columns = motion.astype(np.float64)
     if (turn := motion_fields(motion.shape[1]).get("turn")) is not None:
         unit = np.roll(quats.astype(np.float64), -1, axis=1)
@@ -178,7 +178,7 @@ def _motion_header(columns: int) -> dict[str, int]:
 
 
 def _table(values: NDArray[np.floating]) -> Floats:
-    """Return 256 ascending values, denser where `values` are, with bounded gaps."""
+    """Return a table of 256 ascending values, denser where there are more `values`."""
     ordered = np.sort(np.asarray(values, np.float64), axis=None)
     if not len(ordered) or ordered[0] == ordered[-1]:
         return np.full(256, ordered[0] if len(ordered) else 0.0)
@@ -189,13 +189,13 @@ def _table(values: NDArray[np.floating]) -> Floats:
 
 
 def _even_table(largest: float) -> Floats:
-    """Return 256 values around and including 0: even steps up to KNEE, then growing steps up to `largest`."""
+    """Return a table of 256 values around 0: even steps up to KNEE, then growing steps up to `largest`."""
     values = KNEE * np.sinh(np.linspace(-1, 1, 255) * np.arcsinh(max(MIN_RANGE, largest) / KNEE))
     values[127] = 0.0
     return np.append(values, values[-1])
 
 
 def _codes(table: Floats, values: NDArray[np.floating]) -> Bytes:
-    """Return the indices of the nearest values of a table, with the shape of `values`."""
+    """Return the index of the nearest table value for each of the values, in their shape."""
     borders = (table[1:] + table[:-1]) / 2
     return np.searchsorted(borders, values).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Write the viewer page: one file that shows models, needs no network and opens from the disk."""
+"""Write the viewer page: a single file that shows models, opens from the disk, and needs no network."""
 
 import base64
 import re
@@ -21,10 +21,10 @@ from clsplat.viewer.packing import Packed
 
 
 def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
-    """Return the first viewpoint of a page, as main.js reads it."""
+    """Return the initial viewpoint of a page, as main.js reads it."""
     return {
-        "pivot": rounded(viewpoint.pivot),
-        "up": rounded(viewpoint.up),
+        "pivot": float32_digits(viewpoint.pivot),
+        "up": float32_digits(viewpoint.up),
         "radius": viewpoint.radius,
         "focal": viewpoint.focal,
         "start": camera_data(viewpoint.start),
@@ -36,11 +36,11 @@ def camera_data(view: View) -> dict[str, Any]:
     c = view.camera
     time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
-    return {"pose": rounded(view.world_to_camera.ravel()), "lens": lens, **time}
+    return {"pose": float32_digits(view.world_to_camera.ravel()), "lens": lens, **time}
 
 
-def rounded(values: NDArray[np.floating]) -> list[float]:
-    """Return numbers with the digits that float32 needs."""
+def float32_digits(values: NDArray[np.floating]) -> list[float]:
+    """Return numbers rounded to the digits that float32 needs."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
 
@@ -49,28 +49,26 @@ SCRIPTS = (
     *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
     *("panel", "settings", "time", "main"),
 )
-TIMESTAMPS = 31  # if the views of the page have a single one, or none
-MAX_SIZE = 200.0  # MB: browsers need several times as much memory
-MARGIN = 0.97  # of that size, since important splats may compress worse than the average
+TIMESTAMPS = 31  # number of times if the views of the page have fewer than two
+MAX_SIZE = 200.0  # MB; browsers need several times this in memory
+MARGIN = 0.97  # of that size, because important splats may compress worse than the average
 MARK = b'<canvas id="frustums"'  # in viewer.html.j2
 COLORS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
 class Page:
-    """The contents of a page: models by name, which share a camera, and the views of a scene."""
+    """The contents of a page: models by name, shown with one camera, and the views of a scene."""
 
     title: str
     models: Mapping[str, Packed]
     viewpoint: Viewpoint
     background: str = "black"
     views: Sequence[dict[str, Any]] = field(default_factory=list)
-    origin: NDArray[np.floating] = field(
-        default_factory=lambda: np.zeros(3)
-    )  # [3] world coordinates of the page's zero
+    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates
 
     def text(self) -> str:
-        """Return the page; the same models and views give the same bytes."""
+        """Return the HTML of the page; the same models and views give the same bytes."""
         names = [view["name"] for view in self.views]
         first = names.index(self.viewpoint.start.name) if self.viewpoint.start.name in names else -1
         info = {
@@ -80,7 +78,7 @@ class Page:
             "first": first,
             "background": COLORS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
-            **({"moments": self._timestamps} if self.moves else {}),
+            **({"moments": self._timestamps} if self.is_moving else {}),
         }
         return render(
             "viewer.html.j2",
@@ -94,25 +92,25 @@ class Page:
         )
 
     @property
-    def moves(self) -> bool:
-        """Whether a model moves."""
+    def is_moving(self) -> bool:
+        """Whether any model has motion."""
         return any("motion" in packed.header for packed in self.models.values())
 
     @property
     def _timestamps(self) -> list[float]:
-        """The timestamps of the views, in order."""
+        """The timestamps of the views, in order, or evenly spaced ones if there are fewer than two."""
         times = np.unique([view["time"] for view in self.views if "time" in view])
         return [float(time) for time in (times if len(times) > 1 else np.linspace(0, 1, TIMESTAMPS))]
 
     @property
     def size(self) -> float:
-        """Approximate size of the page, MB."""
+        """The approximate size of the page, MB."""
         photographs = sum(len(view["thumbnail"]) + len(view["photograph"] or "") for view in self.views)
         return (photographs + sum(len(packed.data) * 4 / 3 for packed in self.models.values())) / 1e6 + 0.1
 
     @property
     def max_splats(self) -> int:
-        """Largest number of splats per model with which the page stays below MAX_SIZE."""
+        """The largest number of splats per model for a page below MAX_SIZE."""
         splats = sum(len(packed.data) * 4 / 3e6 for packed in self.models.values())
         room = max(0.0, MAX_SIZE - (self.size - splats))
         low, high = 0, max(packed.count for packed in self.models.values())
@@ -129,18 +127,18 @@ class Page:
             splats = f"only the {number:,} most important splats (--splats {number}), or " if number else ""
             raise OutputError(
                 f"{path}: the page would have {self.size:.0f} MB, and browsers open at most {MAX_SIZE:.0f} MB; show "
-                f"{splats}fewer photographs (--photographs, --photograph-budget)"
+                f"{splats}fewer photos (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())
 
     def _facts(self) -> dict[str, str]:
         facts = {}
         for name, packed in self.models.items():
-            header, of = packed.header, f" of {name}" if len(self.models) > 1 else ""
-            facts[f"splats{of}"] = f"{packed.count_text}, SH degree {header['degree']}"
+            header, suffix = packed.header, f" of {name}" if len(self.models) > 1 else ""
+            facts[f"splats{suffix}"] = f"{packed.count_text}, SH degree {header['degree']}"
             blur = f"{header['variance']:g} px²{', normalized' if header['compensate'] else ''}"
-            facts[f"screen filter{of}"] = f"pixel box, drawn here as a blur of {blur}" if "box" in header else blur
-            facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
+            facts[f"screen filter{suffix}"] = f"pixel box, drawn here as a blur of {blur}" if "box" in header else blur
+            facts[f"size{suffix}"] = f"{len(packed.data) / 1e6:.2f} MB"
         facts |= {"views": f"{len(self.views):,}"} if self.views else {}
         return facts | ({"origin": position_text(self.origin)} if self.origin.any() else {})
 
@@ -152,11 +150,11 @@ def is_viewer(path: Path) -> bool:
 
 def script() -> str:
     """Return the scripts of the page as one function."""
-    return joined(SCRIPTS)
+    return join_scripts(SCRIPTS)
 
 
-def joined(names: Sequence[str], others: Sequence[str] = ()) -> str:
-    """Join scripts of this folder, given by name, and the texts of others into one function."""
+def join_scripts(names: Sequence[str], others: Sequence[str] = ()) -> str:
+    """Join scripts of this folder, by name, and the texts of other scripts into one JavaScript function."""
     parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *others]
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
 
@@ -170,39 +168,39 @@ def style() -> str:
 
 Which = Literal["none", "test", "all"]  # views whose photos are in the page
 THUMBNAIL, LARGEST = 128, 1000  # px, the longer side
-BUDGET = 4.0  # MB of photographs
+BUDGET = 4.0  # MB of photos
 Image = NDArray[np.uint8]
 
 
-def described(
+def view_entries(
     scene: Scene,
     read: Callable[[View], Image],
     which: Which,
     budget: float = BUDGET,
-    through: Callable[[Iterable[View]], Iterable[View]] = lambda views: views,
+    progress: Callable[[Iterable[View]], Iterable[View]] = lambda views: views,
 ) -> list[dict[str, Any]]:
-    """Return every view of a scene as photographs.js reads it.
+    """Return the data of every view of a scene, as photographs.js reads it.
 
-    read: returns a photo, RGB at the camera's size.  budget: MB of photos; with more, only every second, third, …
-    stays.  through: wraps the iteration over views, such as with a progress bar.
+    read: returns a photo, RGB at the camera's size.  budget: MB of photos; if they exceed it, only every second, third,
+    … is included.  progress: wraps the iteration over views, such as with a progress bar.
     """
     test = {view.name for view in scene.split("test")}
     views: list[dict[str, Any]] = []
-    for view in through(scene.views):
+    for view in progress(scene.views):
         pixels, split = read(view), "test" if view.name in test else "train"
-        wanted = which == "all" or which == split
-        photograph = data_url(shrink(pixels, LARGEST)) if wanted else None
+        is_included = which == "all" or which == split
+        photograph = data_url(shrink(pixels, LARGEST)) if is_included else None
         thumbnail = data_url(shrink(pixels, THUMBNAIL))
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )
     with_photo = [view for view in views if view["photograph"]]
-    for i in left_out([len(view["photograph"]) for view in with_photo], round(1e6 * budget)):
+    for i in omitted_indices([len(view["photograph"]) for view in with_photo], round(1e6 * budget)):
         with_photo[i]["photograph"] = None
     return views
 
 
-def left_out(sizes: list[int], budget: int) -> set[int]:
-    """Return the indices to leave out so that every n-th stays and their sum is at most `budget`."""
+def omitted_indices(sizes: list[int], budget: int) -> set[int]:
+    """Return the indices to omit so that every n-th one stays and the sum of their sizes is at most `budget`."""
     every = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
     return {i for i in range(len(sizes)) if every > len(sizes) or i % every}

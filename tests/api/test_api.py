@@ -39,7 +39,7 @@ def test_import_loads_no_heavy_module():
 def test_models_and_scenes_open_no_device():
     assert "clsplat.opencl.device" in loaded_after("import clsplat; clsplat.load")
     code = "import clsplat; clsplat.load; clsplat.read_scene; clsplat.Renderer; clsplat.Trainer; clsplat.run\n"
-    code += "from clsplat.api import renderer; assert renderer._opened.cache_info().currsize == 0"
+    code += "from clsplat.api import renderer; assert renderer._open_default.cache_info().currsize == 0"
     assert "torch" not in loaded_after(code)
 
 

@@ -133,8 +133,8 @@ def test_pages(runs, tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kind": "jpg"}, "^no kind 'jpg'; there are png, npy$"),
-        ({"split": "bogus"}, "^no split 'bogus'; there are train, test, all$"),
+        ({"kind": "jpg"}, "^kind: expected one of png, npy, got 'jpg'$"),
+        ({"split": "bogus"}, "^split: expected one of train, test, all, got 'bogus'$"),
     ],
 )
 def test_views_of_other_kinds_and_splits_are_refused(runs, tmp_path, arguments, message):

@@ -128,7 +128,7 @@ def test_empty_model_renders_the_background(device, rng):
 def test_derivatives_of_another_shape_are_refused(device, rng):
     case = random_case(rng, 3, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view)
-    with pytest.raises(ValueError, match=r"gradient of alpha: expected shape"):
+    with pytest.raises(ValueError, match=r"gradient of alpha: expected the shape"):
         picture.backward(alpha=np.zeros((3, 3)))
 
 
@@ -210,11 +210,11 @@ def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
     monkeypatch.setattr(program, "Program", slowly(built))
     monkeypatch.setattr(device, "_programs", {})
     monkeypatch.setattr(devices, "Device", slowly(opened))
-    devices._opened.cache_clear()
+    devices._open_default.cache_clear()
     with ThreadPoolExecutor(4) as pool:
         programs = list(pool.map(lambda _: device.program("fill.cl"), range(4)))
         found = list(pool.map(lambda _: devices.default_device(), range(4)))
-    devices._opened.cache_clear()
+    devices._open_default.cache_clear()
     assert (len(built), len(set(programs))) == (1, 1)
     assert (len(opened), len(set(found))) == (1, 1)
 

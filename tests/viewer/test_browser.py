@@ -14,7 +14,7 @@ import clsplat
 from clsplat.metrics.images import psnr, to_8_bits
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import Page, described
+from clsplat.viewer.page import Page, view_entries
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import HOSTILE
 from tests.support.viewer_pages import MIP, PLAIN, cloud, scene
@@ -46,7 +46,7 @@ def write_page(folder: Path, model, **names) -> Path:
     """Write a page whose photographs are renders of its model, as JPEG."""
     found = scene(folder)
     stand = Viewpoint.from_points(model.means, found.views, found.views[0])
-    views = described(found, lambda view: render(model, view), "test")
+    views = view_entries(found, lambda view: render(model, view), "test")
     for view, name in zip(views, names.get("views", ()), strict=False):
         view["name"] = name
     stand = replace(stand, start=replace(stand.start, name=views[0]["name"]))

@@ -126,7 +126,7 @@ FAULTS = {
     "no height": (lambda d: d.update(render_height=0), r"size \(64, 0\).*; export the path again"),
     "a width alone": (lambda d: d.pop("render_height"), r"size \(64, 0\)"),
     "no size": (lambda d: d.update(render_width=0, render_height=0), r"size \(0, 0\)"),
-    "a rate": (lambda d: d.update(fps=100000), "frames a second.*; export the path again"),
+    "a rate": (lambda d: d.update(fps=100000), "frames per second.*; export the path again"),
     "no rate": (lambda d: d.update(fps=0), "fps 0.0"),
 }
 

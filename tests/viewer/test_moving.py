@@ -12,7 +12,7 @@ from clsplat.gaussians.motion import evaluate_at
 from clsplat.metrics.images import psnr, to_8_bits
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import Page, described
+from clsplat.viewer.page import Page, view_entries
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.viewer_data import unpacked
 from tests.support.viewer_pages import cloud, moving, scene
@@ -38,7 +38,7 @@ def page_of(folder, model) -> Page:
     found = replace(found, views=tuple(replace(v, time=t) for v, t in zip(found.views, MOMENTS, strict=True)))
     stand = Viewpoint.from_points(model.means, found.views, found.views[0])
     renderer = clsplat.Renderer(model)
-    views = described(found, lambda view: to_8_bits(renderer.render(view).image), "none")
+    views = view_entries(found, lambda view: to_8_bits(renderer.render(view).image), "none")
     return Page("demo", {"demo": pack(model)}, stand, "white", views)
 
 

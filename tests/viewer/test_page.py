@@ -15,7 +15,7 @@ from clsplat.core.page import inline, shrink
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer import page as module
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, described, left_out, script
+from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, omitted_indices, script, view_entries
 from tests.support.html_page import HOSTILE
 from tests.support.html_page import Page as Parsed
 from tests.support.viewer_pages import cloud, scene, views
@@ -30,7 +30,7 @@ def flat(view):
 def page(tmp_path) -> Page:
     found, model = scene(tmp_path), cloud(60)
     stand = Viewpoint.from_points(model.means, found.views, found.views[0])
-    return Page("demo", {"model": pack(model)}, stand, "white", described(found, flat, "test"))
+    return Page("demo", {"model": pack(model)}, stand, "white", view_entries(found, flat, "test"))
 
 
 def test_same_input_gives_the_same_page(page, tmp_path):
@@ -108,7 +108,7 @@ def test_too_large_page_for_browsers_is_refused(page, tmp_path, monkeypatch):
 def test_too_large_page_blames_its_photographs(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.2)
     large = replace(page, views=[{"name": "a", "thumbnail": "", "photograph": "x" * 300_000}])
-    with pytest.raises(OutputError, match="at most 0 MB; show fewer photographs") as raised:
+    with pytest.raises(OutputError, match="at most 0 MB; show fewer photos") as raised:
         large.write(tmp_path / "page.html")
     assert "splats" not in str(raised.value)
 
@@ -146,16 +146,16 @@ def test_page_size_matches_the_file(page, tmp_path):
     ],
 )
 def test_photographs_stay_within_a_budget(sizes, budget, kept):
-    assert left_out(sizes, budget) == set(range(len(sizes))) - set(kept)
+    assert omitted_indices(sizes, budget) == set(range(len(sizes))) - set(kept)
 
 
 @pytest.mark.parametrize(("which", "held"), [("none", []), ("test", [0, 3]), ("all", [0, 1, 2, 3])])
 def test_photographs_of_the_selected_views(tmp_path, which, held):
-    found = described(scene(tmp_path), flat, which)
+    found = view_entries(scene(tmp_path), flat, which)
     assert [i for i, view in enumerate(found) if view["photograph"]] == held
     assert all(view["thumbnail"].startswith("data:image/jpeg;base64,") for view in found)
     assert [view["split"] for view in found] == ["test", "train", "train", "test"]
-    assert all(not view["photograph"] for view in described(scene(tmp_path), flat, which, budget=1e-6))
+    assert all(not view["photograph"] for view in view_entries(scene(tmp_path), flat, which, budget=1e-6))
 
 
 @pytest.mark.parametrize(("shape", "after"), [((300, 200), (128, 85)), ((100, 128), (100, 128)), ((2, 4000), (1, 128))])

@@ -15,14 +15,14 @@ from clsplat.scene.view import View
 from clsplat.viewer.video.paths import (
     PATHS,
     Rig,
-    around,
     check_fps,
     check_frames,
     check_size,
     even_size,
-    like,
+    fit_inside,
     nearest_view,
-    order,
+    same_area,
+    tour_order,
 )
 from clsplat.viewer.video.plan import VideoRequest, plan_video
 from tests.support.camera_rings import CAMERA, SIZE, UP, rig_of, ring
@@ -139,11 +139,11 @@ def test_ring_has_no_front_for_a_spiral(rng):
 def test_walk_connects_neighbors_regardless_of_names(rng):
     views = ring(np.linspace(0, 4, 25))
     shuffled = [replace(views[i], name=f"{k:03d}") for k, i in enumerate(rng.permutation(25))]
-    way = order(rig_of(shuffled, rng))
+    way = tour_order(rig_of(shuffled, rng))
     steps = np.linalg.norm(np.diff(positions(shuffled)[way], axis=0), axis=1)
     assert np.median(steps) == pytest.approx(0.5, rel=0.1)
     assert steps.sum() < 1.7 * 12
-    by_name = order(rig_of(views, rng))
+    by_name = tour_order(rig_of(views, rng))
     assert by_name.tolist() == list(range(25))
 
 
@@ -191,9 +191,9 @@ def test_outlier_camera_changes_nothing(rng):
 def test_sizes():
     assert even_size(Camera(225, 401, 9.0, 9.0, 1.0, 1.0)) == (224, 400)
     assert max(even_size(Camera(20001, 10000, 9.0, 9.0, 1.0, 1.0))) <= 8192
-    wide = like(CAMERA, (400, 300))
+    wide = same_area(CAMERA, (400, 300))
     assert (wide.fx, wide.cx, wide.cy) == (360, 200, 150)
-    assert around(CAMERA, (200, 150)) == CAMERA
+    assert fit_inside(CAMERA, (200, 150)) == CAMERA
     assert check_size("640x480") == check_size((640, 480)) == (640, 480)
 
 
@@ -211,12 +211,12 @@ def test_bad_numbers_of_frames_are_refused(frames):
 
 @pytest.mark.parametrize("fps", [0, 241, float("nan"), True])
 def test_bad_rates_are_refused(fps):
-    with pytest.raises(ConfigError, match="frames a second"):
+    with pytest.raises(ConfigError, match="frames per second"):
         check_fps(fps)
 
 
 def test_unknown_path_and_a_path_without_a_scene_are_refused():
-    with pytest.raises(ConfigError, match="no path 'elipse'; there are ellipse, spiral, orbit, through, views"):
+    with pytest.raises(ConfigError, match="path 'elipse': expected one of ellipse, spiral, orbit, through, views"):
         VideoRequest.parse("elipse", None, None, None)
     with pytest.raises(ConfigError, match="needs the cameras of a scene"):
         plan_video(VideoRequest(), None, np.zeros((1, 3)))

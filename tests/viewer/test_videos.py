@@ -65,7 +65,7 @@ def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_pa
         tmp_path / "run", video=None, out=tmp_path / "a", path=str(tmp_path / "p.json"), size="32x32"
     )
     assert told["frames"] == 2
-    assert f"the folder of its photographs, {tmp_path / 'gone'}, is missing" in caplog.text
+    assert f"the folder of its photos, {tmp_path / 'gone'}, is missing" in caplog.text
     with pytest.raises(DataError, match="is missing; give the folder of the scene"):
         clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
 
@@ -205,13 +205,13 @@ def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"path": "elipse"}, "no path 'elipse'; there are ellipse"),
+        ({"path": "elipse"}, "path 'elipse': expected one of ellipse"),
         ({"frames": 0}, "expected a whole number from 1 to 100000"),
         ({"size": "33x32"}, "expected WIDTHxHEIGHT in even numbers"),
         ({"size": "8192x32", "side": "photograph"}, "size \\(16384, 32\\)"),
-        ({"fps": float("nan")}, "expected frames a second"),
+        ({"fps": float("nan")}, "expected frames per second"),
         ({"video": None, "side": "photograph"}, "--side needs --video"),
-        ({"kind": "gif", "video": None}, "no kind 'gif'"),
+        ({"kind": "gif", "video": None}, "expected png or npy, got 'gif'"),
         ({"kind": "npy"}, "--format npy is for images"),
         ({"side": "no.ply"}, "no.ply"),
     ],

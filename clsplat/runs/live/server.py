@@ -25,7 +25,7 @@ from clsplat.runs.live.preview import Credit, Kind, LiveState, Pace, PreviewRequ
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
-from clsplat.viewer.page import camera_data, joined, style, viewpoint_data
+from clsplat.viewer.page import camera_data, join_scripts, style, viewpoint_data
 
 # Requests: only GET, addressed to this machine by name, under a secret path.
 
@@ -198,7 +198,7 @@ def page() -> bytes:
     text = render(
         "live.html.j2",
         style=inline(style() + (FOLDER / "live.css").read_text("utf-8")),
-        script=inline(joined(VIEWER_SCRIPTS, scripts)),
+        script=inline(join_scripts(VIEWER_SCRIPTS, scripts)),
     )
     return text.encode()
 

@@ -1,4 +1,4 @@
-"""Camera paths in files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
+"""Read camera paths from files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
 camera_path  one entry per frame: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical),
@@ -23,7 +23,16 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
 from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of
 from clsplat.scene.view import View
-from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, check_fps, check_size, even_size, placed
+from clsplat.viewer.video.paths import (
+    MAX_FRAMES,
+    Floats,
+    Size,
+    center_inside,
+    check_fps,
+    check_size,
+    even_size,
+    fit_inside,
+)
 
 LOG = logging.getLogger("clsplat")
 WORLD = "dataparser_transforms.json"  # next to a path file: how nerfstudio transformed the scene
@@ -32,7 +41,7 @@ MAX_BYTES = 1 << 27
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A camera path from a file."""
+    """A camera path read from a file."""
 
     views: list[View]
     fps: float
@@ -41,28 +50,28 @@ class CameraPath:
     def resized(self, size: Size) -> list[View]:
         """Return the views at another size, with the same vertical field of view."""
         scale = size[1] / self.size[1]
-        return [replace(view, camera=placed(view.camera, size, scale)) for view in self.views]
+        return [replace(view, camera=center_inside(view.camera, size, scale)) for view in self.views]
 
 
 def read(path: Path, scene: Path | None = None) -> CameraPath:
     """Read a camera path, with its poses in the coordinates of the scene in a folder.
 
-    nerfstudio transforms a scene, and writes the transform to a file WORLD, which is expected next to the path;
-    without it the poses are used as they are, with a warning.
-    Raises DataError for other files, invalid numbers and cameras that are not perspective.
+    nerfstudio transforms a scene, and writes the transform to a file WORLD, which is expected next to the path; without
+    it, the poses are used unchanged, with a warning.
+    Raises DataError for other files, invalid numbers, and cameras that are not perspective.
     """
     table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
     if isinstance(table, list):
-        return _of_cameras(path)
+        return _read_cameras(path)
     frames = table.get("camera_path") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (kind := table.get("camera_type", "perspective")) != "perspective":
-        raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective: export the path again")
+        raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective; export the path again")
     size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
-    move = _world(path, scene)
+    move = _world_transform(path, scene)
     views = []
     for i, entry in enumerate(frames):
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
@@ -73,50 +82,54 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
-            raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
+            raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1; export the path again")
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
     return CameraPath(views, rate, size)
 
 
-def _of_cameras(path: Path) -> CameraPath:
-    """Read the cameras of a cameras.json as frames, each fitted into the size of the first."""
+def _read_cameras(path: Path) -> CameraPath:
+    """Read a path from a cameras.json; all frames get the size of the first camera."""
     views = camera_files.read_inria(path)
     size = even_size(views[0].camera)
-    frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
+    frames = [
+        replace(view, name=f"frame_{i:05d}", camera=fit_inside(view.camera, size)) for i, view in enumerate(views, 1)
+    ]
     return CameraPath(frames, 30.0, size)
 
 
 def resample(views: Sequence[View], frames: int) -> list[View]:
-    """Return evenly spaced views along a path, with positions, rotations (slerp) and lenses interpolated.
+    """Return evenly spaced views along a path, with interpolated positions, rotations (slerp), and intrinsics.
 
-    Times are interpolated too if all views have one.
+    Timestamps are interpolated too if all views have one.
     """
     if frames == len(views):
         return list(views)
     if len(views) == 1:
         return [replace(views[0], name=f"frame_{i:05d}") for i in range(1, frames + 1)]
-    places = np.linspace(0, len(views) - 1, frames)
+    positions = np.linspace(0, len(views) - 1, frames)
     poses = np.stack([view.world_to_camera for view in views])
-    turns = scipy.spatial.transform.Slerp(
+    rotations = scipy.spatial.transform.Slerp(
         np.arange(len(views)), scipy.spatial.transform.Rotation.from_matrix(poses[:, :, :3])
-    )(places).as_matrix()
+    )(positions).as_matrix()
     lenses = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (view.camera for view in views)])
     centers, lenses = (
-        np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
+        np.stack([np.interp(positions, np.arange(len(views)), column) for column in columns.T], axis=1)
         for columns in (np.stack([view.position for view in views]), lenses)
     )
-    known = [view.time for view in views if view.time is not None]
-    moves = len(known) == len(views)
-    times = np.interp(places, np.arange(len(views)), known).tolist() if moves else [None] * frames
+    timestamps = [view.time for view in views if view.time is not None]
+    has_times = len(timestamps) == len(views)
+    times = np.interp(positions, np.arange(len(views)), timestamps).tolist() if has_times else [None] * frames
     first = views[0].camera
     return [
         View(
             f"frame_{i:05d}",
             Camera(first.width, first.height, *lens),
-            np.column_stack([turn, -turn @ center]),
+            np.column_stack([rotation, -rotation @ center]),
             time=time,
         )
-        for i, (turn, center, lens, time) in enumerate(zip(turns, centers, lenses.tolist(), times, strict=True), 1)
+        for i, (rotation, center, lens, time) in enumerate(
+            zip(rotations, centers, lenses.tolist(), times, strict=True), 1
+        )
     ]
 
 
@@ -126,14 +139,14 @@ def _camera(size: Size, fov: float) -> Camera:
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
-def _size_and_rate(whole: JsonFrame) -> tuple[Size, float]:
-    """Return the frame size, in even numbers, and the frames per second; with defaults if the file has none."""
-    sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
+def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
+    """Return the frame size, in even numbers, and the frames per second, or defaults if the file has none."""
+    sides, fps = [document.number(key) for key in ("render_width", "render_height")], document.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
     try:
         return check_size((width, height)), check_fps(30.0 if fps is None else fps)
     except ConfigError as error:
-        raise DataError(f"{whole.where}: {error}; export the path again") from error
+        raise DataError(f"{document.where}: {error}; export the path again") from error
 
 
 def _rows(numbers: Any) -> Any:
@@ -143,26 +156,26 @@ def _rows(numbers: Any) -> Any:
     return [numbers[i : i + 4] for i in range(0, 16, 4)]
 
 
-def _world(path: Path, scene: Path | None) -> Any:
+def _world_transform(path: Path, scene: Path | None) -> Any:
     """Return a function that transforms poses, [3, 4] world to camera, into the coordinates of the scene."""
     file = path.parent / WORLD
     if not file.is_file():
         LOG.warning(
-            "%s: its poses are used in the coordinates of the scene; if nerfstudio moved it, put %s next to the path",
+            "%s: poses are used as scene coordinates; if nerfstudio transformed the scene, put %s next to the path",
             *(path, WORLD),
         )
         return lambda pose: pose
     matrix, scale = _affine(file)
     rotation, shift = matrix[:, :3], matrix[:, 3]
-    before = _applied(scene)
+    applied = _applied_transform(scene)
 
     @np.errstate(all="ignore")  # poses that are not finite are rejected later
     def move(pose: Floats) -> Floats:
         """Invert x' = scale · (rotation x + shift), nerfstudio's transform."""
         center = -pose[:, :3].T @ pose[:, 3]
-        turned = pose[:, :3] @ rotation @ before[:, :3].T
-        place = before[:, :3] @ (rotation.T @ (center / scale - shift)) + before[:, 3]
-        return np.column_stack([turned, -turned @ place])
+        turned = pose[:, :3] @ rotation @ applied[:, :3].T
+        position = applied[:, :3] @ (rotation.T @ (center / scale - shift)) + applied[:, 3]
+        return np.column_stack([turned, -turned @ position])
 
     return move
 
@@ -173,7 +186,7 @@ def _affine(file: Path) -> tuple[Floats, float]:
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
     if scale is None or not scale > 0:
-        raise DataError(f"{file}: scale is {quote(scale)}; expected a number above 0: export the file again")
+        raise DataError(f"{file}: scale is {quote(scale)}; expected a number above 0; export the file again")
     return matrix, scale
 
 
@@ -188,7 +201,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
     return matrix
 
 
-def _applied(scene: Path | None) -> Floats:
+def _applied_transform(scene: Path | None) -> Floats:
     """Read the transform, [3, 4], that nerfstudio had applied to the poses of a scene's transforms.json."""
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():

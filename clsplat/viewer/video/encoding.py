@@ -24,11 +24,11 @@ SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS = 0x18538067, 0x1654AE6B, 0xAE, 0x125
 PARENTS = {SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS}
 CLUSTER = 0x1F43B675  # the first frames; the tracks come before them
 UIDS = {0x73C5, 0x63C5}  # TrackUID, and TagTrackUID
-HEAD = 1 << 16  # bytes; holds all of them
+HEAD = 1 << 16  # bytes, which hold all UIDs
 
 
 def fix_track_ids(path: Path) -> None:
-    """Set the UID of every track of a WebM file to 1, in place, so that the same images give the same file."""
+    """Set the UID of every track of a WebM file to 1, in place, so that equal images give equal files."""
     with path.open("rb+") as file:
         head = file.read(HEAD)
         for start, size in _uids(head, 0, len(head)):
@@ -59,15 +59,15 @@ def _number(data: bytes, start: int, marked: bool) -> tuple[int, int]:
 
 Image = NDArray[np.uint8]
 Write = Callable[[Image], None]  # writes a frame, RGB, [height, width, 3]
-CODEC = "VP80"  # with OpenCV's settings VP9 has the same size and PSNR, and takes 4.5 times as long
+CODEC = "VP80"  # with OpenCV's settings, VP9 gives the same size and PSNR in 4.5 times the time
 QUALITY = "18"  # constant rate factor of H.264: visually almost lossless
-WITHOUT_TREE = "0"  # x264's macroblock tree gives other bits in each run on processors with AVX-512
+NO_MB_TREE = "0"  # with AVX-512, x264's macroblock tree gives different bits in each run
 BT709 = 1  # FFmpeg's number of the color space
-WITHOUT = "or write images with --out DIR, which any encoder reads"
+ALTERNATIVE = "or write images with --out DIR, which any encoder reads"
 
 
 def check_file(path: Path) -> None:
-    """Raise ConfigError if a video cannot be written: unknown suffix, no encoder, or a file of a run."""
+    """Raise ConfigError if a video cannot be written: unknown suffix, no encoder, or the name of a run's file."""
     check_encoder(path)
     check_result_path(path, path.suffix.lower())
 
@@ -83,32 +83,34 @@ def check_encoder(path: Path) -> None:
 
 @contextmanager
 def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
-    """Yield a function that writes a frame; at the end of the block the file is complete and was read back.
+    """Yield a function that writes a frame; the complete file is read back at the end of the block.
 
-    size: of a frame, even numbers.  Raises OutputError; an earlier file then stays.
+    size: of a frame, px, even numbers.  Raises OutputError, and keeps an existing file.
     """
     suffix, count = path.suffix.lower(), 0
     with atomic_path(path, suffix) as temporary:
         with WRITERS[suffix](temporary, size, fps) as write:
 
-            def counted(image: Image) -> None:
+            def write_counted(image: Image) -> None:
                 nonlocal count
                 count += 1
                 write(image)
 
-            yield counted
+            yield write_counted
         if suffix == ".webm":
             fix_track_ids(temporary)
         if (readable := count_frames(temporary)) != count:
-            raise OutputError(f"{path}: {readable} of {count} frames can be read back; check the folder and its space")
+            raise OutputError(
+                f"{path}: {readable} of {count} frames can be read back; check the folder and the free space"
+            )
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
 
 
 def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
-    """Write images of one size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
+    """Write images of equal size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
 
-    Raises ConfigError for an invalid name, rate or size, and ValueError for no images and for images of several sizes.
+    Raises ConfigError for an invalid name, rate, or size, and ValueError for no images or images of different sizes.
     """
     check_file(path)
     check_fps(fps)
@@ -128,7 +130,7 @@ def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -
 
 
 def count_frames(path: Path) -> int:
-    """Return the number of frames of a video that can be decoded."""
+    """Return the number of decodable frames of a video."""
     reader, count = cv2.VideoCapture(str(path)), 0
     try:
         while reader.grab():
@@ -140,13 +142,13 @@ def count_frames(path: Path) -> int:
 
 @contextmanager
 def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
-    with _without_remarks():
+    with _without_codec_message():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*CODEC), float(fps), size)
     try:
         if not writer.isOpened():
             raise OutputError(
-                f"{path.parent}: OpenCV cannot write WebM (VP8) there; check the folder, and that OpenCV is from "
-                f"pip, with FFmpeg; or write .mp4 with the extra clsplat[video], {WITHOUT}"
+                f"{path.parent}: OpenCV cannot write WebM (VP8); check the folder, and that OpenCV is from "
+                f"pip, with FFmpeg; or write .mp4 with the extra clsplat[video], {ALTERNATIVE}"
             )
 
         def write(image: Image) -> None:
@@ -164,7 +166,7 @@ def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
             stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height = size
-            stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY, "mbtree": WITHOUT_TREE}
+            stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY, "mbtree": NO_MB_TREE}
             context = stream.codec_context
             context.thread_count = 1  # the bits depend on the number of threads
             context.colorspace = context.color_primaries = context.color_trc = BT709
@@ -190,13 +192,13 @@ def _av() -> ModuleType:
         return import_module("av")
     except ImportError as error:
         raise ConfigError(
-            f"MP4 needs PyAV; install it: pip install 'clsplat[video]', or give a name that ends in .webm, {WITHOUT}"
+            f"MP4 needs PyAV; install it: pip install 'clsplat[video]', or use the suffix .webm, {ALTERNATIVE}"
         ) from error
 
 
 @contextmanager
-def _without_remarks() -> Iterator[None]:
-    """Discard a message of OpenCV's FFmpeg about the codec's name, which no setting turns off."""
+def _without_codec_message() -> Iterator[None]:
+    """Discard a message of OpenCV's FFmpeg about the codec, which no setting suppresses."""
     try:
         stderr = os.dup(2)
     except OSError:  # closed

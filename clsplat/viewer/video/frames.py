@@ -15,10 +15,10 @@ from clsplat.scene.view import View
 
 Image = NDArray[np.uint8]
 LAYERS = ("color", "depth", "alpha")
-PROBES = 8  # views whose depths set the range of colors
+PROBES = 8  # views whose depths determine the range of colors
 PROBE_SIDE = 240  # px
-OPAQUE = 0.5  # alpha of pixels that have a depth
-SHARES = 0.02, 0.98  # quantiles of the depths that give near and far
+OPAQUE = 0.5  # alpha above which the depth of a pixel counts
+QUANTILES = 0.02, 0.98  # of the depths, for near and far
 MIN_RANGE = 1e-3  # relative to far
 
 
@@ -30,68 +30,68 @@ class Canvas:
 
     def layers(self, view: View, depth: bool = False) -> Layers:
         """Render a view.  Raises NumericError if the render is not finite."""
-        found = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
-        for values in found.arrays:
+        rendered = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
+        for values in rendered.arrays:
             require_finite(values, view)
-        return found
+        return rendered
 
     def picture(self, view: View) -> Image:
         """Render a view to 8 bits, [height, width, 3]."""
         return to_8_bits(self.layers(view).image)
 
     def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
-        """Return near and far: the range of most depths in a sample of the views, scene units."""
+        """Return near and far, scene units: quantiles of the depths in a sample of the views."""
         depths = []
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
             small = replace(view, camera=view.camera.downscaled(max(1, longest / PROBE_SIDE)))
-            found = self.layers(small, depth=True)
-            assert found.depth is not None
-            depths.append(found.depth[found.alpha > OPAQUE])
+            rendered = self.layers(small, depth=True)
+            assert rendered.depth is not None
+            depths.append(rendered.depth[rendered.alpha > OPAQUE])
         all_depths = np.concatenate(depths)
         if not len(all_depths):
             return 1.0, 2.0
-        near, far = np.quantile(all_depths, SHARES)
+        near, far = np.quantile(all_depths, QUANTILES)
         return float(min(near, far * (1 - MIN_RANGE))), float(far)
 
 
-def layer_image(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
+def layer_image(rendered: Layers, layer: str, depths: tuple[float, float]) -> Image:
     """Return one of LAYERS as 8 bits, RGB, [height, width, 3]."""
     if layer == "color":
-        return to_8_bits(found.image)
+        return to_8_bits(rendered.image)
     if layer == "alpha":
-        return np.repeat(to_8_bits(found.alpha)[:, :, None], 3, axis=2)
-    assert found.depth is not None
-    return depth_image(found.depth, found.alpha, depths)
+        return np.repeat(to_8_bits(rendered.alpha)[:, :, None], 3, axis=2)
+    assert rendered.depth is not None
+    return depth_image(rendered.depth, rendered.alpha, depths)
 
 
-def layer_values(found: Layers, layer: str) -> NDArray[np.float32]:
+def layer_values(rendered: Layers, layer: str) -> NDArray[np.float32]:
     """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
-    array = {"color": found.image, "depth": found.depth, "alpha": found.alpha}[layer]
+    array = {"color": rendered.image, "depth": rendered.depth, "alpha": rendered.alpha}[layer]
     assert array is not None
     return array
 
 
 def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
-    """Return depths, [height, width], as colors from red (near) to blue (far), black where nothing is.
+    """Return depths, [height, width], as colors from red (near) to blue (far), black where the image is empty.
 
-    Colors are linear in inverse depth, as near differences matter more to the eye.
+    Colors are linear in inverse depth, because differences between near depths matter more to the eye.
     """
     near, far = depths
     with np.errstate(divide="ignore"):
-        place = (1 / np.maximum(depth, 1e-30) - 1 / far) / (1 / near - 1 / far)
-    colors = cv2.applyColorMap(to_8_bits(place.astype(np.float32)), cv2.COLORMAP_TURBO)[:, :, ::-1]
-    cover = np.where(depth > 0, alpha, 0)[:, :, None]
-    return to_8_bits((colors / np.float32(255) * cover).astype(np.float32))
+        level = (1 / np.maximum(depth, 1e-30) - 1 / far) / (1 / near - 1 / far)
+    colors = cv2.applyColorMap(to_8_bits(level.astype(np.float32)), cv2.COLORMAP_TURBO)[:, :, ::-1]
+    coverage = np.where(depth > 0, alpha, 0)[:, :, None]
+    return to_8_bits((colors / np.float32(255) * coverage).astype(np.float32))
 
 
 def side_by_side(image: Image, other: Image) -> Image:
-    """Join two images of the same height."""
+    """Join two images of the same height, left and right."""
     return np.hstack([image, other])
 
 
 def letterbox(image: Image, size: tuple[int, int]) -> Image:
-    """Scale an image to fit into a size (width, height), centered on black."""
+    """Scale an image to fit into a size (width, height), centered on a black background."""
     width, height = size
     factor = min(width / image.shape[1], height / image.shape[0])
     inner = max(1, min(width, round(image.shape[1] * factor))), max(1, min(height, round(image.shape[0] * factor)))

@@ -1,6 +1,6 @@
-"""Camera paths around and through a scene, by name.
+"""Generate camera paths around and through a scene, by name.
 
-Each is a function of a rig, a number of frames and a size, and returns a view for each frame.
+Each path is a function of a rig, a number of frames, and a size, and returns one view per frame.
 """
 
 import logging
@@ -20,28 +20,28 @@ from clsplat.scene.scene import outlier_cameras
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import nearest_to_axes, up_direction
 
-# The input of a camera path: the cameras of the photos, what they look at, and the up direction.
+# The input of a camera path: the cameras of the photos, their focus, and the up direction.
 
 Floats = NDArray[np.floating]
 MAX_POINTS = 20_000  # sampled to find near and far
-SHARES = 0.05, 0.95  # quantiles of the visible depths that give near and far
-PARALLEL = 0.9  # length of the mean view direction above which the axes are too parallel to give a focus
-DEPTH_MARGIN = 1.5  # of near and far; a focus of parallel axes outside these bounds is replaced
-MIN_FACING = 0.5  # share of the cameras that must have the focus in front of them
+QUANTILES = 0.05, 0.95  # of the visible depths, for near and far
+PARALLEL = 0.9  # length of the mean view direction above which the axes are too parallel for a focus
+DEPTH_MARGIN = 1.5  # factor for near and far; a focus of parallel axes outside of these bounds is replaced
+MIN_FACING = 0.5  # minimum fraction of cameras with the focus in front of them
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene without outliers, and points that they look at."""
+    """The cameras of a scene, without outliers, and points of its content."""
 
     views: Sequence[View]
     points: Floats  # [M, 3], the means of a model or the points of a scene
 
     @classmethod
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
-        """Omit outlier cameras and points that are not finite.  Raises DataError if there is no view."""
+        """Return the rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
         if not views:
-            raise DataError("a camera path needs the cameras of a scene; there is none")
+            raise DataError("a camera path needs the cameras of a scene, but there are none")
         stray = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         step = -(-len(finite) // MAX_POINTS) or 1
@@ -69,34 +69,34 @@ class Rig:
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3]; if they are almost parallel, the middle of what they see.
+        """The point nearest to the optical axes, [3], or the middle of the visible depths if they are almost parallel.
 
         Raises DataError if most cameras look away from it.
         """
         middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
         focus = nearest_to_axes(self.positions, self.forwards, middle)
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
-        ahead = float(np.median(self._before(focus)))
+        ahead = float(np.median(self._depths_of(focus)))
         if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < ahead < far * DEPTH_MARGIN:
             focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
-        if (self._before(focus) > 0).mean() < MIN_FACING:
+        if (self._depths_of(focus) > 0).mean() < MIN_FACING:
             raise DataError(
                 "the cameras look away from each other, so there is no center to orbit; use the path through"
             )
         return focus
 
-    def _before(self, point: Floats) -> Floats:
+    def _depths_of(self, point: Floats) -> Floats:
         """Return the depth of a point in each view, [V]."""
         return np.asarray(((point - self.positions) * self.forwards).sum(axis=1))
 
     @cached_property
     def depths(self) -> tuple[float, float]:
-        """Near and far: the range of most depths that the cameras see, scene units."""
+        """Near and far, scene units: quantiles of the visible depths."""
         sampled = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
         depths = np.concatenate(sampled)
         if not len(depths):
             return 1.0, 10.0
-        near, far = np.quantile(depths, SHARES)
+        near, far = np.quantile(depths, QUANTILES)
         return float(near), float(far)
 
     def _visible_depths(self, view: View) -> Floats:
@@ -126,19 +126,19 @@ Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
 SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between neighbors
 UP_WEIGHT = 0.1  # of up vectors relative to positions, times the distance
-MAX_VIEWS = 1000  # that a tour visits, evenly sampled by name
+MAX_VIEWS = 1000  # in a tour, evenly sampled by name
 ROUNDS = 20  # of 2-opt
 
 
-def order(rig: Rig) -> Indices:
-    """Return the indices of the views by name, or from neighbor to neighbor if that tour is shorter, [V]."""
+def tour_order(rig: Rig) -> Indices:
+    """Return the indices of the views, [V], in order of names, or from neighbor to neighbor if that tour is shorter."""
     spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
-    places = np.hstack([rig.positions / spread, rig.forwards])
+    features = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
     by_name = by_name[:: -(-len(by_name) // MAX_VIEWS)]
-    between = scipy.spatial.distance.cdist(places[by_name], places[by_name])
-    tours = np.arange(len(by_name)), _shorten(_nearest_neighbors(between), between)
-    return np.asarray(by_name[min(tours, key=lambda tour: _length(tour, between))])
+    distances = scipy.spatial.distance.cdist(features[by_name], features[by_name])
+    tours = np.arange(len(by_name)), _shorten(_nearest_neighbors(distances), distances)
+    return np.asarray(by_name[min(tours, key=lambda tour: _length(tour, distances))])
 
 
 def smooth(poses: Floats, frames: int, distance: float) -> Floats:
@@ -149,35 +149,35 @@ def smooth(poses: Floats, frames: int, distance: float) -> Floats:
     weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
     scaled = poses * weights
     steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
-    kept = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # no pose twice
-    scaled = scaled[kept]
+    is_new = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # drop repeated poses
+    scaled = scaled[is_new]
     if len(scaled) == 1:
         return np.repeat(poses[:1], frames, axis=0)
-    loose = len(scaled) * (SMOOTHING * float(np.median(steps[kept[1:]]))) ** 2
+    smoothing = len(scaled) * (SMOOTHING * float(np.median(steps[is_new[1:]]))) ** 2
     curve, _ = scipy.interpolate.splprep(
-        scaled.T, k=min(DEGREE, len(scaled) - 1), s=loose if len(scaled) > DEGREE else 0
+        scaled.T, k=min(DEGREE, len(scaled) - 1), s=smoothing if len(scaled) > DEGREE else 0
     )
     return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
-def _nearest_neighbors(between: Floats) -> Indices:
-    """Return a tour that goes from the first view always to the nearest view not yet visited."""
-    tour, left = [0], set(range(1, len(between)))
-    while left:
-        rest = np.array(sorted(left))
-        tour.append(int(rest[between[tour[-1], rest].argmin()]))
-        left.remove(tour[-1])
+def _nearest_neighbors(distances: Floats) -> Indices:
+    """Return a tour from the first view, each time to the nearest unvisited view."""
+    tour, unvisited = [0], set(range(1, len(distances)))
+    while unvisited:
+        candidates = np.array(sorted(unvisited))
+        tour.append(int(candidates[distances[tour[-1], candidates].argmin()]))
+        unvisited.remove(tour[-1])
     return np.array(tour)
 
 
-def _shorten(tour: Indices, between: Floats) -> Indices:
+def _shorten(tour: Indices, distances: Floats) -> Indices:
     """Reverse parts of a tour while that makes it shorter (2-opt), in place."""
     for _ in range(ROUNDS):
         changed = False
         for i in range(len(tour) - 2):
-            steps = np.append(between[tour[i + 2 : -1], tour[i + 3 :]], 0.0)  # nothing follows the last view
-            ends = np.append(between[tour[i + 1], tour[i + 3 :]], 0.0)
-            gain = between[tour[i], tour[i + 1]] + steps - between[tour[i], tour[i + 2 :]] - ends
+            steps = np.append(distances[tour[i + 2 : -1], tour[i + 3 :]], 0.0)  # nothing follows the last view
+            ends = np.append(distances[tour[i + 1], tour[i + 3 :]], 0.0)
+            gain = distances[tour[i], tour[i + 1]] + steps - distances[tour[i], tour[i + 2 :]] - ends
             j = int(gain.argmax())
             if gain[j] > 1e-9:
                 tour[i + 1 : i + 3 + j] = tour[i + 1 : i + 3 + j][::-1].copy()
@@ -187,15 +187,15 @@ def _shorten(tour: Indices, between: Floats) -> Indices:
     return tour
 
 
-def _length(tour: Indices, between: Floats) -> float:
-    return float(between[tour[:-1], tour[1:]].sum())
+def _length(tour: Indices, distances: Floats) -> float:
+    return float(distances[tour[:-1], tour[1:]].sum())
 
 
 # Cameras with the frame size of a video.
 
 SIDES = 16, 8192  # px, smallest and largest side of a frame
 MAX_FRAMES = 100_000
-RATES = 1, 240  # frames a second
+RATES = 1, 240  # frames per second
 Size = tuple[int, int]  # width, height
 
 
@@ -205,8 +205,8 @@ def check_size(size: str | Size) -> Size:
     Raises ConfigError unless both sides are even, as codecs require, and within bounds.
     """
     if isinstance(size, str):
-        found = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
-        pair = (int(found[1]), int(found[2])) if found else None
+        match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
+        pair = (int(match[1]), int(match[2])) if match else None
     else:
         pair = (size[0], size[1]) if len(size) == 2 and all(isinstance(side, int) for side in size) else None
     if pair is None or not SIDES[0] <= min(pair) <= max(pair) <= SIDES[1] or pair[0] % 2 or pair[1] % 2:
@@ -216,8 +216,8 @@ def check_size(size: str | Size) -> Size:
     return pair
 
 
-def size_of(text: str) -> str:
-    """Return a size unchanged.  Raises ValueError, as validators do, if it is no valid frame size."""
+def validate_size(text: str) -> str:
+    """Return a frame size unchanged.  Raises ValueError, as validators do, if it is invalid."""
     try:
         check_size(text)
     except ConfigError as error:
@@ -226,16 +226,16 @@ def size_of(text: str) -> str:
 
 
 def check_frames(frames: int) -> int:
-    """Return a number of frames.  Raises ConfigError if it is out of bounds."""
+    """Return a number of frames unchanged.  Raises ConfigError if it is out of bounds."""
     if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
         raise ConfigError(f"frames {quote(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
     return frames
 
 
 def check_fps(fps: float) -> float:
-    """Return frames per second.  Raises ConfigError if they are out of bounds."""
+    """Return frames per second unchanged.  Raises ConfigError if they are out of bounds."""
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not RATES[0] <= fps <= RATES[1]:
-        raise ConfigError(f"fps {quote(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
+        raise ConfigError(f"fps {quote(fps)}: expected frames per second from {RATES[0]} to {RATES[1]}")
     return fps
 
 
@@ -246,20 +246,20 @@ def even_size(camera: Camera) -> Size:
     return width, height
 
 
-def like(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another size whose image covers as large an area, centered."""
+def same_area(camera: Camera, size: Size) -> Camera:
+    """Return a camera of another image size with the same area of view, centered."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
 
 
-def around(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another size whose image contains all of the original image, centered."""
-    return placed(camera, size, fit(camera, size))
+def fit_inside(camera: Camera, size: Size) -> Camera:
+    """Return a camera of another image size that contains the whole original image, centered."""
+    return center_inside(camera, size, fit_scale(camera, size))
 
 
-def placed(camera: Camera, size: Size, scale: float) -> Camera:
-    """Return a camera of another size whose image has a camera's, larger by a factor, in its middle."""
+def center_inside(camera: Camera, size: Size, scale: float) -> Camera:
+    """Return a camera of another image size with the original image, scaled by a factor, at its center."""
     width, height = size
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
     return Camera(
@@ -267,50 +267,50 @@ def placed(camera: Camera, size: Size, scale: float) -> Camera:
     )
 
 
-def fit(camera: Camera, size: Size) -> float:
-    """Return the factor by which a camera's image just fits into another size."""
+def fit_scale(camera: Camera, size: Size) -> float:
+    """Return the scale at which a camera's image just fits into another size."""
     return min(size[0] / camera.width, size[1] / camera.height)
 
 
 LOG = logging.getLogger("clsplat")
-WIDEST_GAP = math.radians(100)  # between neighbors on a ring around the focus; wider gaps count as not photographed
-SHARE = 90  # percentile of the cameras' offsets that gives the half axes (Barron et al. 2022)
-FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inverse depth (Mildenhall et al. 2019)
+MAX_GAP = math.radians(100)  # between neighbors on a ring around the focus; wider gaps count as not photographed
+PERCENTILE = 90  # of the cameras' offsets, for the half axes (Barron et al. 2022)
+FOCUS_DEPTH = 0.75  # of a spiral, from near (0) to far (1) in inverse depth (Mildenhall et al. 2019)
 TURNS = 2  # of a spiral
-SWAY = 0.3  # largest radius of a spiral relative to the distance of its target, as cameras may surround the scene
-ARC_SHARE = 0.85  # of a photographed arc; at its ends half of the image was not photographed
-TIME_WEIGHT = 1e-3  # of the whole duration relative to a right angle, to choose among the timestamps of one camera
+MAX_RADIUS = 0.3  # of a spiral, relative to the distance of its target; cameras may surround the scene
+ARC_FRACTION = 0.85  # of a photographed arc; at its ends, half of the image was not photographed
+TIME_WEIGHT = 1e-3  # of the full time range relative to a right angle, to choose among timestamps of one camera
 MIN_AGREEMENT = 0.5  # length of the mean view direction below which the cameras have no common front
 
 
 def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Circle the focus on an ellipse that fits the cameras; if they are all on one side, swing back and forth there.
+    """Circle the focus on an ellipse that fits the cameras, or swing back and forth if they are all on one side.
 
     The half axes are the 90th percentiles of the offsets along the principal axes of the horizontal plane, as in
     Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
     """
     across, offsets, height = _ring(rig)
-    half = np.percentile(np.abs(offsets), SHARE, axis=0)
+    half = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
     if min(half) <= 1e-6 * max(half):
         half = np.maximum(half, 0.05 * max(half, default=0.0))
     angles = _sweep(np.arctan2(offsets[:, 1] / half[1], offsets[:, 0] / half[0]), frames)
     flat = np.stack([half[0] * np.cos(angles), half[1] * np.sin(angles)], axis=1)
-    return _looking(rig, rig.focus + flat @ across + height.mean() * rig.up, rig.focus, size)
+    return _look_at(rig, rig.focus + flat @ across + height.mean() * rig.up, rig.focus, size)
 
 
 def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
     """Circle the focus once at the cameras' median distance and height, like a turntable."""
     across, offsets, height = _ring(rig)
     radius = float(np.median(np.linalg.norm(offsets, axis=1)))
-    taken = np.arctan2(offsets[:, 1], offsets[:, 0])
-    if (unseen := _gap(taken)[0]) > WIDEST_GAP:
+    camera_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+    if (gap := _gap(camera_angles)[0]) > MAX_GAP:
         LOG.warning(
             "%.0f degrees of the orbit were not photographed; the path ellipse stays where photos were taken",
-            math.degrees(unseen),
+            math.degrees(gap),
         )
-    angles = taken[0] + 2 * np.pi * np.arange(frames) / frames
+    angles = camera_angles[0] + 2 * np.pi * np.arange(frames) / frames
     flat = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return _looking(rig, rig.focus + flat @ across + np.median(height) * rig.up, rig.focus, size)
+    return _look_at(rig, rig.focus + flat @ across + np.median(height) * rig.up, rig.focus, size)
 
 
 def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
@@ -325,41 +325,43 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     right = unit(np.cross(forward, rig.up))
     axes = np.stack([right, np.cross(forward, right), forward])
     near, far = rig.depths
-    target = middle + forward / ((1 - FARNESS) / near + FARNESS / far)
-    radii = np.percentile(np.abs((rig.positions - middle) @ axes.T), SHARE, axis=0)
-    radii *= min(1.0, SWAY * float(np.linalg.norm(target - middle)) / max(float(radii.max()), 1e-30))
+    target = middle + forward / ((1 - FOCUS_DEPTH) / near + FOCUS_DEPTH / far)
+    radii = np.percentile(np.abs((rig.positions - middle) @ axes.T), PERCENTILE, axis=0)
+    radii *= min(1.0, MAX_RADIUS * float(np.linalg.norm(target - middle)) / max(float(radii.max()), 1e-30))
     turn = 2 * np.pi * TURNS * np.arange(frames) / frames
     steps = np.stack([np.cos(turn), np.sin(turn), np.sin(turn / 2)], axis=1) * radii
     positions = middle + steps @ axes
-    return named(
+    return looking_views(
         positions, np.broadcast_to(target, positions.shape), np.broadcast_to(rig.up, positions.shape), rig, size
     )
 
 
 def through(rig: Rig, frames: int, size: Size) -> list[View]:
     """Fly along the views on a smooth curve, by name or from neighbor to neighbor, whichever is shorter."""
-    chosen = order(rig)
+    chosen = tour_order(rig)
     distance = float(np.median(rig.depths))
     places = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[chosen]
     track = smooth(places, frames, distance)
-    return named(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
+    return looking_views(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
 
 
 def views(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Return at most `frames` of the photos' cameras one after another, evenly chosen, with their own intrinsics."""
+    """Return at most `frames` of the photos' cameras, evenly spaced, with the intrinsics of the photos."""
     chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
-    return [replace(rig.views[i], camera=around(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen]
+    return [
+        replace(rig.views[i], camera=fit_inside(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen
+    ]
 
 
 def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Stay at the most central camera, for scenes that move."""
+    """Stay at the most central camera, for moving scenes."""
     middle = np.median(rig.positions, axis=0)
     return stay(rig.views[int(np.linalg.norm(rig.positions - middle, axis=1).argmin())], frames, size)
 
 
 def stay(view: View, frames: int, size: Size) -> list[View]:
     """Repeat a view for all frames, without its timestamp."""
-    still = replace(view, camera=around(view.camera, size), lens=None, mask_path=None, time=None)
+    still = replace(view, camera=fit_inside(view.camera, size), lens=None, mask_path=None, time=None)
     return [replace(still, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
 
 
@@ -373,9 +375,9 @@ PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
 }
 
 
-def named(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
-    """Return views at positions that look at targets, [F, 3] each.  Raises DataError if one looks along up."""
-    camera = like(rig.camera, size)
+def looking_views(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
+    """Return views at positions that look at targets, [F, 3] each.  Raises DataError if a view looks along up."""
+    camera = same_area(rig.camera, size)
     try:
         return [
             View.looking_at(position, target, up, camera, f"frame_{i:05d}")
@@ -386,10 +388,7 @@ def named(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size)
 
 
 def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
-    """Return two horizontal axes, [2, 3], and the cameras' offsets from the focus along them, [V, 2], and up, [V].
-
-    The axes are principal axes, so an ellipse along them fits.
-    """
+    """Return two horizontal principal axes, [2, 3], and the cameras' offsets: along them, [V, 2], and up, [V]."""
     offsets = rig.positions - rig.focus
     height = offsets @ rig.up
     flat = offsets - height[:, None] * rig.up
@@ -399,27 +398,27 @@ def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
     return across, flat @ across.T, height
 
 
-def _sweep(taken: Floats, frames: int) -> Floats:
-    """Return the angles of the frames: once around, or back and forth if an arc was not photographed.  taken: [V]."""
-    gap, begin = _gap(taken)
+def _sweep(angles: Floats, frames: int) -> Floats:
+    """Return the angles of the frames: once around, or back and forth if there is a gap.  angles: of cameras, [V]."""
+    gap, begin = _gap(angles)
     turn = 2 * np.pi * np.arange(frames) / frames
-    if gap < WIDEST_GAP:
-        return np.asarray(taken[0] + turn)
+    if gap < MAX_GAP:
+        return np.asarray(angles[0] + turn)
     half = np.pi - gap / 2
-    return np.asarray(begin + half + ARC_SHARE * half * np.sin(turn))
+    return np.asarray(begin + half + ARC_FRACTION * half * np.sin(turn))
 
 
-def _gap(taken: Floats) -> tuple[float, float]:
+def _gap(angles: Floats) -> tuple[float, float]:
     """Return the widest angle without a camera, and the angle of the camera after it."""
-    ring = np.sort(taken % (2 * np.pi))
+    ring = np.sort(angles % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
     widest = int(gaps.argmax())
     return float(gaps[widest]), float(ring[(widest + 1) % len(ring)])
 
 
-def _looking(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[View]:
+def _look_at(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[View]:
     targets, ups = (np.broadcast_to(vector, positions.shape) for vector in (target, rig.up))
-    return named(positions, targets, ups, rig, size)
+    return looking_views(positions, targets, ups, rig, size)
 
 
 def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
@@ -427,7 +426,7 @@ def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
 
     Among the views of one camera, the nearest in time is returned.
     """
-    apart = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
-    turned = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
-    late = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
-    return views[int((apart + turned + TIME_WEIGHT * late).argmin())]
+    distance = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
+    angle = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
+    delay = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
+    return views[int((distance + angle + TIME_WEIGHT * delay).argmin())]

@@ -23,11 +23,11 @@ from clsplat.viewer.video.paths import (
     check_frames,
     check_size,
     even_size,
-    like,
+    same_area,
     stay,
 )
 
-# Timestamps of the frames, for scenes that move.
+# Timestamps of the frames, for moving scenes.
 
 Times = tuple[float, float]  # timestamps of the first and the last frame, in [0, 1]
 FULL_RANGE: Times = (0.0, 1.0)
@@ -36,7 +36,7 @@ FULL_RANGE: Times = (0.0, 1.0)
 def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
     """Return the timestamps of the first and the last frame, from one or two numbers or text such as 0..1.
 
-    None stays None.  If the second is smaller, time runs backwards.  Raises ConfigError.
+    None stays None.  If the second is smaller, time runs backward.  Raises ConfigError.
     """
     if value is None:
         return None
@@ -46,7 +46,7 @@ def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
     except (ValueError, TypeError):
         times = []
     if len(times) not in (1, 2) or not all(map(is_timestamp, times)):
-        raise ConfigError(f"the time {quote(value)}: expected a time from 0 to 1, or two such as 0..1")
+        raise ConfigError(f"time {quote(value)}: expected a time from 0 to 1, or two such as 0..1")
     return times[0], times[-1]
 
 
@@ -56,9 +56,9 @@ def with_times(views: Sequence[View], times: Times) -> list[View]:
 
 
 def assign_times(views: Sequence[View], times: Times | None, moves: bool) -> list[View]:
-    """Return views with timestamps: the requested ones, or their own, or the whole duration of a scene that moves.
+    """Return views with timestamps: the requested ones, or those of the views, or the full range for a moving model.
 
-    moves: whether the model does.  Raises ConfigError if timestamps were requested for a model that does not move.
+    moves: whether the model moves.  Raises ConfigError if timestamps were requested for a model that does not move.
     """
     if times is not None:
         require_motion(moves)
@@ -69,7 +69,7 @@ def assign_times(views: Sequence[View], times: Times | None, moves: bool) -> lis
 
 
 def require_motion(moves: bool) -> None:
-    """Raise ConfigError if the model does not move, as it then has no timestamps."""
+    """Raise ConfigError unless the model moves."""
     if not moves:
         raise ConfigError("a time was given, but the model does not move; omit the time")
 
@@ -82,13 +82,13 @@ Side = Callable[[View], Image]  # the image to the right of a view's render
 
 @dataclass(frozen=True)
 class VideoRequest:
-    """The settings of a video, checked before any work; None stands for a default."""
+    """The settings of a video, checked in advance; None means the default."""
 
     path: str = "ellipse"  # one of PATHS, fixed:NAME of a view, or a file of a camera path
     frames: int | None = None
     fps: float | None = None
     size: Size | None = None
-    times: Times | None = None  # of a scene that moves
+    times: Times | None = None  # for a moving scene
 
     @classmethod
     def parse(
@@ -99,11 +99,13 @@ class VideoRequest:
         size: str | Size | None,
         times: str | float | Sequence[float] | None = None,
     ) -> "VideoRequest":
-        """Check everything that needs no scene.  Raises ConfigError."""
+        """Parse the settings, and check all that needs no scene.  Raises ConfigError."""
         if path.partition(SEPARATOR)[0] not in PATHS and not path.lower().endswith(".json"):
-            raise ConfigError(f"no path {quote(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
+            raise ConfigError(
+                f"path {quote(path)}: expected one of {', '.join(PATHS)}, or a file of nerfstudio (.json)"
+            )
         if SEPARATOR in path and path.partition(SEPARATOR)[0] in PATHS and not path.startswith(f"fixed{SEPARATOR}"):
-            raise ConfigError(f"no path {quote(path)}; only `fixed{SEPARATOR}NAME` names a view")
+            raise ConfigError(f"path {quote(path)}: only `fixed{SEPARATOR}NAME` names a view")
         return cls(
             path,
             None if frames is None else check_frames(frames),
@@ -120,7 +122,7 @@ class VideoRequest:
 
 @dataclass(frozen=True)
 class VideoPlan:
-    """The views of a video, one per frame, all of one size."""
+    """The views of a video, one per frame, all of the same size."""
 
     views: list[View]
     fps: float
@@ -133,31 +135,31 @@ class VideoPlan:
 
     @property
     def seconds(self) -> float:
-        """Duration."""
+        """The duration of the video, s."""
         return len(self.views) / self.fps
 
 
 def plan_video(
     request: VideoRequest, scene: Scene | None, points: Floats, moves: bool = False, origin: Floats | None = None
 ) -> VideoPlan:
-    """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it does.
+    """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it moves.
 
-    origin: [3] world coordinates of the points' zero, by default that of the scene.
+    origin: [3] world coordinates of the points' origin, by default that of the scene.
 
-    Raises ConfigError without a scene where the path needs one, and for times where nothing moves; DataError where the
-    scene has no such path.
+    Raises ConfigError if the path needs a scene and there is none, and for times without motion; DataError if the path
+    is impossible in the scene.
     """
     plan = _path(request, scene, points, scene.origin if scene and origin is None else origin)
     return replace(plan, views=assign_times(plan.views, request.times, moves))
 
 
 def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Floats | None) -> VideoPlan:
-    """Plan the video without timestamps."""
+    """Plan a video without timestamps."""
     if request.is_file:
-        found = camera_path.read(Path(request.path), scene.path if scene else None)
-        views = found.resized(request.size) if request.size else found.views
+        camera_file = camera_path.read(Path(request.path), scene.path if scene else None)
+        views = camera_file.resized(request.size) if request.size else camera_file.views
         views = views if origin is None else [view.shifted(origin) for view in views]  # files have world coordinates
-        return VideoPlan(camera_path.resample(views, request.frames or len(views)), request.fps or found.fps)
+        return VideoPlan(camera_path.resample(views, request.frames or len(views)), request.fps or camera_file.fps)
     if scene is None:
         raise ConfigError(
             f"the path {request.path} needs the cameras of a scene; give --scene, a run folder, or a file"
@@ -172,20 +174,20 @@ def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Fl
 
 
 def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
-    """Return the video file of each layer; that of the colors is `video`.  Raises ConfigError for invalid names."""
-    found = {
+    """Return the video file of each layer; `video` is that of the color.  Raises ConfigError for invalid names."""
+    files = {
         layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
         for layer in layers
     }
-    for path in found.values():
+    for path in files.values():
         encoding.check_file(path)
-    return found
+    return files
 
 
 def render_video(
     canvas: Canvas, plan: VideoPlan, videos: Mapping[str, Path], side: Side | None, progress: Progress
 ) -> None:
-    """Render the views into videos, one per layer.  side: what is shown to the right of the colors."""
+    """Render the views to videos, one per layer.  side: returns the image to the right of the color."""
     wide = plan.size[0] * (1 if side is None else 2)
     check_size((wide, plan.size[1]))
     depths = canvas.depth_range(plan.views) if "depth" in videos else (0.0, 0.0)
@@ -197,15 +199,15 @@ def render_video(
             for layer, path in videos.items()
         }
         for view in progress(plan.views):
-            found = canvas.layers(view, "depth" in videos)
+            rendered = canvas.layers(view, "depth" in videos)
             for layer, write in writers.items():
-                picture = layer_image(found, layer, depths)
+                picture = layer_image(rendered, layer, depths)
                 write(side_by_side(picture, side(view)) if side and layer == LAYERS[0] else picture)
 
 
 def resize_view(view: View, size: Size | None = None) -> View:
-    """Return a view at another size; by default its own size, with even sides."""
-    wanted = size or even_size(view.camera)
-    if wanted == (view.camera.width, view.camera.height):
+    """Return a view at another image size, by default its size rounded down to even sides."""
+    target = size or even_size(view.camera)
+    if target == (view.camera.width, view.camera.height):
         return view
-    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path, time=view.time)
+    return View(view.name, same_area(view.camera, target), view.world_to_camera, view.image_path, time=view.time)
