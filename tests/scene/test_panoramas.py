@@ -8,7 +8,7 @@ import pytest
 from clsplat.core.errors import DataError
 from clsplat.prepare.inspect.facts import read_parts
 from clsplat.prepare.undistort import undistort_scene
-from clsplat.scene.camera import FACES, Lens, panorama_lens
+from clsplat.scene.camera import FACES, WIDE, Lens, panorama_lens
 from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
@@ -76,6 +76,7 @@ def test_directions_project_like_colmap(model: str, rng: np.random.Generator) ->
 
 
 def test_panoramas_project_like_colmap(rng: np.random.Generator) -> None:
+    assert {*MODELS, "EQUIRECTANGULAR"} == WIDE, "every model is compared"
     pycolmap = pytest.importorskip("pycolmap")
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=128, height=64, params=[128.0, 64.0])
     pixels = rng.random((100, 2)) * [128, 64]
