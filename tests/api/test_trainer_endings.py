@@ -108,7 +108,7 @@ def test_failed_edit_between_steps_prevents_saving(tiny_scene, tmp_path, monkeyp
     trainer = clsplat.Trainer(tiny_scene, two, out=tmp_path / "run")
     with pytest.raises(RuntimeError, match="no such teapot"):
         trainer.run()
-    with pytest.raises(ClsplatError, match="step 2 is half done"):
+    with pytest.raises(ClsplatError, match="step 2 is incomplete"):
         trainer.checkpoint()
     assert not (tmp_path / "run" / "checkpoints").exists()
 
@@ -152,7 +152,7 @@ def test_second_interrupt_saves_the_last_whole_step_or_none(tiny_scene, tmp_path
             with pytest.raises(KeyboardInterrupt):
                 trainer.step()
         if place is SplatStats:  # in the middle of the update
-            with pytest.raises(ClsplatError, match="step 3 is half done, so it is not saved"):
+            with pytest.raises(ClsplatError, match="step 3 is incomplete, so it is not saved"):
                 trainer.checkpoint()
             assert not (out / "checkpoints").exists()
             continue

@@ -221,7 +221,7 @@ def test_resume_gives_the_same_bits(finished, tmp_path):
     done = clsplat("resume", run)
     assert "resumed at step 40" in done.stdout
     assert (run / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
-    assert "made with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
+    assert "saved with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
 
 
 def test_plugin_option_works_after_the_command(tmp_path, without_plugins):

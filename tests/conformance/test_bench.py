@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.bench.cases import BenchCase, BenchResult, Peaks, Work, case, run_bench, synthetic
+from clsplat.conformance.bench.cases import BenchCase, BenchResult, Peaks, Work, case, run_bench, synthetic, with_near
 from clsplat.conformance.bench.measurement import compare_conditions, read_measurement, table
 from clsplat.core.errors import ConfigError
 from clsplat.core.text_table import text_table
@@ -57,7 +57,7 @@ def test_moving_case_changes_nothing(device, rng):
     parameters[MOTION] = rng.normal(0, 0.3, (SIZE[2], 5)).astype(np.float32)
     pixels = rng.integers(0, 256, (3, SIZE[1], SIZE[0]), dtype=np.uint8)
     photograph = Photograph(upload_camera(device, replace(view, time=0.5)), device.upload(pixels))
-    timed = BenchCase(device, parameters, photograph, "black", load("dynamic_7k").settings)
+    timed = BenchCase(device, parameters, photograph, "black", with_near(load("dynamic_7k").settings, 0.2))
     np.testing.assert_allclose(timed.trainer.model.gaussians.get(MOTION), parameters[MOTION], rtol=0, atol=1e-20)
 
 

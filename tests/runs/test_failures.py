@@ -137,7 +137,7 @@ def test_incomplete_step_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, 
     monkeypatch.undo()
     newest = steps_saved(tmp_path)[-1]
     assert newest in ("step_000004.npz", "step_000008.npz")
-    assert f"was half done; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
+    assert f"the failed step was incomplete; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
     train(tiny_scene, tmp_path, *FEW, resume=True)
     assert digest(tmp_path) == digest(few_steps)
     assert records(tmp_path) == records(few_steps)

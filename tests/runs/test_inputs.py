@@ -368,7 +368,7 @@ def test_dry_run_of_a_resume_prints_the_step(scene, tmp_path):
     assert f"would continue from step 12 in {out}" in command(*words, "--resume").stdout
     assert "already has a run" in command(*words, expect=2).stderr
     done = command(*words, "--resume", "--set", "seed=7", expect=2)
-    assert "made with other settings: seed was 0, is 7" in done.stderr
+    assert "saved with other settings: seed was 0, is 7" in done.stderr
     for path in (out / "checkpoints").iterdir():
         path.write_bytes(b"")
     assert "and so are all others" in command(*words, "--resume", expect=7).stderr

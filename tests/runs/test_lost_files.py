@@ -154,7 +154,7 @@ REFUSALS = {
         r"has no checkpoint to continue from; `clsplat run \S+ --out \S+ --restart` trains",
     ),
     "a damaged checkpoint": (OutputError, {}, "and so are all others"),
-    "another setting": (ConfigError, {"init.count": 51}, "was made with other settings"),
+    "another setting": (ConfigError, {"init.count": 51}, "was saved with other settings"),
     "no such device": (DeviceError, {}, "nowhere"),
 }
 

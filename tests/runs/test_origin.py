@@ -70,7 +70,7 @@ def test_world_coordinates_need_doubles(runs, tmp_path):
     found, expected = np.stack([rows[axis] for axis in "xyz"], axis=1), load(runs / "world").means + ORIGIN
     np.testing.assert_array_equal(found, expected)
     with pytest.raises(
-        ConfigError, match=r"a\.spz: world coordinates around \(500000, 4500000, 100\) need more digits"
+        ConfigError, match=r"a\.spz: world coordinates around \(500000, 4500000, 100\) exceed the precision"
     ):
         convert(runs / "world", tmp_path / "a.spz", world=True)
 

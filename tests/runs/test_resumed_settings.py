@@ -35,7 +35,7 @@ def test_training_values_may_change(change, killed_run, tiny_scene, caplog):
 
 @pytest.mark.parametrize("change", ["seed=3", "init.count=70", "model.sh_degree=2", "optimize.losses=[l1]"])
 def test_settings_that_shape_tables_may_not_change(change, killed_run, tiny_scene):
-    with pytest.raises(ConfigError, match=r"was made with other settings: .*restore it, or start again with `clsp"):
+    with pytest.raises(ConfigError, match=r"was saved with other settings: .*restore it, or start over with `clsp"):
         train(tiny_scene, killed_run, *FEW, change, resume=True)
 
 
@@ -51,7 +51,7 @@ def test_fewer_steps_than_trained_are_refused(killed_run, tiny_scene, caplog):
 def test_finished_training_accepts_no_new_values(few_steps, tiny_scene, tmp_path):
     out = shutil.copytree(few_steps, tmp_path / "run")
     before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
-    words = rf"no step is left to train, at step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` with that"
+    words = rf"no steps are left after step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` trains longer"
     with pytest.raises(ConfigError, match=words):
         Job.resume(out, ["optimize.rates.quats=1e-5"]).run()
     assert {file: file.read_bytes() for file in before if file.name != "log.txt"} == {

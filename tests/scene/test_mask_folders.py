@@ -158,7 +158,7 @@ def test_cell_identity_includes_masks(tiny_scene, tmp_path):
 
     def known(*settings: str) -> str:
         pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *settings])
-        return Scenes(tmp_path / "hashes").known(pipeline).digest
+        return Scenes(tmp_path / "hashes").facts(pipeline).digest
 
     first, place = known(f"scene.masks='{masks}'"), f"scene.masks='{masks}'"
     assert first != known()

@@ -116,7 +116,7 @@ def test_run_resumes_with_a_moved_file_but_not_another(tiny_scene, tmp_path, cap
     train(tiny_scene, tmp_path / "run", *FEW, chosen[0])
     killed(tmp_path / "run", tmp_path / "killed")
     lists[0].unlink()
-    with pytest.raises(ConfigError, match=r"made with other settings: scene\.holdout\.file was"):
+    with pytest.raises(ConfigError, match=r"saved with other settings: scene\.holdout\.file was"):
         train(tiny_scene, tmp_path / "killed", *FEW, chosen[2], resume=True)
     with caplog.at_level("INFO", "clsplat"):
         train(tiny_scene, tmp_path / "killed", *FEW, chosen[1], resume=True)

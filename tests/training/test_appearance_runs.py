@@ -121,7 +121,7 @@ def test_decision_is_recorded_and_off_keeps_the_bits(tiny_scene, tmp_path, few_s
     run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "off"
-    assert found.reason == "exposures are unknown, from tracks as well as from EXIF"
+    assert found.reason == "neither tracks nor EXIF give exposures"
     assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert RunState.read(tmp_path / "run").is_complete(asked), "the same command finds it up to date"
@@ -146,10 +146,10 @@ def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
 @pytest.mark.parametrize(
     ("spread", "explained", "chosen", "said"),
     [
-        (0.133, 0.32, "off", "; not more than 33% of what differs"),
+        (0.133, 0.32, "off", "; not more than 33% of the variance"),
         (0.02, 0.9, "off", "; not more than 3.0%"),
-        (0.02, 0.1, "off", "; not more than 3.0% nor 33% of what differs"),
-        (0.133, 0.7, "on", "; more than 3.0%, and than 33% of what differs"),
+        (0.02, 0.1, "off", "; not more than 3.0% or 33% of the variance"),
+        (0.133, 0.7, "on", "; more than 3.0% and 33% of the variance"),
     ],
 )
 def test_reason_names_the_deciding_bound(spread, explained, chosen, said):

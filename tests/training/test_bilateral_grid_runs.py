@@ -221,10 +221,10 @@ def test_damaged_tables_are_refused():
         {**good, "moment1": good["values"] + np.float32(np.nan)},
         {},
     ):
-        with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid has"):
+        with pytest.raises(DataError, match=r"its grids do not have|of its BilateralGrid has"):
             BilateralGrid.check_saved(rows, damaged)
     for damage in ({"colors/b/row": 6.0}, {"colors/a/row": 0.5}, {"colors/c/row": 2.0}):
-        with pytest.raises(DataError, match="color grids of 2 photographs"):
+        with pytest.raises(DataError, match="color grids for 2 photographs"):
             BilateralGrid.check_saved(rows | damage, good)
 
 
@@ -235,7 +235,7 @@ def test_checkpoint_without_its_grids_is_refused(with_grids, tmp_path):
     assert len(left) == len(tables) - 3
     with (tmp_path / "step_000012.npz").open("wb") as file:
         archive.write(file, notes, left.items())
-    with pytest.raises(DataError, match="its grids are not"):
+    with pytest.raises(DataError, match="its grids do not have"):
         checkpoint.load(tmp_path / "step_000012.npz")
 
 

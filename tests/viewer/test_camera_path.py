@@ -119,7 +119,7 @@ FAULTS = {
     "no angle": (lambda d: d["camera_path"][1].pop("fov"), "camera_path\\[1\\]: fov is None"),
     "a wide angle": (lambda d: d["camera_path"][0].update(fov=180), "fov is 180"),
     "no width at all": (lambda d: d["camera_path"][0].update(fov=1e-322), "fov is 1e-322"),
-    "text": (lambda d: d["camera_path"][0].update(fov="50"), "fov is '50'"),
+    "text": (lambda d: d["camera_path"][0].update(fov="wide"), "fov is 'wide'"),
     "few numbers": (lambda d: d["camera_path"][2]["camera_to_world"].pop(), "camera_path\\[2\\]"),
     "no rotation": (lambda d: d["camera_path"][0].update(camera_to_world=[0.0] * 16), "rotation"),
     "huge": (lambda d: d.update(render_width=10**9), "size"),
