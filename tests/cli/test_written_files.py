@@ -26,7 +26,7 @@ def test_renders_are_not_written_among_photographs(place, finished, tiny_scene, 
     shutil.copytree(tiny_scene, scene)
     before = contents(tmp_path)
     said = command("render", finished, "--scene", scene, "--out", scene / place, expect=2).stderr
-    assert "photographs" in said
+    assert "the folder of the photos" in said
     assert contents(tmp_path) == before
 
 

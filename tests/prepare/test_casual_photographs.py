@@ -318,7 +318,10 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         (unrelated_photograph, "no two of them show the same features"),
         (lambda number: rotated_view(1), "photographs are all the same"),
-        (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "none has features, where thousands"),
+        (
+            lambda number: np.full((180, 240, 3), np.linspace(90, 180 + number, 240)[:, None]).astype(np.uint8),
+            "none has features, where thousands",
+        ),
         (
             lambda number: np.full((180, 240, 3), 9, np.uint8) if number else rotated_view(1),
             "half of them have no features",

@@ -92,7 +92,7 @@ def test_suggested_command_works(state, tmp_path):
 
 
 def test_step_is_the_later_of_status_and_report(tmp_path):
-    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
+    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": 0.1, "psnr": 20}\n')
     assert ": failed at step 8 of 9" in reading.status_text(write_and_read_status(tmp_path, state="failed"))
 
 

@@ -58,7 +58,6 @@ def test_text_dialects(tmp_path: Path, edit) -> None:
         ("images", "1 a.jpg", "5 a.jpg", "names camera 5"),
         ("images", "1 a.jpg", "", "images.txt: line 2"),
         ("images", "1 2 -1 3 4 7", "1 2 -1 3", "images.txt: line 3"),
-        ("images", "a.jpg", "../a.jpg", "images.txt: line 2"),
         ("cameras", "50 51", "-nan(ind) 51", "cameras.txt: line 2"),
         ("cameras", "50 51", "nan 51", "cameras.txt: line 2"),
         ("cameras", "50 51", "50 -51", "cameras.txt: line 2"),

@@ -143,9 +143,7 @@ def test_restoring_reads_no_other_run(few_steps, tmp_path):
 def test_run_with_a_moved_scene_resumes(killed_run, few_steps, tiny_scene, tmp_path):
     pipeline, moved = killed_run / "pipeline.yaml", shutil.copytree(tiny_scene, tmp_path / "moved" / tiny_scene.name)
     pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
-    remedy = (
-        rf"photographs, {tmp_path / 'gone'}, is missing; if you moved it, run `clsplat resume {killed_run} --scene DIR`"
-    )
+    remedy = rf"photos, {tmp_path / 'gone'}, is missing; if you moved it, run `clsplat resume {killed_run} --scene DIR`"
     with pytest.raises(DataError, match=remedy):
         clsplat.resume(killed_run)
     clsplat.resume(killed_run, moved)

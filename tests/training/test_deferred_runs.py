@@ -91,8 +91,8 @@ def test_too_large_plan_suggests_the_host(spread, tiny_scene, tmp_path):
     other = run.memory_plan(harmonics="host")
     between = (other.needed(count) + own.needed(count)) // 2
     assert other.needed(count) < between < own.needed(count)
-    assert "harmonics on the host" in other.text(count)
-    assert "harmonics on the host" not in own.text(count)
+    assert "MiB on the host" in other.text(count)
+    assert "on the host" not in own.text(count)
     replace(other, memory=between).check(count)
     with pytest.raises(MemoryLimitError, match=r"rasterizer\.harmonics=auto"):
         replace(own, memory=between).check(count, ", or rasterizer.harmonics=auto")
@@ -190,7 +190,7 @@ def test_harmonics_stay_on_the_device_if_the_host_is_no_help(tiny_scene, info):
 def test_dry_run_reports_offloaded_harmonics(tiny_scene, tmp_path):
     own = [f"scene.path='{tiny_scene}'", HOST]
     text = describe(load("smoke", own), RunState.read(tmp_path / "run"), None, "new")
-    assert "harmonics on the host, in" in text
+    assert "MiB on the host" in text
     assert "on the host" not in describe(load("smoke", own[:1]), RunState.read(tmp_path / "run"), None, "new")
 
 
@@ -201,7 +201,7 @@ def test_device_holds_the_visible_part_of_host_harmonics(spread, tiny_scene, tmp
     held = {name: table.array.nbytes for name, table in gaussians.tables.items()}
     assert set(gaussians.on_host.tables) == {"sh_rest", "adam/sh_rest/moment1", "adam/sh_rest/moment2"}
     assert held["sh_rest"] == gaussians.on_host.block * 4 * gaussians.tables["sh_rest"].array.shape[0]
-    assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
+    assert 0 < len(gaussians.on_host.loaded) <= gaussians.tables["sh_rest"].array.shape[0]
 
 
 def test_settings_that_need_all_harmonics_are_refused(tiny_scene):
