@@ -1,4 +1,4 @@
-"""Define the base classes of losses and penalties: each adds to a gradient, and returns its value lazily."""
+"""Define the base classes of losses and penalties, which add to a gradient and return their value lazily."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -31,8 +31,8 @@ class Comparison:
     photograph: Array
     gradient: Array
     mask: Array | None = None  # [1, rows, stride] 0 or 1
-    step: int = 0  # global; schedules are taken at it
-    accumulate: bool = False  # False: the next loss overwrites the gradient
+    step: int = 0  # global; schedules are evaluated at it
+    accumulate: bool = False  # if False, the next loss overwrites the gradient
     depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 
     @property
@@ -42,7 +42,7 @@ class Comparison:
 
     @property
     def counted(self) -> int:
-        """Number of values in pixels that count; waits for the device if there is a mask."""
+        """Number of values in unmasked pixels; waits for the device if there is a mask."""
         return self.values if self.mask is None else 3 * int(self.mask.get().sum())
 
 
@@ -51,11 +51,11 @@ class LossValue:
     """The value of a loss at one step.  Reading it waits for the device."""
 
     name: str
-    value: Callable[[], float]  # weight included
+    value: Callable[[], float]  # including the weight
 
 
-def returned(loss: "Loss", value: object) -> LossValue:
-    """Return the result of a loss's `add`.  Raises ConfigError if it is not a LossValue."""
+def checked_value(loss: "Loss", value: object) -> LossValue:
+    """Return `value`, the result of a loss's `add`.  Raises ConfigError if it is not a LossValue."""
     if not isinstance(value, LossValue):
         raise ConfigError(
             f"the loss {type(loss).__name__}: expected a LossValue from 'add', got {type(value).__name__}"
@@ -80,7 +80,7 @@ class ViewLosses:
 
 @dataclass(frozen=True)
 class ViewGradients(ViewLosses):
-    """A view's frame, its losses and the sums over pixels that give the gradients; valid until the next view."""
+    """A view's frame, its losses, and the pixel sums from which gradients follow; valid until the next view."""
 
     pixel_sums: Array  # [PIXEL_SUMS or more, S]
 
@@ -98,12 +98,12 @@ class ImageLoss(Loss):
     """A loss on the rendered image."""
 
     symmetric: ClassVar[bool] = False
-    """Whether the value stays the same if image and photograph are exchanged, as the module `haar` requires."""
+    """Whether the value is the same if image and photograph are swapped, as the module `haar` requires."""
     reads_photograph: ClassVar[bool] = True
-    """Whether it compares the image with the photograph; training needs at least one loss that does."""
+    """Whether the loss compares the image with the photograph; training needs at least one such loss."""
 
     def reads(self, step: int) -> Content:
-        """Return which planes of the rendered image it needs at a global step: only colors, or also a fourth plane."""
+        """Return the planes of the image that the loss needs at a global step: only colors, or a fourth plane too."""
         return "color"
 
     @abstractmethod
@@ -123,15 +123,15 @@ class PenaltyInputs:
 
     @property
     def items(self) -> int:
-        """Work-items of a kernel whose item is LANES Gaussians."""
+        """The number of work-items of a kernel whose item is LANES Gaussians."""
         return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
 
     def sums(self, name: str) -> Array:
-        """Return an array for the sums of work-items, [items].  name: unique among the penalties of a step."""
+        """Return an array for the sums of work-items, [items].  name: must be unique among the penalties of a step."""
         return self.workspace.array(f"{name} sums", self.items)
 
     def arguments(self, parameter: str) -> dict[str, Any]:
-        """Return the arguments of a penalty's kernel by name: `<parameter>`, `grad_<parameter>`, sizes."""
+        """Return the arguments of a penalty's kernel by name: `<parameter>`, `grad_<parameter>`, and sizes."""
         return {
             "items": self.items,
             parameter: self.gaussians[parameter],
@@ -155,7 +155,7 @@ class Penalty(Loss):
 
 
 def required_content(losses: Sequence[Loss], step: int) -> Content:
-    """Return which planes of the rendered image the losses need at a global step.
+    """Return the planes of the rendered image that the losses need at a global step.
 
     Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for two different fourth planes.
     """
@@ -165,6 +165,6 @@ def required_content(losses: Sequence[Loss], step: int) -> Content:
     planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"color"}
     if len(planes) > 1:
         raise ConfigError(
-            f"losses read {' and '.join(sorted(planes))} of an image, but only one of them is possible; remove one"
+            f"the losses need {' and '.join(sorted(planes))} of an image, but only one can be rendered; remove a loss"
         )
     return planes.pop() if planes else "color"

@@ -1,4 +1,4 @@
-"""Supervise depths by points of structure from motion, or by depth maps."""
+"""Supervise depths with points of structure from motion, or with depth maps."""
 
 from typing import ClassVar, Literal
 
@@ -16,15 +16,15 @@ class InverseDepth(ImageLoss):
     Σ w / z the blended inverse depth of its pixel.
 
     q is 1 for points in at least four photographs, less for others, and 0 in photographs with a reprojection error of a
-    pixel or more at training size, if the dataset has it.  Nothing behind the splats adds to D, so that splats also
+    pixel or more at training size, if the dataset has such errors.  The background does not add to D, so splats also
     become opaque at points.  We use a weight of 0.02 that falls to 0 over the first half of the steps.  The loss needs
     points with tracks, as in COLMAP models, and does not optimize poses.
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"
     folder: InputPath | None = None
-    """Folder of depth maps, one per photograph: `a.png` for a.jpg, 8 or 16 bits, bright is near, linear in 1/z.
-    Each is fitted to the points of its photograph and used instead of them.  Default: only points."""
+    """Folder of depth maps, one per photograph: `a.png` for a.jpg, 8 or 16 bits, linear in 1/z, bright is near.  Each
+    is fitted to the points of its photograph, and used instead of them.  Default: only points."""
     reads_photograph: ClassVar[bool] = False
 
     def reads(self, step: int) -> Content:
@@ -36,7 +36,7 @@ class InverseDepth(ImageLoss):
             return LossValue("inverse_depth", lambda: 0.0)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
             raise ConfigError(
-                "the loss inverse_depth needs a frame with the content 'inverse_depth', as the trainer renders it"
+                "the loss inverse_depth needs a frame with the content 'inverse_depth'; render it with that content"
             )
         count = known.pixels.shape[0]
         scale = weight * known.extent / count

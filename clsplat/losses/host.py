@@ -49,7 +49,7 @@ class HostLoss(ImageLoss):
         if not (math.isfinite(value) and np.isfinite(derivative).all()):
             raise NumericError(
                 f"step {comparison.step}: the loss '{self.name}' returned values that are not finite; "
-                "expected finite numbers: look for a division, root or logarithm of 0 in it"
+                "expected finite numbers; look for a division by 0, or a root or logarithm of 0"
             )
         planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
         planes[:3, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
@@ -58,7 +58,7 @@ class HostLoss(ImageLoss):
         return LossValue(self.name, lambda: weight * value)
 
     def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        """Return value and gradient.  Raises ValueError if the function returns anything else."""
+        """Call the function; return its value and gradient.  Raises ValueError for any other result."""
         result: Any = self._function(image, photograph)
         try:
             value, derivative = result
@@ -69,6 +69,6 @@ class HostLoss(ImageLoss):
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(
-                f"the loss returned a derivative of {derivative.shape}; expected {image.shape}, as the image"
+                f"the loss returned a gradient of shape {derivative.shape}; expected that of the image, {image.shape}"
             )
         return value, derivative

@@ -1,4 +1,4 @@
-"""Define photometric losses, L1, L2 and D-SSIM, and the entropy of blend weights."""
+"""Define the photometric losses L1, L2, and D-SSIM, and the entropy of blend weights."""
 
 import math
 from typing import ClassVar, Literal
@@ -68,7 +68,7 @@ class Dssim(ImageLoss):
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
     """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
     camera, values = comparison.camera, comparison.values
-    sums = comparison.workspace.array("row_sums", (3, camera.rows, 2))  # the same for all losses of a step
+    sums = comparison.workspace.array("row_sums", (3, camera.rows, 2))  # identical for all losses of a step
     comparison.workspace.device.program("loss.cl").pixel_loss(
         groups=(1, camera.rows, 3),
         image=comparison.image,
@@ -85,14 +85,14 @@ def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
 
 
 def psnr(comparison: Comparison) -> float:
-    """Return the PSNR of the pixels that count, dB, before 8 bits; waits for the device."""
+    """Return the PSNR of unmasked pixels, dB, before rounding to 8 bits; waits for the device."""
     squares = pixel_loss(comparison, l1=0.0, l2=0.0).get()[..., 1]
     error = float(squares.sum(dtype="float64")) / comparison.counted
     return -10 * math.log10(max(error, 1e-10))
 
 
 def view_error(comparison: Comparison) -> Array:
-    """Return the sum over pixels of |gradient (x - y)|, [1], the error of the image as the losses weight it."""
+    """Return the sum over pixels of |gradient (x - y)|, [1]: the error of the image, weighted like the losses."""
     camera, workspace = comparison.camera, comparison.workspace
     rows, error = workspace.array("row_errors", (3, camera.rows)), workspace.array("view_error", 1)
     program = workspace.device.program("loss.cl")
@@ -109,14 +109,14 @@ def view_error(comparison: Comparison) -> Array:
 
 
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
-    """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks].
+    """Return the derivatives of the SSIM map, [3, 3, rows, stride], and the map's sums, [3, height, blocks].
 
     Raises DataError for images of more than SSIM_PIXELS_MAX pixels, in whole tiles.
     """
     camera, array = comparison.camera, comparison.workspace.array
     if camera.rows * camera.stride > SSIM_PIXELS_MAX:
         raise DataError(
-            f"an image of {camera.width}x{camera.height} pixels is too large for SSIM, at most {SSIM_PIXELS_MAX:,}; "
+            f"an image of {camera.width}x{camera.height} pixels is too large for SSIM (at most {SSIM_PIXELS_MAX:,}); "
             "downscale it"
         )
     blocks = -(-camera.stride // SSIM_BLOCK)
@@ -153,7 +153,7 @@ class WeightEntropy(ImageLoss):
         camera, weight = comparison.camera, at_step(self.weight, comparison.step)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
             raise ConfigError(
-                "the loss weight_entropy needs a frame with the content 'entropy', as the trainer renders it"
+                "the loss weight_entropy needs a frame with the content 'entropy'; render it with that content"
             )
         scale = weight / (camera.width * camera.height)
         sums = comparison.workspace.array("entropy_sums", camera.rows)

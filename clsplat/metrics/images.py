@@ -1,4 +1,4 @@
-"""Compute PSNR and SSIM of two images as in papers: 8 bits per channel, SSIM with an 11 x 11 Gaussian window."""
+"""Compute PSNR and SSIM as in papers: of 8-bit images, with an 11 x 11 Gaussian window for SSIM."""
 
 import math
 
@@ -24,28 +24,28 @@ def to_8_bits(image: NDArray[np.generic]) -> Image:
 
 
 def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None = None) -> float:
-    """Return the peak signal-to-noise ratio in dB over all channels of the pixels that count.
+    """Return the peak signal-to-noise ratio in dB over all channels of unmasked pixels.
 
     image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits; mask: [height, width].
     Raises ValueError for other types, for different shapes, and if no pixel counts.
     """
-    image, photograph = _checked(image, photograph, mask)
+    image, photograph = _check(image, photograph, mask)
     squared = (image.astype(np.float64) - photograph) ** 2
     error = float(np.mean(squared if mask is None else squared[mask])) / 255**2
     return MAX_PSNR if error == 0 else 10 * math.log10(1 / error)
 
 
 def ssim(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None = None) -> float:
-    """Return the structural similarity (Wang et al. 2004), the mean over the pixels that count.
+    """Return the structural similarity (Wang et al. 2004), averaged over unmasked pixels.
 
     Arguments and errors are as in `psnr`.
     """
-    similarity = ssim_map(*_checked(image, photograph, mask))
+    similarity = ssim_map(*_check(image, photograph, mask))
     return float((similarity if mask is None else similarity[mask]).mean())
 
 
-def _checked(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None) -> tuple[Image, Image]:
-    """Return both images as 8 bits.  Raises ValueError if they cannot be compared."""
+def _check(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None) -> tuple[Image, Image]:
+    """Convert both images to 8 bits.  Raises ValueError if they cannot be compared."""
     shape = image.shape
     if shape != photograph.shape or len(shape) != 3 or shape[2] != 3 or image.size == 0:
         raise ValueError(
@@ -55,7 +55,7 @@ def _checked(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: 
     if mask is not None and (mask.dtype != np.bool_ or mask.shape != shape[:2] or not mask.any()):
         raise ValueError(
             f"the mask has shape {mask.shape} and type {mask.dtype}; "
-            f"expected bool of {shape[:2]}, as the image, with at least one pixel that counts"
+            f"expected bool of shape {shape[:2]}, with at least one unmasked pixel"
         )
     for name, pixels in (("image", image), ("photograph", photograph)):
         if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():

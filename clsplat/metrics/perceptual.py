@@ -1,4 +1,4 @@
-"""Compute perceptual metrics of 8-bit images on the host: MS-SSIM, FLIP and LPIPS."""
+"""Compute perceptual metrics of 8-bit images on the host: MS-SSIM, FLIP, and LPIPS."""
 
 import hashlib
 import sys
@@ -17,7 +17,7 @@ from clsplat.core.child import run_module
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file
 
-# LPIPS with a network in a local ONNX file, by OpenCV's DNN module, without downloads or torch.
+# LPIPS with a network from a local ONNX file, run by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
 READ_SECONDS = 300  # a slow machine reads a network of 60 MB and runs it
@@ -28,9 +28,9 @@ INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 class Lpips:
     """Learned perceptual distance (Zhang et al. 2018); 0 for equal images.
 
-    The file holds a network of two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output: the
-    result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")`, with free height and width.  That network expects values
-    in [-1, 1]; the tables of 3DGS and Mip-Splatting have values in [0, 1], which give smaller distances.
+    The file contains a network with two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output:
+    the result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")`, with dynamic height and width.  That network expects
+    values in [-1, 1]; the tables of 3DGS and Mip-Splatting used values in [0, 1], which give smaller distances.
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:
@@ -48,11 +48,11 @@ class Lpips:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
             raise DataError(
-                f"{path}: not an ONNX file that OpenCV {cv2.__version__} reads ({_short(error)})"
+                f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_short(error)})"
             ) from error
         gray = np.full((64, 64, 3), 128, np.uint8)
         if (distance := self.distance(gray, gray)) != 0:
-            raise ConfigError(f"{path}: the distance of equal images is {distance:g}, expected 0: this is not LPIPS")
+            raise ConfigError(f"{path}: is not LPIPS; the distance of equal images is {distance:g}, expected 0")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3]."""
@@ -64,7 +64,7 @@ class Lpips:
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise ConfigError(
                 f"{self.path}: cannot compare images of {size} ({_short(error)}); expected the inputs "
-                f"{' and '.join(INPUTS)} of [1, 3, height, width], with free height and width"
+                f"{' and '.join(INPUTS)} of [1, 3, height, width], with dynamic height and width"
             ) from error
         if output.size != 1 or output.dtype.kind != "f" or not np.isfinite(output).all():
             raise ConfigError(
@@ -73,7 +73,7 @@ class Lpips:
         return float(output.ravel()[0])
 
     def origin(self) -> dict[str, str]:
-        """Return input range and network; only values with the same of both are comparable."""
+        """Return the input range and the network; values are only comparable if both are the same."""
         return {"lpips_input": self.inputs, "lpips_model": f"{self.path.name} sha256:{self.digest[:16]}"}
 
     def _planes(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -92,7 +92,7 @@ Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # Wang et al. 2003, finest scale first
-RADIUS, SIGMA = 5, 1.5  # window of 11 x 11
+RADIUS, SIGMA = 5, 1.5  # px, of the 11 x 11 window
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -124,7 +124,7 @@ class Perceptual:
         return values
 
     def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-        """Return means over views with the keys of metrics.json, and the reason for each missing value."""
+        """Average values over views, with the keys of metrics.json, and the reasons for missing values."""
         averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
         if "ms_ssim" in self.names:
             averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
@@ -136,9 +136,9 @@ class Perceptual:
 
 
 def metric_names(names: Sequence[str]) -> list[Metric]:
-    """Return the names as metrics.  Raises ConfigError for an unknown one."""
+    """Return the metrics with these names, in fixed order.  Raises ConfigError for an unknown name."""
     if unknown := [name for name in names if name not in METRICS]:
-        raise ConfigError(f"no metric named '{unknown[0]}'; there are {', '.join(METRICS)}")
+        raise ConfigError(f"unknown metric '{unknown[0]}'; expected one of {', '.join(METRICS)}")
     return [name for name in METRICS if name in names]
 
 
@@ -156,11 +156,11 @@ def ms_ssim_scales(image: Image) -> int:
 def ms_ssim(image: Image, photograph: Image) -> float | None:
     """Return the multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
 
-    For each channel, the product over scales of the mean contrast-structure factor, at the coarsest scale times the
-    luminance factor, to the power of the scale's weight; then the mean of the channels.  Each scale is
-    the one before, averaged over 2 x 2 pixels.  Means are over the pixels whose 11 x 11 Gaussian window is inside the
-    image; a negative mean counts as 0.  Images with a side below 176 px have fewer scales, whose weights are
-    renormalized.  Returns None if not even one scale fits.
+    For each channel, it is the product over scales of the mean contrast-structure factor (at the coarsest scale times
+    the luminance factor) to the power of the scale's weight; the result is the mean over channels.  Each scale averages
+    2 x 2 pixels of the previous one.  Means are over pixels whose 11 x 11 Gaussian window is inside the image; negative
+    means count as 0.  Images with a side below 176 px have fewer scales, whose weights are renormalized.  Returns None
+    if not even one scale fits.
     """
     scales = ms_ssim_scales(image)
     if scales == 0:
@@ -170,15 +170,15 @@ def ms_ssim(image: Image, photograph: Image) -> float | None:
     product = np.ones(3)
     for scale, weight in enumerate(weights):
         if scale > 0:
-            x, y = _halved(x), _halved(y)
+            x, y = _halve(x), _halve(y)
         luminance, structure = _ssim_factors(x, y)
         similarity = structure * luminance if scale == scales - 1 else structure
         product *= np.maximum(similarity.mean(axis=(0, 1)), 0) ** weight
     return float(product.mean())
 
 
-def _halved(image: Floats) -> Floats:
-    """Average 2 x 2 pixels; an odd last row or column is dropped."""
+def _halve(image: Floats) -> Floats:
+    """Average squares of 2 x 2 pixels, without an odd last row or column."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     even = image[:height, :width]
     mean: Floats = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
@@ -186,7 +186,7 @@ def _halved(image: Floats) -> Floats:
 
 
 def ssim_map(image: Image, photograph: Image) -> Floats:
-    """Return the structural similarity of every pixel and channel, with zeros around the image, as in training."""
+    """Return the structural similarity of every pixel and channel, with zero padding as in training."""
     padding = ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0))
     luminance, structure = _ssim_factors(np.pad(image / 255.0, padding), np.pad(photograph / 255.0, padding))
     return luminance * structure
@@ -218,7 +218,7 @@ def _flip_package() -> ModuleType:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ConfigError("metric flip: its package is not installed; pip install 'clsplat[metrics]'") from error
+        raise ConfigError("metric flip: needs a package; pip install 'clsplat[metrics]'") from error
     return flip_evaluator  # type: ignore[no-any-return]
 
 

@@ -1,4 +1,4 @@
-"""Measure a model at the views of a scene, and average the metrics."""
+"""Measure a model on the views of a scene, and average the metrics."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,8 +24,8 @@ from clsplat.scene.view import View, load_mask
 
 # Static parts of a dynamic scene: PSNR of static pixels, and flicker.
 
-STILL = 3.0  # levels of standard deviation: camera noise; motion gives more
-MAX_CAMERAS = 8  # whose sums are held, 48 bytes per pixel each
+STILL = 3.0  # levels; a larger standard deviation is motion, not camera noise
+MAX_CAMERAS = 8  # with sums in memory, 48 bytes per pixel each
 MIN_TIMESTAMPS = 2
 FLICKER, OF_PHOTOGRAPHS, STATIC, SHARE = "flicker", "flicker_photographs", "psnr_static", "static_share"
 
@@ -57,12 +57,12 @@ class Station:
     views: list[str] = field(default_factory=list)
     renders: Spread = field(default_factory=Spread)
     photographs: Spread = field(default_factory=Spread)
-    counted: Mask | None = None  # static by the file, and counted by the masks of all timestamps
+    counted: Mask | None = None  # static according to the file, and unmasked at all timestamps
     has_static_file: bool = False
 
 
 class Stillness:
-    """Gathers the views of a measurement by camera; cameras with one timestamp, or that move, are ignored."""
+    """Gathers views by camera to measure flicker; moving cameras and cameras with one timestamp are ignored."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""
@@ -71,47 +71,47 @@ class Stillness:
 
     @property
     def held(self) -> int:
-        """The number of cameras whose sums are held."""
+        """The number of cameras whose sums are in memory."""
         return len(self._stations)
 
     def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
         """Add a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels, if a file marks them."""
-        still = static_pixels(view)
-        known = still if counted is None else counted if still is None else still & counted
+        static = static_pixels(view)
+        mask = static if counted is None else counted if static is None else static & counted
         if view.time is not None:
-            self._gather(view, rendered, photograph, known, still is not None)
-        if still is None or known is None or not known.any():
+            self._gather(view, rendered, photograph, mask, static is not None)
+        if static is None or mask is None or not mask.any():
             return {}
-        return {STATIC: psnr(rendered, photograph, known)}
+        return {STATIC: psnr(rendered, photograph, mask)}
 
-    def _gather(self, view: View, rendered: Image, photograph: Image, known: Mask | None, has_file: bool) -> None:
+    def _gather(self, view: View, rendered: Image, photograph: Image, mask: Mask | None, has_file: bool) -> None:
         if (station := self._stations.get(camera_key(view))) is None:
             return
         station.views.append(view.name)
         station.renders.add(rendered)
         station.photographs.add(photograph)
         station.has_static_file |= has_file
-        if known is not None:
-            station.counted = known if station.counted is None else station.counted & known
+        if mask is not None:
+            station.counted = mask if station.counted is None else station.counted & mask
 
     def figures(self) -> dict[str, dict[str, float]]:
-        """Return the flicker of each view's camera by the name of the view; none for cameras with one timestamp."""
+        """Return the flicker of each view's camera, by view name; empty for cameras with one timestamp."""
         figures = dict[str, dict[str, float]]()
         for station in self._stations.values():
             if station.renders.count < MIN_TIMESTAMPS:
                 continue
             rendered, captured = station.renders.deviation(), station.photographs.deviation()
-            still = np.ones(rendered.shape[:2], bool) if station.counted is None else station.counted
+            static = np.ones(rendered.shape[:2], bool) if station.counted is None else station.counted
             if not station.has_static_file:
-                still = still & (captured.max(axis=2) <= STILL)
-            if still.any():
-                values = {FLICKER: float(rendered[still].mean()), OF_PHOTOGRAPHS: float(captured[still].mean())}
-                figures |= {name: {**values, SHARE: float(still.mean())} for name in station.views}
+                static = static & (captured.max(axis=2) <= STILL)
+            if static.any():
+                values = {FLICKER: float(rendered[static].mean()), OF_PHOTOGRAPHS: float(captured[static].mean())}
+                figures |= {name: {**values, SHARE: float(static.mean())} for name in station.views}
         return figures
 
 
 def static_pixels(view: View) -> Mask | None:
-    """Return which pixels of a view are static, [H, W]; None if no file says so."""
+    """Return the mask of a view's static pixels, [H, W], or None without a file."""
     if view.static_path is None:
         return None
     return load_mask(replace(view, mask_path=view.static_path, alpha="transparency"))
@@ -125,8 +125,8 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 # PSNR of a render after a color transform fitted to its photograph.
 
-NOTABLE_GAIN = 1.0  # dB by which a color transform must raise PSNR for the log to say why
-MIN_SLOPE = 1e-3  # of a regression that is divided by
+NOTABLE_GAIN = 1.0  # dB; if a color transform increases PSNR by more, the log explains it
+MIN_SLOPE = 1e-3  # of a regression, by which the image is divided
 # Usable pixels per fitted parameter: p parameters fitted to n independent errors add p / n of their variance to the
 # error elsewhere, here 1 / 64, which is 0.07 dB.
 PIXELS = 64
@@ -138,16 +138,16 @@ class Fitted(Protocol):
     numbers_per_channel: ClassVar[int]  # parameters per channel that `fit_matrix` fits
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], that fits an image to a photograph, pixels [M, 3]."""
+        """Return the matrix, [3, 4], that fits an image to a photograph.  Both: pixels, [M, 3]."""
 
 
 class Gains:
-    """Gains of red, green and blue."""
+    """Gains of red, green, and blue."""
 
     numbers_per_channel: ClassVar[int] = 1
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares, pixels [M, 3]."""
+        """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares."""
         squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
         gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
         return np.column_stack([np.diag(gains), np.zeros(3)])
@@ -158,38 +158,38 @@ def color_figures(
 ) -> dict[str, float]:
     """Return `psnr_color` and `psnr_affine`, dB, of a render and a photograph, [height, width, 3].
 
-    mask: pixels that count, [height, width].  `psnr_color` is missing if a half has too few pixels for the fit.  NaN in
-    the render counts as black, infinity as white or black.
+    mask: pixels that count, [height, width].  `psnr_color` is missing if a half has too few pixels to fit.  NaN in the
+    render counts as black, infinity as white or black.
     """
     truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
-    changed = in_colors_of(finite, photograph, counted, model)
-    corrected = corrected_by_regression(finite, truth, counted)
-    color = {} if changed is None else {"psnr_color": psnr(changed, photograph, counted)}
+    fitted = fit_colors(finite, photograph, counted, model)
+    corrected = correct_by_regression(finite, truth, counted)
+    color = {} if fitted is None else {"psnr_color": psnr(fitted, photograph, counted)}
     return {**color, "psnr_affine": psnr(corrected, photograph, counted)}
 
 
 def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Average the results of color_figures over views, with the keys of metrics.json.
 
-    If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` says why; if
-    none has, `psnr_color` is None.
+    If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` has the reason; if
+    no view has it, `psnr_color` is None.
     """
-    averages, has = means(rows), [row for row in rows if "psnr_color" in row]
-    if not averages or len(has) == len(rows):
+    averages, fitted = means(rows), [row for row in rows if "psnr_color" in row]
+    if not averages or len(fitted) == len(rows):
         return averages
-    reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colors to"
-    return {"psnr_color": None, **averages, "psnr_color_views": len(has), "psnr_color_reason": reason}
+    reason = f"{len(rows) - len(fitted)} of {len(rows)} views have a half with too few pixels to fit colors to"
+    return {"psnr_color": None, **averages, "psnr_color_views": len(fitted), "psnr_color_reason": reason}
 
 
-def in_colors_of(
+def fit_colors(
     image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: Fitted
 ) -> NDArray[np.float64] | None:
-    """Transform each half of the image, left and right, by the colors fitted on the other half.
+    """Transform the left and right halves of an image by the color model fitted to the other half.
 
-    Pixels that are black or white in the photograph are not used for the fit.  Returns None if a half has fewer than
-    PIXELS others per fitted parameter; this depends only on the photograph and the mask, so that models are compared on
-    the same views.  Pixels beyond white in the image are not used either, if enough others remain.
+    The fit does not use pixels that are black or white in the photograph.  Returns None if a half has fewer than PIXELS
+    usable pixels per parameter; this depends only on the photograph and the mask, so that models are compared on the
+    same views.  Pixels brighter than white in the image are not used either, if enough others remain.
     """
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
     middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
@@ -205,9 +205,7 @@ def in_colors_of(
     return changed
 
 
-def corrected_by_regression(
-    image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask
-) -> NDArray[np.float64]:
+def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask) -> NDArray[np.float64]:
     """Return (image - b) / a of each channel, where a truth + b is fitted to the image (gsplat).
 
     Noise makes the slope `a` too small, so this is not the least-squares correction of the image.
@@ -226,33 +224,33 @@ def log_color_figures(averages: dict[str, Any]) -> None:
     """Log the metrics of a split after color fitting, if there are any."""
     if "psnr_color" not in averages:
         return
-    figure, reason = averages["psnr_color"], averages.get("psnr_color_reason")
-    if figure is None:
+    psnr_color, reason = averages["psnr_color"], averages.get("psnr_color_reason")
+    if psnr_color is None:
         LOG.warning("no PSNR in the photographs' colors: %s", reason)
     elif reason:
         LOG.warning(
             "in the photographs' colors: PSNR %.2f dB, the mean of %s: %s",
-            *(figure, pluralize(averages["psnr_color_views"], "view"), reason),
+            *(psnr_color, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
-        differ = figure - averages["psnr"] > NOTABLE_GAIN
-        why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
-        LOG.info("in the photographs' colors: PSNR %.2f dB%s", figure, why)
+        is_notable = psnr_color - averages["psnr"] > NOTABLE_GAIN
+        note = "; the photographs' exposures differ, which PSNR counts as errors" if is_notable else ""
+        LOG.info("in the photographs' colors: PSNR %.2f dB%s", psnr_color, note)
 
 
-# PSNR of a dynamic scene, separately for timestamps in and not in the training views.
+# PSNR of a dynamic scene, separately for timestamps of training views and others.
 
 HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 
 
 def by_moment(psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]) -> dict[str, dict[str, float]]:
-    """Return the PSNR of views, dB, by name, keyed by whether their timestamp is one of the training views.
+    """Return the PSNR of views, dB, by name, under a key for timestamps of training views or for others.
 
     Empty if all views are of one kind, as in static scenes.
     """
-    known, times = set(distinct_times(trained)), {view.name: view.time for view in views}
-    kinds = {name: OTHERS if time in known else HELD_OUT for name, time in times.items() if time is not None}
-    if not known or {kinds.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
+    trained_times, times = set(distinct_times(trained)), {view.name: view.time for view in views}
+    kinds = {name: OTHERS if time in trained_times else HELD_OUT for name, time in times.items() if time is not None}
+    if not trained_times or {kinds.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
         return {}
     return {name: {kinds[name]: value} for name, value in psnr.items()}
 
@@ -287,7 +285,7 @@ class ViewMetrics:
 
 
 def render_view(painter: Painter, camera: DeviceCamera) -> Image:
-    """Render to 8 bits, [height, width, 3]: clamped to [0, 1] and rounded to nearest."""
+    """Render to an 8-bit image, [height, width, 3], clamped and rounded to nearest."""
     return to_8_bits(render_floats(painter, camera))
 
 
@@ -330,7 +328,7 @@ def measure(
     counted: Iterable[View] | None = None,
     trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:
-    """Return the metrics of every view.
+    """Measure every view; return its metrics.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  finite: raise NumericError
     for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
@@ -371,9 +369,9 @@ def measure(
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
-    """Return means over views, with the keys of metrics.json."""
+    """Average metrics over views, with the keys of metrics.json.  Raises DataError without views."""
     if not results:
-        raise DataError("no view can be measured, since the masks exclude every pixel; fix the masks")
+        raise DataError("no view can be measured, since masks exclude all pixels; fix the masks")
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
@@ -385,17 +383,17 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
     }
 
 
-# The distributions of size, anisotropy and opacity over the Gaussians of a model.
+# The distributions of size, anisotropy, and opacity over the Gaussians of a model.
 
-SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
-    """Return quantiles, at SHARES: size (rms scale, scene units), anisotropy (longest by shortest axis), opacity."""
+    """Return the QUANTILES of size (RMS scale, scene units), anisotropy (longest by shortest axis), and opacity."""
     log_scales = gaussians.get("log_scales").astype(np.float64)
     columns = {
         "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),
         "anisotropy": np.exp(log_scales.max(axis=1) - log_scales.min(axis=1)),
         "opacity": 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0]),
     }
-    return {name: [float(value) for value in np.quantile(column, SHARES)] for name, column in columns.items()}
+    return {name: [float(value) for value in np.quantile(column, QUANTILES)] for name, column in columns.items()}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.transforms import PhotographTransform, Planes
-from clsplat.render.camera import DeviceCamera, placed_camera, upload_camera
+from clsplat.render.camera import DeviceCamera, update_camera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background
@@ -114,7 +114,7 @@ class Photographs:
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
         cached = self._held.get(_key(view))
-        return placed_camera(cached.camera, view) if cached else upload_camera(self.device, view)
+        return update_camera(cached.camera, view) if cached else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view, with the view's current camera.
@@ -130,7 +130,7 @@ class Photographs:
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
             transparency = None if shows is None else self.device.upload(shows)
             photograph = Photograph(self.camera(view), self.device.upload(colors), mask_on_device, empty, transparency)
-        elif (camera := placed_camera(photograph.camera, view)) is not photograph.camera:
+        elif (camera := update_camera(photograph.camera, view)) is not photograph.camera:
             photograph = replace(photograph, camera=camera)
         self._held[key] = photograph
         return photograph

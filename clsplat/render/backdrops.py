@@ -1,4 +1,4 @@
-"""Settings of `model.background`: what is rendered behind the Gaussians."""
+"""Define the settings of `model.background`, which is rendered behind the Gaussians."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -10,16 +10,16 @@ from clsplat.gaussians.sky import SIDES
 
 
 class Backdrop(Settings):
-    """What is behind the Gaussians."""
+    """The background behind the Gaussians."""
 
     @property
     def sky(self) -> "EnvironmentMap | None":
-        """The settings of the learned sky; None without one."""
+        """The settings of the learned sky, or None."""
         return None
 
 
 class EnvironmentMap(Backdrop):
-    """Learn a color for each direction together with the Gaussians: a sky, infinitely far away.
+    """Learn a sky: a color for each direction, infinitely far away, together with the Gaussians.
 
     A pixel has the color C + T b, where C is the blended color of the Gaussians, T their transmittance, and b the map's
     color in the direction of the pixel's ray.  The map is octahedral with bilinear interpolation, and has its own Adam.
@@ -32,13 +32,13 @@ class EnvironmentMap(Backdrop):
 
     type: Literal["envmap"] = "envmap"
     side: Annotated[int, Field(ge=SIDES[0], le=SIDES[1])] = 64
-    """Texels along a side of the square map; at 64 they are 3 degrees apart."""
+    """Number of texels along a side of the square map; with 64, they are 3 degrees apart."""
     rate: NonNegative = 5.0e-3
     """Learning rate of the colors; by step."""
     cover: NonNegative = 0.05
-    """Weight of the loss on Gaussians in front of the sky: mean over the image of alpha in pixels of sky; by step."""
+    """Weight of the loss on Gaussians in front of the sky: mean over the image of the alpha of sky pixels; by step."""
     difference: NonNegative = 0.05
-    """Largest difference between pixel and map, mean over channels, at which a pixel shows the sky; by step."""
+    """Difference between pixel and map, averaged over channels, below which a pixel shows the sky; by step."""
 
     @property
     def sky(self) -> "EnvironmentMap":
@@ -59,16 +59,16 @@ class Auto(Backdrop):
     model: EnvironmentMap = EnvironmentMap()
     """The sky to learn."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.15
-    """Share of the upper third of a photograph that must be sky for the photograph to count."""
+    """Fraction of the upper third of a photograph that must be sky for the photograph to count."""
     photographs: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the photographs that must count."""
+    """Fraction of the photographs that must count."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: whether a sky is learned."""
     reason: str = ""
-    """Written by a run: why."""
+    """Written by a run: the reason for the choice."""
 
     def parts(self) -> dict[str, Any]:
-        return {}  # no conflict is an error: a run chooses no sky instead
+        return {}  # conflicts are not errors, since a run then chooses no sky
 
     @property
     def sky(self) -> EnvironmentMap | None:

@@ -11,7 +11,7 @@ from clsplat.opencl.device import Array, Device, constants
 from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
-TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # to a side
+TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # per side
 PIXELS_MAX = 2**30  # in whole tiles: kernels index up to four planes of an image in 32 bits
 
 # camera_t of cl_kernels/common.h
@@ -28,7 +28,7 @@ CAMERA = np.dtype(
 
 @dataclass(frozen=True)
 class DeviceCamera:
-    """A view's camera on the device, with the size of its planes: whole tiles."""
+    """A view's camera on the device, with the size of its planes, in whole tiles."""
 
     array: Array  # [1] camera_t
     width: int
@@ -36,8 +36,8 @@ class DeviceCamera:
     tiles_x: int
     tiles_y: int
     tile: int
-    view: int | None = None  # its index in the table HIDDEN; None draws every Gaussian
-    time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are shown
+    view: int | None = None  # index in the table HIDDEN; None renders all Gaussians
+    time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are rendered
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property
@@ -46,21 +46,21 @@ class DeviceCamera:
 
     @property
     def stride(self) -> int:
-        """Columns of a plane."""
+        """The number of columns of a plane."""
         return self.tiles_x * self.tile
 
     @property
     def rows(self) -> int:
-        """Rows of a plane."""
+        """The number of rows of a plane."""
         return self.tiles_y * self.tile
 
     def plane_arguments(self) -> dict[str, int]:
-        """Return the sizes for kernels on planes, by the names of their arguments."""
+        """Return the plane sizes as kernel arguments, by name."""
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
 def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
-    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`; the planes stay."""
+    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`; the size of planes does not change."""
     values = camera.values.copy()
     for name in ("fx", "fy"):
         values[name] = float(values[name]) * zoom
@@ -71,8 +71,8 @@ def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zo
     return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
 
 
-def placed_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
-    """Return the camera of a view with the size of an uploaded one, which is reused if its values are equal."""
+def update_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
+    """Upload the camera of a view with the same size as `camera`; return `camera` itself if its values are equal."""
     values = camera_values(view, camera.tile)
     if values == camera.values:
         return camera
@@ -100,12 +100,12 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
     if max(tiles_x, tiles_y) > TILES_MAX:
         raise DataError(
             f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {TILES_MAX * tile} "
-            "to a side on this device: downscale the image"
+            "per side on this device; downscale the image"
         )
     if tiles_x * tiles_y * tile**2 > PIXELS_MAX:
         raise DataError(
             f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {PIXELS_MAX:,} in "
-            f"whole tiles of {tile}x{tile}: downscale the image"
+            f"whole tiles of {tile}x{tile}; downscale the image"
         )
     margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
     margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)

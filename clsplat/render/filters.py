@@ -1,7 +1,7 @@
 """Define the settings of `model:`: the degree of the harmonics, and two low-pass filters.
 
 A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
-filter is three numbers of the model.  Rendering only reads these numbers and does not know the filters.
+filter is three numbers of the model.  Rendering reads only these numbers, and does not depend on the filters.
 """
 
 from abc import abstractmethod
@@ -26,7 +26,7 @@ BOX_VARIANCE = 1 / 12  # px²
 
 
 class FilterViews:
-    """The cameras that sample the Gaussians, on the device, [V] camera_t, and their focal lengths, [V] px."""
+    """The cameras of training views on the device, [V] camera_t, and their focal lengths, [V] px."""
 
     def __init__(self, device: Device, views: Sequence[View]) -> None:
         tile = int(device.tuning["TILE"])
@@ -34,7 +34,7 @@ class FilterViews:
         self.focal: NDArray[np.float32] = np.array([view.camera.fx for view in views], np.float32)
 
 
-AT_REST = {"motion": "it reads Gaussians where they are at their own time, not at that of a view"}
+AT_REST = {"motion": "it uses the positions of Gaussians at their time centers, not at the time of a view"}
 
 
 class WorldFilter(Settings):
@@ -42,7 +42,7 @@ class WorldFilter(Settings):
 
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
-        """Write `filter_variance`, [S] scene units², for the current means.  near: smallest depth, scene units."""
+        """Write `filter_variance`, [S] scene units², for the current means.  near: minimum depth, scene units."""
 
 
 class NoWorldFilter(WorldFilter):
@@ -58,17 +58,17 @@ class Smoothing(WorldFilter):
     """Blur Gaussians to the training views' resolution (3D smoothing filter of Mip-Splatting, Yu et al. 2024).
 
     A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` takes the smallest
-    such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
+    such interval (eq. 6); `global_max` uses the smallest z and the largest f of all views, as in the paper's code.
     """
 
     conflicts: ClassVar[Mapping[str, str]] = {
-        "motion": f"{AT_REST['motion']}; set model.world_filter: none, or leave model.time out"
+        "motion": f"{AT_REST['motion']}; set model.world_filter: none, or remove model.time"
     }
     type: Literal["smoothing"] = "smoothing"
     variance: Annotated[float, Field(ge=0)] = 0.2
     """Variance added to the squared scales, in sampling intervals²."""
     focal: Literal["per_camera", "global_max"] = "per_camera"
-    """Focal length of the interval: of each view, or the largest of all."""
+    """Focal length for the interval: that of each view, or the largest of all."""
 
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
         focal = np.full_like(views.focal, views.focal.max()) if self.focal == "global_max" else views.focal
@@ -102,9 +102,9 @@ class ScreenFilter(Settings):
 
     pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the two numbers are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
-    """Added to the variance of every splat, px²."""
+    """Variance added to every splat, px²."""
     compensate: Literal[0, 1]
-    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+    """1: reduce the opacity as the area grows, so that a splat keeps its energy."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **values: Any) -> None:
@@ -123,9 +123,9 @@ class Dilation(ScreenFilter):
 
     type: Literal["dilation"] = "dilation"
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
-    """Added to the variance of every splat, px²."""
+    """Variance added to every splat, px²."""
     compensate: Literal[0, 1] = 0
-    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+    """1: reduce the opacity as the area grows, so that a splat keeps its energy."""
 
 
 class Ewa(ScreenFilter):
@@ -133,9 +133,9 @@ class Ewa(ScreenFilter):
 
     type: Literal["ewa"] = "ewa"
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
-    """Added to the variance of every splat, px²."""
+    """Variance added to every splat, px²."""
     compensate: Literal[0, 1] = 1
-    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+    """1: reduce the opacity as the area grows, so that a splat keeps its energy."""
 
 
 class Mip(ScreenFilter):
@@ -143,12 +143,12 @@ class Mip(ScreenFilter):
 
     type: Literal["mip"] = "mip"
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.1
-    """Added to the variance of every splat, px²."""
+    """Variance added to every splat, px²."""
     compensate: Literal[0, 1] = 1
-    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+    """1: reduce the opacity as the area grows, so that a splat keeps its energy."""
 
 
-def _of_a_box(variance: float) -> float:
+def _require_box_variance(variance: float) -> float:
     if variance != BOX_VARIANCE:
         raise ValueError(f"'box' has a fixed variance of {BOX_VARIANCE}; write `screen_filter: box`")
     return variance
@@ -157,36 +157,36 @@ def _of_a_box(variance: float) -> float:
 class BoxFilter(ScreenFilter):
     """Integrate every splat over the box of each pixel, instead of evaluating it at the pixel's center.
 
-    For splats larger than a pixel this is close to a Gaussian blur with the box's variance, 1/12 px², which programs
+    For splats larger than a pixel, this is close to a Gaussian blur with the box's variance, 1/12 px², which programs
     without a box filter use instead.  The integral is in `cl_kernels/pixel_box.h`.
     """
 
     pixel_box: ClassVar[bool] = True
     type: Literal["box"] = "box"
-    variance: Annotated[float, AfterValidator(_of_a_box)] = BOX_VARIANCE
-    """Of the box, px²: for programs that draw a Gaussian blur instead.  Only this value."""
+    variance: Annotated[float, AfterValidator(_require_box_variance)] = BOX_VARIANCE
+    """Variance of the box, px², for programs that use a Gaussian blur instead; it cannot be changed."""
     compensate: Literal[1] = 1
-    """As `variance`: a box keeps the energy of a splat."""
+    """A box keeps the energy of a splat; it cannot be changed."""
 
 
 class Motion(Settings):
-    """How Gaussians move and fade over the time of a scene: a polynomial, and a bell curve of their opacity."""
+    """Motion of Gaussians over the time of a scene: polynomial positions, and opacities that follow a bell curve."""
 
     family: ClassVar[str] = "motion"
 
     degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)] = 1
-    """Degree of the polynomial in time that a mean follows: 1 in FreeTimeGS, 3 in Spacetime Gaussians."""
+    """Degree of the polynomial in time for means: 1 in FreeTimeGS, 3 in Spacetime Gaussians."""
     rotation: bool = False
-    """Whether Gaussians turn too, at a constant rate."""
+    """Whether Gaussians also rotate, at a constant rate."""
 
     @property
     def width(self) -> int:
-        """Columns of the table of the motion."""
+        """The number of columns of the motion table."""
         return motion_width(self.degree, self.rotation)
 
 
 class ModelSettings(Settings):
-    """How Gaussians are rendered."""
+    """Settings for rendering Gaussians."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"near_auto"})
 
@@ -205,16 +205,16 @@ class ModelSettings(Settings):
     screen_filter: OneOf[ScreenFilter] = Dilation()
     """Blur of splats in the image."""
     background: OneOf[Backdrop] | None = None
-    """What is behind the Gaussians: `envmap`, a learned sky, or `auto`; by default `scene.background`."""
+    """Background behind the Gaussians: `envmap`, a learned sky, or `auto`; default: `scene.background`."""
     time: Motion | None = None
-    """How Gaussians move, in a scene whose views have times; without it, they stand still."""
+    """Motion of Gaussians, in a scene whose views have times; default: they do not move."""
 
     @property
     def sky(self) -> EnvironmentMap | None:
-        """The settings of the learned sky; None without one, or while `auto` has not chosen."""
+        """The settings of the learned sky; None if there is none, or `auto` has not chosen yet."""
         return self.background.sky if self.background else None
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
-        """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
+        """Return the Gaussians with the numbers of these settings.  degree: the active SH degree."""
         assert self.near != "auto"  # a run chooses it before its first stage
         return DeviceModel(gaussians, degree, self.near, *self.screen_filter.numbers())

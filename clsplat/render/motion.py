@@ -14,13 +14,13 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 
 LOG = logging.getLogger("clsplat")
-FIRST = 0.0  # timestamp for cameras without a time
+DEFAULT_TIME = 0.0  # for cameras without a time
 
 
-def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:
+def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:
     """Return the model at the time of a camera, in memory that the next call reuses; a static model is unchanged.
 
-    A camera without a time shows the first timestamp, with one warning.
+    A camera without a time shows the first timestamp, and a warning is logged once.
     """
     gaussians = model.gaussians
     if not gaussians.is_moving:
@@ -46,7 +46,7 @@ def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) ->
     return replace(model, gaussians=_with_tables(gaussians, moved))
 
 
-def to_centers(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
+def backpropagate_motion(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
     """Convert gradients of the model at the time of a camera to those of the model and its motion, in place."""
     gaussians = model.gaussians
     if not gaussians.is_moving:
@@ -70,7 +70,7 @@ def _arguments(gaussians: Gaussians, camera: DeviceCamera) -> dict[str, Any]:
     return {
         "items": -(-gaussians.count // int(gaussians.device.tuning["LANES"])),
         "motion": gaussians[MOTION],
-        "time": FIRST if camera.time is None else camera.time,
+        "time": DEFAULT_TIME if camera.time is None else camera.time,
         "stride": gaussians.capacity,
         "count": gaussians.count,
     }
@@ -97,6 +97,6 @@ def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
 @cache
 def _warn_of_first_timestamp() -> None:
     LOG.warning(
-        "a view without a time shows a moving model at its first timestamp; set `--time T` in commands, `View.time` in "
-        "Python"
+        "a view without a time shows a moving model at its first timestamp; set `--time T` in commands, or `View.time` "
+        "in Python"
     )

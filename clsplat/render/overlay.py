@@ -14,10 +14,10 @@ from clsplat.render.workspace import Workspace
 class OverlayLayer:
     """A layer composited over an image; valid until the next layer."""
 
-    frame: Frame  # of only the layer, over black
+    frame: Frame  # of the layer only, over black
     image: Array  # composite, [3 or 4, rows, stride]
     behind: Array  # T dL/dT of the loss on the layer's alpha, [1, rows, stride]
-    loss: Callable[[], float]  # its value; waits for the device
+    loss: Callable[[], float]  # returns the value of that loss; waits for the device
 
 
 def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:

@@ -1,4 +1,4 @@
-"""Define the interface that renders views, of Gaussians as well as of fields."""
+"""Define the interface of renderers, for Gaussians and fields."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,9 +17,9 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendered view on the host: color, alpha and depth."""
+    """A rendered view on the host: color, alpha, and depth."""
 
-    image: Floats  # [height, width, 3], background included
+    image: Floats  # [height, width, 3], with background
     alpha: Floats  # [height, width] in [0, 1]
     depth: Floats | None  # [height, width] scene units, alpha-weighted mean; 0 where alpha is 0
 
@@ -32,7 +32,7 @@ class Layers:
 def layers(
     rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array, depth: bool = False
 ) -> Layers:
-    """Render a view.  background: [3]; depth takes another pass."""
+    """Render a view.  background: [3]; depth: render it too, in a second pass."""
     frame = rasterizer.forward(model, camera, background)
     image = inside(frame, frame.image.get())
     alpha = inside(frame, 1 - np.abs(frame.transmittance.get()[None]))[:, :, 0]
@@ -40,7 +40,7 @@ def layers(
 
 
 def inside(frame: Frame, planes: Floats) -> Floats:
-    """[channels, rows, stride] -> [height, width, channels]."""
+    """Crop planes, [channels, rows, stride], to the image; return [height, width, channels]."""
     return np.ascontiguousarray(planes[:, : frame.camera.height, : frame.camera.width].transpose(1, 2, 0))
 
 
@@ -53,22 +53,22 @@ def _depth(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> 
 
 
 class Painter(Protocol):
-    """Renders the view of a camera, at any size."""
+    """A renderer of the views of cameras of any size."""
 
     @property
     def workspace(self) -> Workspace:
-        """Device memory that renders reuse."""
+        """Device memory that is reused between renders."""
 
     def paint(self, camera: DeviceCamera) -> Array:
-        """Return the render, [3, rows, stride], not clamped; valid until the next one."""
+        """Return the render, [3, rows, stride], not clamped; valid until the next render."""
 
     def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        """Return the render on the host, with alpha, and with depth on request."""
+        """Return the render on the host, with alpha, and with depth if requested."""
 
 
 @dataclass(frozen=True)
 class SplatPainter:
-    """Paints Gaussians before a background, [3] in [0, 1]."""
+    """A renderer of Gaussians over a background color, [3] in [0, 1]."""
 
     rasterizer: Rasterizer
     model: DeviceModel

@@ -1,4 +1,4 @@
-"""Render Gaussians to an image, and compute their gradients from the gradient of the image."""
+"""Render Gaussians, and compute their gradients from the gradient of the image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -13,12 +13,12 @@ from clsplat.gaussians.sh_offload import slot_arguments
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.motion import at_moment, to_centers
+from clsplat.render.motion import backpropagate_motion, evaluate_motion
 from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
-# Sum gradient records over the pairs of each Gaussian, including those of the blended inverse depth.
+# Sums of gradient records over the pairs of each Gaussian, including those of the blended inverse depth.
 
 INVERSE_DEPTHS = "inverse_depth_sums"  # in the workspace
 
@@ -31,9 +31,9 @@ def sum_records(
     defines: Mapping[str, int],
     accumulate: int,
 ) -> None:
-    """Write the sums of the records [P, RECORD] of each Gaussian, [PIXEL_SUMS, S].
+    """Sum the records of pairs, [P, RECORD], for each Gaussian, into `pixel_sums`, [PIXEL_SUMS, S].
 
-    defines: contains PIXEL_SUMS unless it is the default; accumulate: 1 adds to the sums.
+    defines: contains PIXEL_SUMS unless it is the default; accumulate: 1 to add to existing sums.
     """
     device = gaussians.device
     device.program("gather.cl", **defines).sum_records(
@@ -51,7 +51,7 @@ def sum_records(
 def sum_inverse_depths(
     workspace: Workspace, pair_sums: Array, lists: TileLists, gaussians: Gaussians, accumulate: int
 ) -> Array:
-    """Return the sum of w dL/dD over the pixels of each Gaussian, [S]; accumulate: 1 adds to the sums."""
+    """Return the sum of w dL/dD over the pixels of each Gaussian, [S].  accumulate: 1 to add to existing sums."""
     sums = workspace.array(INVERSE_DEPTHS, gaussians.capacity)
     workspace.device.program("inverse_depth.cl").sum_inverse_depths(
         items=gaussians.count,
@@ -66,7 +66,7 @@ def sum_inverse_depths(
 
 
 def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splats: Array, grad_means: Array) -> None:
-    """Add the gradient of the inverse depth, from the last sums, to that of the means; splats: [N, RECORD]."""
+    """Add the gradient of the inverse depth, from the last sums, to that of the means.  splats: [N, RECORD]."""
     count, capacity = splats.shape[0], grad_means.shape[1]
     workspace.device.program("inverse_depth.cl").inverse_depth_backward(
         items=count,
@@ -146,38 +146,38 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
 Content = Literal["color", "depth", "entropy", "inverse_depth"]
-# The planes are the color, or (depth of the mean in scene units, 1, 0), or the color and a fourth plane: the entropy of
-# the weights, or the blended inverse depth of the means.
+# The planes are the color; or (depth of the mean in scene units, 1, 0); or the color and a fourth plane: the entropy of
+# blend weights, or the blended inverse depth of the means.
 FOURTH_PLANE: dict[Content, str] = {"entropy": "WEIGHT_ENTROPY", "inverse_depth": "INVERSE_DEPTH"}
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The result of a forward pass, for losses and the backward pass; valid until the next one."""
+    """The result of a forward pass, for losses and the backward pass; valid until the next forward pass."""
 
     camera: DeviceCamera
     splats: Array  # [N, RECORD]
     depth_key: Array  # [S] bits of the depth; all ones if the splat was culled
-    radius: Array  # [S] px, 3 standard deviations; 0: not visible
+    radius: Array  # [S] px, 3 standard deviations; 0 if not visible
     lists: TileLists
     tile_last: Array  # [T] pairs of each tile up to the last one that any pixel blends
     image: Array  # [3, rows, stride], zero outside the image; with a fourth plane [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
-    content: Content  # what was blended
+    content: Content  # of the planes
     drawn: DeviceModel  # the rendered model: a dynamic one at the timestamp of the camera
 
 
 @dataclass(frozen=True)
 class RenderLimits:
-    """Limits on memory and on launches; results do not depend on them."""
+    """Limits on memory and launches; results do not depend on them."""
 
     pairs: int  # (tile, Gaussian) pairs in memory
     tiles: int = 0  # per launch; 0: all
 
 
 class Rasterizer:
-    """Renders one frame at a time; its buffers are reused from frame to frame."""
+    """Renders one frame at a time, and reuses its buffers."""
 
     def __init__(self, device: Device, sort: Sort = "auto", budget: RenderLimits | None = None) -> None:
         self.device = device
@@ -200,7 +200,7 @@ class Rasterizer:
         the same bits.  Raises MemoryLimitError if a single row does not fit.
         """
         sky = model.sky if content != "depth" else None
-        model = at_moment(self.workspace, model, camera)
+        model = evaluate_motion(self.workspace, model, camera)
         catch_up(self.workspace, model, camera)
         while True:
             try:
@@ -211,8 +211,8 @@ class Rasterizer:
             except TooManyPairs as error:
                 if not self._narrow(camera):
                     raise MemoryLimitError(
-                        f"an image of {camera.width}x{camera.height} px: one row of tiles has more than "
-                        f"{MAX_PAIRS:,} pairs of a tile and a Gaussian; use smaller images or fewer Gaussians"
+                        f"an image of {camera.width}x{camera.height} px has a row of tiles with more than "
+                        f"{MAX_PAIRS:,} (tile, Gaussian) pairs; use smaller images, or fewer Gaussians"
                     ) from error
             except MemoryLimitError:
                 if not self._narrow(camera):
@@ -261,7 +261,7 @@ class Rasterizer:
         return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
-        """Return the first tile and the number of tiles of each launch; display watchdogs may limit the time of one."""
+        """Return the first tile and the number of tiles of each launch, which display watchdogs may limit in time."""
         step = self.budget.tiles or band.tiles_inside
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
@@ -289,11 +289,11 @@ class Rasterizer:
         texture: Array | None = None,
         behind: Array | None = None,
     ) -> Array:
-        """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
+        """Return the sums over each Gaussian's pixels from which gradients follow, [count, S] (cl_kernels/splat.h).
 
         grad_image: in the layout of the frame's image, zero outside it.  A `count` above PIXEL_SUMS is slower; texture
-        sums need `texture`, [rows, stride], negative where unknown.  behind: [rows, stride] T dL/dT of a loss on the
-        transmittance T.  Memory as in `forward`.
+        sums need `texture`, [rows, stride], negative if unknown.  behind: [rows, stride] T dL/dT of a loss on the
+        transmittance T.  The memory is limited as in `forward`.
         """
         bands = frame.bands
         while True:
@@ -357,5 +357,5 @@ class Rasterizer:
         )
         if frame.content == "inverse_depth":
             add_inverse_depth_gradient(self.workspace, frame.camera, frame.splats, gradients["means"])
-        to_centers(model, frame.camera, gradients)
+        backpropagate_motion(model, frame.camera, gradients)
         return gradients

@@ -1,4 +1,4 @@
-"""Render the sky and compute its gradients, in runs of pixels (cl_kernels/sky.cl)."""
+"""Render a sky and compute its gradients, for runs of pixels (cl_kernels/sky.cl)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ NUMBERS = constants("sky.cl")
 RUN_WORDS, CORNERS, RUN_SUMS, PLACE_BITS, BORDER = (
     int(NUMBERS[name]) for name in ("RUN_WORDS", "CORNERS", "RUN_SUMS", "PLACE_BITS", "BORDER")
 )
-CACHE_SIZE = 1 << 28  # bytes, of runs on the device
+CACHE_SIZE = 1 << 28  # bytes of runs on the device
 Integers = NDArray[np.int64]
 
 
@@ -36,20 +36,20 @@ class Runs:
         return sum(array.nbytes for array in (self.runs, self.strips, self.shown, self.first_entry, self.entries))
 
 
-def directions_of(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
+def ray_directions(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
     """Return unnormalized ray directions through pixel centers, [height, width, 3], scene axes; values: camera_t."""
-    turn = values["world_to_camera"].reshape(3, 4)[:, :3].astype(np.float64)
+    rotation = values["world_to_camera"].reshape(3, 4)[:, :3].astype(np.float64)
     x = (np.arange(width) + 0.5 - np.float64(values["cx"])) / np.float64(values["fx"])
     y = (np.arange(height) + 0.5 - np.float64(values["cy"])) / np.float64(values["fy"])
-    return np.asarray(x[None, :, None] * turn[0] + (y[:, None, None] * turn[1] + turn[2]))
+    return np.asarray(x[None, :, None] * rotation[0] + (y[:, None, None] * rotation[1] + rotation[2]))
 
 
 def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> Integers:
-    """Return the runs of all rows, [R, RUN_WORDS]: adjacent pixels of a row between the same four texels of an octant.
+    """Return the runs of all rows, [R, RUN_WORDS]: adjacent pixels between the same four texels of an octant.
 
     values: camera_t.
     """
-    rays = directions_of(values, width, height)
+    rays = ray_directions(values, width, height)
     first = np.floor(texel_positions(rays, side)).astype(np.int64)
     bits = (signs(rays) < 0) @ np.array([1, 2, 4])
     key = first[..., 0] + 1 | (first[..., 1] + 1) << PLACE_BITS | bits << 2 * PLACE_BITS
@@ -79,11 +79,11 @@ class Skies:
     def runs(self, camera: DeviceCamera, side: int) -> Runs:
         """Return the runs of a camera; waits for the device if they are not cached."""
         key = camera.array.buffer.int_ptr, side
-        found = self._cache.pop(key, None) or self._compute(camera, side)
-        while self._cache and found.nbytes + sum(runs.nbytes for runs in self._cache.values()) > self._limit:
+        result = self._cache.pop(key, None) or self._compute(camera, side)
+        while self._cache and result.nbytes + sum(runs.nbytes for runs in self._cache.values()) > self._limit:
             self._cache.pop(next(iter(self._cache)))
-        self._cache[key] = found
-        return found
+        self._cache[key] = result
+        return result
 
     def _compute(self, camera: DeviceCamera, side: int) -> Runs:
         values = np.asarray(camera.array.get(), CAMERA)[0]
@@ -124,8 +124,8 @@ class Skies:
     ) -> tuple[Array, Array]:
         """Return T dL/dT of the loss on splats in front of the sky, [1, rows, stride], and row sums of 1 - T, [rows].
 
-        free: [1, side * side], 1 for trained texels, otherwise 0; photograph: [3, rows, stride]; difference: maximum
-        at which a pixel counts as sky; scale: factor of the sums.
+        free: [1, side * side], 1 for trained texels, otherwise 0; photograph: [3, rows, stride]; difference: largest
+        for a pixel that counts as sky; scale: factor of the loss.
         """
         runs, wide = self.runs(camera, sky.side), camera.stride + 2 * BORDER
         matches = self.workspace.array("sky matches", (camera.rows + 2, wide))

@@ -1,8 +1,8 @@
 """List the splats of each tile, front to back.
 
 Two algorithms give the same result.  Radix sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in that
-order, and sorts stably only by tile.  Bitonic emits the pairs in order of index, and sorts each tile by (depth, index).
-Both break ties by index.
+order, and then sorts them stably by tile.  Bitonic emits the pairs in the order of indices, and sorts each tile by
+(depth, index).  Both break ties by index.
 """
 
 import time
@@ -16,9 +16,9 @@ from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # those of the projection
-TRIALS = 3  # of each sort for `auto`
-MAX_SINGLE_GROUP_RUN = 32  # values per item, up to which one group scans everything
-MAX_SCAN_BLOCKS = 1024  # each adds the sums of all blocks before it
+TRIALS = 3  # of each sort, to choose for `auto`
+MAX_SINGLE_GROUP_RUN = 32  # values per item up to which one group scans everything
+MAX_SCAN_BLOCKS = 1024  # each block adds the sums of all blocks before it
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Band:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles of the whole grid."""
+        """Number of tiles in the whole grid."""
         return self.tiles_x * self.tiles_y
 
     @property
@@ -76,7 +76,7 @@ def resolve_sort(device: Device, sort: Sort) -> Sort:
 
 
 class Tiler:
-    """Builds tile lists.  sort: auto is radix on CPUs, and the faster one in the first frame on GPUs."""
+    """Builds tile lists.  sort: auto is radix on CPUs; on GPUs, it is the sort that is faster in the first frame."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace
@@ -96,7 +96,7 @@ class Tiler:
         Raises TooManyPairs if there are more than `limit`.
         """
         if self.sort == "auto":
-            self.sort = self._faster(splats, footprints, band, count, limit, defines)
+            self.sort = self._faster_sort(splats, footprints, band, count, limit, defines)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         large = self._large_arguments(splats, footprints, band, count)
         program = self.device.program("large.cl", **(defines or {}))
@@ -234,7 +234,7 @@ class Tiler:
         bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster(
+    def _faster_sort(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines
     ) -> Sort:
         seconds: dict[Sort, float] = {}

@@ -22,7 +22,7 @@ class Workspace:
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Return an array of that shape; its values are undefined.
 
-        Raises MemoryLimitError if it does not fit, even without room to grow.
+        Raises MemoryLimitError if it does not fit, even without slack.
         """
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
@@ -30,14 +30,14 @@ class Workspace:
         array = self._arrays.get(name)
         if array is None or array.nbytes < length * kind.itemsize:
             grows, array = array is not None, None
-            self._arrays.pop(name, None)  # released before its successor is allocated
+            self._arrays.pop(name, None)  # frees the old buffer before the new one is allocated
             array = self._arrays[name] = (
                 self._allocate_with_slack(length, kind) if grows else self.device.zeros(length, kind)
             )
         return Array(self.device, array.buffer, shape, kind)
 
     def _allocate_with_slack(self, length: int, kind: np.dtype[Any]) -> Array:
-        """Allocate with room to grow, if the device has enough memory."""
+        """Allocate an array with slack for growth, if the device has enough memory."""
         largest = self.device.info.allocation // kind.itemsize
         try:
             return self.device.zeros(max(length, min(int(length * GROWTH), largest)), kind)

@@ -18,7 +18,7 @@ from clsplat.core.files import PIPELINE, write_text
 from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
-from clsplat.metrics.views import SHARES, Gains, ViewMetrics, measure, render_view
+from clsplat.metrics.views import QUANTILES, Gains, ViewMetrics, measure, render_view
 from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS, position_text
 from clsplat.scene.view import View, sample_views
@@ -186,10 +186,10 @@ def gaussians_charts(run: Run) -> list[Markup]:
     lines = run.records.read("distribution")
     if len(lines) < 2:
         return []
-    shares = [f"{share:.0%}" for share in SHARES]
+    labels = [f"{q:.0%}" for q in QUANTILES]
 
     def quantiles(name: str) -> list[Line]:
-        return [Line([(r["step"], r[name][i]) for r in lines], share) for i, share in enumerate(shares)]
+        return [Line([(r["step"], r[name][i]) for r in lines], label) for i, label in enumerate(labels)]
 
     return safe_charts(
         [

@@ -13,8 +13,8 @@ from clsplat.losses.base import (
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
+    checked_value,
     required_content,
-    returned,
 )
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
@@ -118,7 +118,9 @@ class StepTrainer:
             apply_mask(workspace, camera, target, mask)
         for module in data.modules:
             module.before_losses(data)
-        data.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
+        data.losses += [
+            checked_value(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)
+        ]
         data.losses += data.module_losses
         for module in data.modules:
             module.after_losses(data)
@@ -169,6 +171,6 @@ class StepTrainer:
         current = gradients.without_deferred() if is_deferred else gradients
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, current, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
-        view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)
+        view.losses.extend(checked_value(penalty, penalty.add(inputs)) for penalty in penalties)
         self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)
         return gradients.mean2d

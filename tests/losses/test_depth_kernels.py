@@ -144,7 +144,7 @@ def test_training_with_the_loss_approaches_known_depths(device, rng):
 @on_one_setting
 def test_second_fourth_plane_is_refused(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
-    with pytest.raises(ConfigError, match="read entropy and inverse_depth of an image, but only one of them"):
+    with pytest.raises(ConfigError, match="need entropy and inverse_depth of an image, but only one can be"):
         trainer.step(photograph, 1)
     trainer.losses = [L1(), InverseDepth(weight=[[0, 1.0], [5, 0.0]]), WeightEntropy()]
     assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.formats.table import read as read_ply
-from clsplat.metrics.views import SHARES, distribution
+from clsplat.metrics.views import QUANTILES, distribution
 from clsplat.viewer.charts import Line, curve
 from tests.support.runs import train
 
@@ -42,7 +42,7 @@ def test_every_rule_and_penalty_has_an_effect(finished):
         assert 0 < grown <= total if name in growing else grown == 0, name
     found = [line for line in lines if line["kind"] == "distribution"]
     assert found[-1]["step"] == 50
-    assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
+    assert all(len(line["anisotropy"]) == len(QUANTILES) for line in found)
     page = (finished.out / "report.html").read_text()
     assert "anisotropy" in page
     assert re.search("changed by each rule.*split_oversized", page)
@@ -107,6 +107,6 @@ def test_distribution_of_known_gaussians(device, rng):
     case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
     case.parameters["logit_opacity"][:] = 0
     found = distribution(case.model(device).gaussians)
-    np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], SHARES), rtol=1e-6)
+    np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], QUANTILES), rtol=1e-6)
     np.testing.assert_allclose(found["size"][2], np.sqrt(11 / 3), rtol=1e-6)
     assert found["opacity"] == [0.5] * 5

@@ -9,8 +9,8 @@ from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
 from clsplat.metrics.views import (
     PIXELS,
     color_figures,
-    corrected_by_regression,
-    in_colors_of,
+    correct_by_regression,
+    fit_colors,
     log_color_figures,
     mean_figures,
 )
@@ -47,7 +47,7 @@ def test_colors_are_fitted_on_other_pixels_than_measured(image):
     """What is true of one half alone does not help there."""
     photograph = to_8_bits(image)
     photograph[:, :15] = to_8_bits(image[:, :15] * 0.5)
-    changed = in_colors_of(image.astype(np.float64), photograph, all_pixels(image), Gain())
+    changed = fit_colors(image.astype(np.float64), photograph, all_pixels(image), Gain())
     assert changed[:, :15] == pytest.approx(image[:, :15], abs=0.01), "as the right half asks for"
     assert changed[:, 15:] == pytest.approx(0.5 * image[:, 15:], abs=0.01)
 
@@ -57,7 +57,7 @@ def test_white_black_and_masked_pixels_are_not_fitted(image, rng):
     photograph, counted = to_8_bits(truth), rng.random(image.shape[:2]) < 0.8
     assert (photograph == 255).any()
     photograph[~counted] = 128
-    changed = in_colors_of(image.astype(np.float64), photograph, counted, Gain())
+    changed = fit_colors(image.astype(np.float64), photograph, counted, Gain())
     assert changed[counted] == pytest.approx(truth[counted], abs=0.01)
 
 
@@ -88,7 +88,7 @@ def test_views_with_the_metric_do_not_depend_on_the_model(image, model):
 def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
     photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
     bright[:5] = 3
-    changed = in_colors_of(bright, photograph, all_pixels(image), Gain())
+    changed = fit_colors(bright, photograph, all_pixels(image), Gain())
     assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
 
 
@@ -112,7 +112,7 @@ def test_log_reports_the_number_of_averaged_views(caplog):
     log_color_figures({"psnr": 20.0})
     assert not caplog.messages
     for averages, said in (
-        (whole, r"PSNR 24.00 dB; exposures of these photographs differ"),
+        (whole, r"PSNR 24.00 dB; the photographs' exposures differ"),
         ({**whole, "psnr_color_views": 1, "psnr_color_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
         (
             {"psnr": 20.0, "psnr_color": None, "psnr_color_reason": "why"},
@@ -147,6 +147,6 @@ def test_render_is_regressed_on_the_photograph(rng):
     """With noise in the image its slope is too small by nothing, with noise in the photograph by 1 / (1 + noise)."""
     truth = rng.uniform(0.2, 0.8, (60, 60, 3))
     image = 0.5 * truth + 0.1
-    assert corrected_by_regression(image, truth, all_pixels(image)) == pytest.approx(truth)
+    assert correct_by_regression(image, truth, all_pixels(image)) == pytest.approx(truth)
     flat = np.full_like(truth, 0.3)
-    assert corrected_by_regression(flat, truth, all_pixels(flat)) == pytest.approx(flat)
+    assert correct_by_regression(flat, truth, all_pixels(flat)) == pytest.approx(flat)

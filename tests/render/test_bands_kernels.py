@@ -183,5 +183,5 @@ def test_frame_with_more_pairs_than_32_bits_renders_in_bands(device, rng, monkey
 def test_row_of_tiles_with_too_many_pairs_is_refused(device, rng, monkeypatch):
     monkeypatch.setattr("clsplat.render.rasterizer.MAX_PAIRS", 50)
     case = random_case(rng, 300, 60, 70)
-    with pytest.raises(MemoryLimitError, match=r"60x70 px: .*more than 50 .*; use smaller images or fewer"):
+    with pytest.raises(MemoryLimitError, match=r"60x70 px .*more than 50 .*; use smaller images, or fewer"):
         results(device, case, 0.0)

@@ -13,7 +13,7 @@ from clsplat.formats.splats import MOTION, PARAMETERS, STATIC_LOG_DURATION, WIDT
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, ViewGradients
-from clsplat.render.motion import at_moment
+from clsplat.render.motion import evaluate_motion
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting
@@ -55,7 +55,7 @@ def test_image_gradients_reach_the_motion(device, rng):
         return {name: array.get()[:, :65].T.astype(np.float64) for name, array in found.arrays.items()}
 
     model = case.model(device)
-    moment = at_moment(rasterizer.workspace, model, camera).gaussians
+    moment = evaluate_motion(rasterizer.workspace, model, camera).gaussians
     tables = {name: moment.get(name) for name in PARAMETERS}
     static = gradients_of(replace(model, gaussians=Gaussians(device, tables)))
     upstream = static["means"], static["quats"], static["logit_opacity"][:, 0]
@@ -101,7 +101,7 @@ def test_splitting_matrices_belong_to_the_time_of_the_view(device, rng):
     camera, background = case.device_camera(device), device.zeros(3)
     weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))
     rasterizer, found = Rasterizer(device, "radix"), []
-    moment = at_moment(rasterizer.workspace, case.model(device), camera).gaussians
+    moment = evaluate_motion(rasterizer.workspace, case.model(device), camera).gaussians
     static = Gaussians(device, {name: moment.get(name) for name in PARAMETERS})
     for model in (case.model(device), replace(case.model(device), gaussians=static)):
         frame = rasterizer.forward(model, camera, background)

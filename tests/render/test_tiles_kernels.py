@@ -67,7 +67,7 @@ def test_image_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, side):
     view = random_case(rng, 1).view
     largest = replace(view, camera=replace(view.camera, **{side: 4096 * tile}))
     assert camera_values(largest, tile)["tiles_x" if side == "width" else "tiles_y"] == 4096
-    with pytest.raises(DataError, match=rf"view: .*{4096 * tile + 1}.* at most {4096 * tile} to a side"):
+    with pytest.raises(DataError, match=rf"view: .*{4096 * tile + 1}.* at most {4096 * tile} per side"):
         camera_values(replace(view, camera=replace(view.camera, **{side: 4096 * tile + 1})), tile)
 
 

@@ -13,7 +13,7 @@ from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
 from clsplat.methods.dynamic import MotionL2, ShortDuration
 from clsplat.opencl.device import Device
-from clsplat.render.motion import at_moment, to_centers
+from clsplat.render.motion import backpropagate_motion, evaluate_motion
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam
@@ -45,7 +45,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
-    drawn = at_moment(Workspace(device), model, camera).gaussians
+    drawn = evaluate_motion(Workspace(device), model, camera).gaussians
     means, quats, logits = ref.moved(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
     there = np.isfinite(means).all(axis=1)
     actual = drawn.get("means")
@@ -61,7 +61,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
         planes = np.zeros(gradients[name].shape, np.float32)
         planes[:, :count] = values.T
         gradients[name].set(planes)
-    to_centers(model, camera, gradients)
+    backpropagate_motion(model, camera, gradients)
     g = {name: values.astype(np.float64) for name, values in given.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
     grad_motion, grad_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
