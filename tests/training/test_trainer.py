@@ -12,7 +12,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Gaussians
-from clsplat.losses.base import ImageLoss, Loss, returned
+from clsplat.losses.base import ImageLoss, Loss, checked_value
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
@@ -261,7 +261,7 @@ def test_loss_that_returns_none_is_named():
             pass
 
     with pytest.raises(ConfigError, match="the loss Silent: expected a LossValue from 'add', got NoneType"):
-        returned(Silent(), Silent().add(None))
+        checked_value(Silent(), Silent().add(None))
 
 
 @pytest.mark.parametrize("more", [[], [Anisotropy(above=1.0)]], ids=["losses", "a penalty"])
