@@ -95,7 +95,7 @@ def compare_photos(
     stops = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
     median = np.median([photo.sharpness for photo in photos.values()], axis=0) if photos else np.zeros(2)
     return ComparisonFacts(
-        blurred=[name for name, photo in photos.items() if is_blurred(photo.sharpness, median)],
+        blurred=[name for name, photo in photos.items() if is_blurred(photo.sharpness, median) and not photo.is_blank],
         same=_duplicates(list(photos), [photo.thumbnail for photo in photos.values()]),
         jumps=[jump for jump in stops if jump[2] > MAX_STOPS],
         steps=_brightness_steps(

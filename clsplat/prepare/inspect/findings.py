@@ -337,6 +337,9 @@ def summarize(facts: Facts) -> dict[str, str]:
         lines["sizes"] = _counts(capture.sizes)
         lines["cameras by EXIF"] = _counts(capture.cameras)
         lines["GPS positions"] = f"{capture.located}" if capture.located else "none"
+        compared = facts.comparison
+        lines["comparison"] = f"{len(compared.blurred)} blurred, {len(compared.same)} duplicates"
+        lines["comparison"] += f", {len(compared.jumps)} exposure jumps"
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if facts.timestamps:
