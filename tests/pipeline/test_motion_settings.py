@@ -23,7 +23,7 @@ PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
     ],
 )
 def test_settings_with_static_positions_refuse_motion(override, what):
-    with pytest.raises(ConfigError, match=f"{re.escape(what)} cannot be combined with .* \\(model.time\\): it reads"):
+    with pytest.raises(ConfigError, match=f"{re.escape(what)} cannot be combined with .* \\(model.time\\): it uses"):
         load("dynamic_7k", [override])
     load("splat_7k", [override])
 
@@ -31,8 +31,8 @@ def test_settings_with_static_positions_refuse_motion(override, what):
 @pytest.mark.parametrize(
     ("stage", "words"),
     [
-        ("cleanup", r".rules\[\d\]: 'prune_far' cannot be .*: it reads .*; leave one of them out"),
-        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it reads"),
+        ("cleanup", r".rules\[\d\]: 'prune_far' cannot be .*: it uses .*; leave one of them out"),
+        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it uses"),
     ],
 )
 def test_static_only_stages_are_refused_on_loading(tmp_path, stage, words):

@@ -215,7 +215,7 @@ def test_numpy_loss_trains_like_the_device_loss(any_device, rng):
 def test_derivative_of_another_shape_is_refused(any_device, rng):
     x, y = images(rng, 5, 4)
     loss = HostLoss(lambda image, photograph: (0.0, np.zeros((3, 4, 5), np.float32)))
-    with pytest.raises(ValueError, match=r"derivative of \(3, 4, 5\); expected \(4, 5, 3\), as the image"):
+    with pytest.raises(ValueError, match=r"gradient of shape \(3, 4, 5\); expected that of the image, \(4, 5, 3\)"):
         loss.add(comparison_of(any_device, x, y))
 
 
