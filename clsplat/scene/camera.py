@@ -70,7 +70,7 @@ BORDER_POINTS = 200  # per edge of a photograph
 MAX_ROUNDS = 50  # iterations of Newton's method
 MAX_ERROR = 1.0e-6  # of its result, normalized units
 MAX_DIFFERENCE = 1.0e-3  # of a ray after distortion and undistortion, normalized units
-MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond, a pinhole image is mostly stretched edges
+MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond it, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
 
 
@@ -128,14 +128,12 @@ def _fov(u: Floats, v: Floats, k: Sequence[float], z: Floats | None = None) -> t
     return u * factor, v * factor
 
 
-def _division(u: Floats, v: Floats, k: Sequence[float], z: Floats | float | None = None) -> tuple[Floats, Floats]:
-    z = 1.0 if z is None else z
+def _division(u: Floats, v: Floats, k: Sequence[float], z: Floats | float = 1.0) -> tuple[Floats, Floats]:
     factor = 2 / (z + np.sqrt(z * z - 4 * k[0] * (u * u + v * v)))
     return u * factor, v * factor
 
 
-def _eucm(u: Floats, v: Floats, k: Sequence[float], z: Floats | float | None = None) -> tuple[Floats, Floats]:
-    z = 1.0 if z is None else z
+def _eucm(u: Floats, v: Floats, k: Sequence[float], z: Floats | float = 1.0) -> tuple[Floats, Floats]:
     depth = k[0] * np.sqrt(k[1] * (u * u + v * v) + z * z) + (1 - k[0]) * z
     return u / depth, v / depth
 
@@ -173,13 +171,12 @@ MIN_WIDE = math.radians(80)  # to a side of the image: a pinhole image would be 
 MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
 RIM = 1.5  # px: a sample at the edge of what a fisheye shows would mix with the dark beyond
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
-FACE_GRID = 128  # directions to a side at which the part of a face that the photograph shows is looked for
-MIN_SHOWN = 0.02  # share of a face; one that shows less is left out
+FACE_GRID = 128  # directions to a side, at which the visible part of a face is measured
+MIN_SHOWN = 0.02  # visible fraction of a face; one with less is left out
 ANGLES = 1801  # from 0 to 180 degrees
 BLOCK = 1 << 20  # samples at a time
-FACES: dict[
-    str, Floats
-] = {  # rotations from the camera of the photograph to that of the face: its right, down, forward
+# rotations from the camera of the photograph to that of the face: its right, down, forward
+FACES: dict[str, Floats] = {
     "front": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
     "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
     "back": np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
@@ -215,14 +212,9 @@ class Lens:
     def _angles(self) -> tuple[Floats, float]:
         """The angles (rad) that the lens shows left, right, up and down, [4], and that beyond which it folds back."""
         fx, fy, cx, cy, rest = self._split
-        angle = np.linspace(0, np.pi, ANGLES)
-        sides, folds = [], []
-        for x, y, size in (
-            (-1, 0, cx / fx),
-            (1, 0, (self.width - cx) / fx),
-            (0, -1, cy / fy),
-            (0, 1, (self.height - cy) / fy),
-        ):
+        angle, sides, folds = np.linspace(0, np.pi, ANGLES), [], []
+        sizes = cx / fx, (self.width - cx) / fx, cy / fy, (self.height - cy) / fy
+        for (x, y), size in zip(((-1, 0), (1, 0), (0, -1), (0, 1)), sizes, strict=True):
             with np.errstate(all="ignore"):
                 u, v = MODELS[self.model][1](x * np.sin(angle), y * np.sin(angle), rest, np.cos(angle))
                 radius = x * u + y * v
@@ -235,46 +227,44 @@ class Lens:
     @cached_property
     def is_wide(self) -> bool:
         """Whether the photograph shows too much for one pinhole image, and is cut into faces."""
-        if self.model not in WIDE:
-            return False
-        return self.model == "EQUIRECTANGULAR" or bool(self._angles[0].max() > MIN_WIDE)
+        is_panorama = self.model == "EQUIRECTANGULAR"
+        return is_panorama or (self.model in WIDE and bool(self._angles[0].max() > MIN_WIDE))
 
     @cached_property
     def faces(self) -> tuple["Lens", ...]:
         """The front of a wide photograph, and the other faces that show MIN_SHOWN or more.  Raises DataError."""
-        lenses = [replace(self, face=face, whole=self.model != "EQUIRECTANGULAR") for face in FACES]
-        return tuple(
-            intern_lens(lens)
-            for lens in lenses
-            if lens.face == "front" or lens._shows(*_face_grid()).mean() >= MIN_SHOWN
-        )
+        lenses = [intern_lens(replace(self, face=face, whole=self.model != "EQUIRECTANGULAR")) for face in FACES]
+        return tuple(lens for lens in lenses if lens.face == "front" or lens._grid_shown.mean() >= MIN_SHOWN)
+
+    @cached_property
+    def _grid_shown(self) -> NDArray[np.bool_]:
+        """Which points of `_face_grid` the photograph shows, [FACE_GRID, FACE_GRID]."""
+        return self._shows(*_face_grid())
+
+    def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return x, y, z in the camera of the wide photograph of normalized coordinates of the face."""
+        x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
+        return x, y, z
 
     def _shows(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
         """Return whether the wide photograph shows the rays with these normalized coordinates of the face."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
-        sides, fold = self._angles
-        directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"]
-        angle = np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), directions[..., 2])
+        (sides, fold), (x, y, z) = self._angles, self._directions(u, v)
+        angle = np.arctan2(np.hypot(x, y), z)
         with np.errstate(all="ignore"):
-            x, y = self._pixels(directions)
+            x, y = self.distort(x, y, z)
             inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
         circle = max(sides.min(), MIN_CIRCLE) - RIM / self._split[0]
         return np.asarray(inside & (angle < min(fold, circle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
         """Return whether a face shows a white pixel of a mask, [H, W, C], of the photograph."""
-        u, v = np.stack(_face_grid())[:, self._shows(*_face_grid())]
-        x, y = self._pixels(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face])
+        u, v = np.stack(_face_grid())[:, self._grid_shown]
+        x, y = self.distort(*self._directions(u, v))
         height, width = mask.shape[:2]
         rows, columns = (y * height / self.height).astype(int), (x * width / self.width).astype(int)
         return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
-
-    def _pixels(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Return the pixel coordinates in a wide photograph of directions in its camera, [..., 3]."""
-        fx, fy, cx, cy, rest = self._split
-        x, y = MODELS[self.model][1](directions[..., 0], directions[..., 1], rest, directions[..., 2])
-        return fx * x + cx, fy * y + cy
 
     def _face_camera(self) -> Camera:
         """Return the camera of the smallest part of a face that contains what the photograph shows.
@@ -289,25 +279,20 @@ class Lens:
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
                 f"at most {MAX_SOURCE} px to a side and focal lengths that fit: calibrate the camera again"
             )
-        shows = self._shows(*_face_grid())
-        if not shows.any():
-            raise DataError(f"the lens {self.model} {quote(self.params)} shows nothing; calibrate the camera again")
-        spans = [np.flatnonzero(shows.any(axis=axis)) for axis in (0, 1)]  # columns, rows
+        if not self._grid_shown.any():
+            raise self._error("shows nothing")
+        spans = [np.flatnonzero(self._grid_shown.any(axis=axis)) for axis in (0, 1)]  # columns, rows
         (x0, x1), (y0, y1) = (
             (max(0, int((i[0] - 1) / FACE_GRID * side)), min(side, int((i[-1] + 2) / FACE_GRID * side))) for i in spans
         )
         return Camera(x1 - x0, y1 - y0, focal, focal, side / 2 - x0, side / 2 - y0)
 
     def _blocks(self, samples: int) -> Iterator[tuple[slice, Floats, Floats]]:
-        """Yield some rows of the face, and the normalized coordinates of samples x samples rays in each pixel."""
-        camera = self.pinhole
-        across = (np.arange(camera.width * samples) + 0.5) / samples
-        step = max(1, BLOCK // (len(across) * samples))
-        for row in range(0, camera.height, step):
-            rows = slice(row, min(row + step, camera.height))
-            down = (np.arange(rows.start * samples, rows.stop * samples) + 0.5) / samples
-            u, v = np.meshgrid((across - camera.cx) / camera.fx, (down - camera.cy) / camera.fy)
-            yield rows, u, v
+        """Yield a block of rows of the face, and the normalized coordinates of its rays as `_rays` does."""
+        step = max(1, BLOCK // (self.pinhole.width * samples**2))
+        for row in range(0, self.pinhole.height, step):
+            rows = slice(row, row + step)
+            yield rows, *_rays(self.pinhole, rows, samples)
 
     def _cut(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the face of a wide photograph, [H, W, C]; each pixel is the mean of 2 x 2 rays."""
@@ -316,25 +301,23 @@ class Lens:
             pixels = np.concatenate([pixels[:, -1:], pixels, pixels[:, :1]], axis=1)
         face = np.empty((camera.height, camera.width, pixels.shape[2]), pixels.dtype)
         for rows, u, v in self._blocks(2):
-            directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"]
             with np.errstate(all="ignore"):
-                x, y = (np.nan_to_num(value - 0.5).astype(np.float32) for value in self._pixels(directions))
+                x, y = (np.nan_to_num(p - 0.5).astype(np.float32) for p in self.distort(*self._directions(u, v)))
             rays = cv2.remap(pixels, x + np.float32(border), y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            size = camera.width, rows.stop - rows.start
-            face[rows] = cv2.resize(rays, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
+            shape = face[rows].shape
+            face[rows] = cv2.resize(rays, shape[1::-1], interpolation=cv2.INTER_AREA).reshape(shape)
         return face
 
-    def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Return the pixel coordinates of normalized coordinates."""
+    def distort(self, u: Floats, v: Floats, *z: Floats) -> tuple[Floats, Floats]:
+        """Return the pixel coordinates of normalized coordinates, or of directions (u, v, z) for models of WIDE."""
         fx, fy, cx, cy, rest = self._split
-        x, y = MODELS[self.model][1](u, v, rest)
+        x, y = MODELS[self.model][1](u, v, rest, *z)
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
         """Return the pixel coordinates, [M, 2], of points, [M, 3] in camera space, behind a wide lens too."""
-        if self.is_wide:
-            return np.stack(self._pixels(points), axis=1)
-        return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
+        x, y, z = points.T
+        return np.stack(self.distort(x, y, z) if self.is_wide else self.distort(x / z, y / z), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return the normalized coordinates of pixels by Newton's method; NaN where it does not converge."""
@@ -346,9 +329,8 @@ class Lens:
             for _ in range(MAX_ROUNDS):
                 before = point[:, moving]
                 point[:, moving] = after = _newton_step(distortion, rest, before, goal[:, moving])
-                moving = moving[
-                    (before.view(np.int64) != after.view(np.int64)).any(axis=0)
-                ]  # a point that repeats its bits never moves again
+                # a point that repeats its bits never moves again
+                moving = moving[(before.view(np.int64) != after.view(np.int64)).any(axis=0)]
                 if not moving.size:
                     break
             error = np.abs(np.stack(distortion(point[0], point[1], rest)) - goal)
@@ -358,8 +340,7 @@ class Lens:
     @property
     def camera(self) -> Camera:
         """The camera without distortion, at the size of the photograph."""
-        fx, fy, cx, cy, _ = self._split
-        return Camera(self.width, self.height, fx, fy, cx, cy)
+        return Camera(self.width, self.height, *self._split[:4])
 
     @cached_property
     def pinhole(self) -> Camera:
@@ -378,9 +359,7 @@ class Lens:
         top = self.undistort(along_x, np.zeros(BORDER_POINTS))[1]
         bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
-            raise DataError(
-                f"the lens {self.model} {quote(self.params)} cannot be inverted; calibrate the camera again"
-            )
+            raise self._error("cannot be inverted")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
         if self.whole:
             across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
@@ -389,10 +368,11 @@ class Lens:
             v0, v1 = max(np.nanmin(down), -MAX_TANGENT, -high), min(np.nanmax(down), MAX_TANGENT, high)
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
-            raise DataError(
-                f"the lens {self.model} {quote(self.params)} leaves no pixel undistorted; calibrate the camera again"
-            )
+            raise self._error("leaves no pixel undistorted")
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
+
+    def _error(self, fault: str) -> DataError:
+        return DataError(f"the lens {self.model} {quote(self.params)} {fault}; calibrate the camera again")
 
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
@@ -414,17 +394,16 @@ class Lens:
         return inside & (np.abs(back_u - u) < MAX_DIFFERENCE) & (np.abs(back_v - v) < MAX_DIFFERENCE)
 
 
-def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """The normalized coordinates of all pixel centers, [H, W] each."""
-    u, v = np.meshgrid(
-        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
-        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
-    )
+def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) -> tuple[Floats, Floats]:
+    """Return the normalized coordinates of samples x samples rays in each pixel of some rows, [H, W] each."""
+    across, down = ((np.arange(size * samples) + 0.5) / samples for size in (camera.width, camera.height))
+    down = down[rows.start * samples : rows.stop * samples]
+    u, v = np.meshgrid((across - camera.cx) / camera.fx, (down - camera.cy) / camera.fy)
     return u, v
 
 
 def _face_grid() -> tuple[Floats, Floats]:
-    """The normalized coordinates of FACE_GRID x FACE_GRID points of a face."""
+    """Return the normalized coordinates of FACE_GRID x FACE_GRID points of a face."""
     along = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
     u, v = np.meshgrid(along, along)
     return u, v

@@ -68,10 +68,10 @@ def test_directions_project_like_colmap(model: str, rng: np.random.Generator) ->
     rays = rng.normal(size=(100, 3)) * [1, 1, 0.3]
     rays[:, 2] = np.abs(rays[:, 2]) + 0.02
     pixels = np.array([camera.img_from_cam(ray) for ray in rays])
-    np.testing.assert_allclose(np.stack(lens._pixels(rays), axis=1), pixels, atol=1e-9)
+    np.testing.assert_allclose(np.stack(lens.distort(*rays.T), axis=1), pixels, atol=1e-9)
     np.testing.assert_allclose(np.stack(lens.distort(*(rays[:, :2] / rays[:, 2:]).T), axis=1), pixels, atol=1e-9)
     beside = [(sign * np.sin(a), 0, np.cos(a)) for sign in (-1, 1) for a in np.radians((89.999, 90.001))]
-    jumps = np.diff(np.stack(lens._pixels(np.array(beside)), axis=1).reshape(2, 2, 2), axis=1)
+    jumps = np.diff(np.stack(lens.distort(*np.array(beside).T), axis=1).reshape(2, 2, 2), axis=1)
     assert np.abs(jumps).max() < 0.02, "nothing happens at 90 degrees"
 
 
