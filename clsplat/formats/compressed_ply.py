@@ -59,14 +59,13 @@ def read_compressed_ply(path: Path) -> SplatFile:
     require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
     per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
     color, alpha = _colors(vertices, chunks, per_splat)
-    rest = _harmonics(path, tables.get("sh"), len(vertices))
     parameters = {
-        "means": _ranged(vertices["packed_position"], chunks, AXES, per_splat),
+        "means": _spread(_fields(vertices["packed_position"], BITS), chunks, AXES, per_splat).astype(np.float32),
         "quats": _quaternions(vertices["packed_rotation"]),
-        "log_scales": _ranged(vertices["packed_scale"], chunks, SCALES, per_splat),
+        "log_scales": _spread(_fields(vertices["packed_scale"], BITS), chunks, SCALES, per_splat).astype(np.float32),
         "logit_opacity": logits(alpha[:, None]),
         "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
-        "sh_rest": rest,
+        "sh_rest": _harmonics(path, tables.get("sh"), len(vertices)),
     }
     return SplatFile(parameters, rendering_of(path, header), render_mode(header))
 
@@ -97,9 +96,9 @@ def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np
             f"{path}: 'element sh' has {len(table)} rows of {columns} properties; expected {count} rows of "
             "9, 24, or 45 'property uchar f_rest_…', numbered from 0; export it again"
         )
-    share = (np.arange(256) + 0.5) / 256
-    share[0], share[255] = 0, 1
-    levels = ((share - 0.5) * SH_RANGE).astype(np.float32)
+    fractions = (np.arange(256) + 0.5) / 256
+    fractions[0], fractions[255] = 0, 1
+    levels = ((fractions - 0.5) * SH_RANGE).astype(np.float32)
     return reorder_columns(levels[table.view("u1").reshape(count, columns)], 3, columns // 3)
 
 
@@ -112,20 +111,13 @@ def _fields(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
     return np.stack(columns, axis=1)
 
 
-def _ranged(
-    packed: NDArray[Any], chunks: NDArray[Any], names: tuple[str, ...], per_splat: NDArray[np.integer]
-) -> NDArray[np.float32]:
-    """Return positions or log scales, [N, 3]."""
-    return _spread(_fields(packed, BITS), chunks, names, per_splat).astype(np.float32)
-
-
 def _spread(
-    shares: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], per_splat: NDArray[np.integer]
+    fractions: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], per_splat: NDArray[np.integer]
 ) -> NDArray[np.float64]:
     """Scale numbers in [0, 1] to the range of each splat's chunk."""
     low, high = (np.stack([chunks[f"{end}_{n}"] for n in names], axis=1).astype(np.float64) for end in ("min", "max"))
     with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
-        values: NDArray[np.float64] = low[per_splat] + shares * (high - low)[per_splat]
+        values: NDArray[np.float64] = low[per_splat] + fractions * (high - low)[per_splat]
     return values
 
 
@@ -133,12 +125,12 @@ def _colors(
     vertices: NDArray[Any], chunks: NDArray[Any], per_splat: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return colors, [N, 3], and opacities, [N]."""
-    shares = _fields(vertices["packed_color"], (8, 8, 8, 8))
+    fractions = _fields(vertices["packed_color"], (8, 8, 8, 8))
     if set(_ENDS[12:]) <= set(chunks.dtype.names or ()):
-        return _spread(shares[:, :3], chunks, COLORS, per_splat), shares[:, 3]
-    return shares[:, :3], shares[:, 3]
+        return _spread(fractions[:, :3], chunks, COLORS, per_splat), fractions[:, 3]
+    return fractions[:, :3], fractions[:, 3]
 
 
 def _quaternions(packed: NDArray[Any]) -> NDArray[np.float32]:
-    shares = _fields(packed << np.uint32(2), (10, 10, 10))
-    return from_smallest_three((packed >> np.uint32(30)).astype(np.intp), (shares - 0.5) * 2**0.5)
+    fractions = _fields(packed << np.uint32(2), (10, 10, 10))
+    return from_smallest_three((packed >> np.uint32(30)).astype(np.intp), (fractions - 0.5) * 2**0.5)

@@ -33,16 +33,15 @@ from clsplat.formats.splats import (
     Parameters,
     SplatFile,
     Writing,
+    concatenate,
     flip_axes,
     opacities,
     opacities_to_logits,
     require_gaussians,
     require_memory,
     scales_to_logs,
-    sh_degree_of,
     transform,
     unit,
-    with_degree,
 )
 from clsplat.formats.spz import ALIKE, RATIO, decode_spz
 
@@ -76,7 +75,7 @@ class Gltf:
         primitives = [
             (primitive, matrix) for mesh, matrix in self._meshes() for primitive in tree["meshes"][mesh]["primitives"]
         ]
-        self.primitives = [pair for pair in primitives if _has_gaussians(pair[0])]
+        self.primitives = [pair for pair in primitives if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
         placement = FLIP_4 @ self.primitives[0][1] @ FLIP_4
@@ -84,10 +83,7 @@ class Gltf:
 
     def parameters(self) -> Parameters:
         """Return all Gaussians in the axes of a PLY, before the transform `placement`."""
-        parts = [self._placed(primitive, matrix) for primitive, matrix in self.primitives]
-        degree = max(sh_degree_of(part["sh_rest"].shape[1]) for part in parts)
-        parts = [with_degree(part, degree) for part in parts]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return concatenate([self._placed(primitive, matrix) for primitive, matrix in self.primitives])
 
     def _placed(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
         """Return the Gaussians of a primitive where its transform, relative to the first one, puts them."""
@@ -152,8 +148,7 @@ class Gltf:
             return self.accessor(names[name], width)
 
         degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in names), default=0)
-        orders = [(d, m) for d in range(degree + 1) for m in range(2 * d + 1)]
-        bands = [table(f"{PREFIX}SH_DEGREE_{d}_COEF_{m}", 3) for d, m in orders]
+        bands = [table(name, 3) for name in _sh_names(degree)]
         means = table("POSITION", 3)
         parameters = {
             "means": means,
@@ -163,22 +158,21 @@ class Gltf:
             "sh_base": bands[0],
             "sh_rest": np.concatenate(bands[1:], axis=1) if degree else np.zeros((len(means), 0), np.float32),
         }
-        if len({len(one) for one in parameters.values()}) > 1:
+        if len(set(map(len, parameters.values()))) > 1:
             raise DataError(f"{self.path}: the attributes of its Gaussians have different counts; export it again")
         return parameters
 
     def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
         """Return the rows of an accessor, [count, width]; normalized integers are scaled to [-1, 1]."""
-        one = self.tree["accessors"][_index(number)]
-        kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
-        if WIDTHS.get(one["type"]) != width or "sparse" in one or "bufferView" not in one:
+        row = self.tree["accessors"][_index(number)]
+        kind, count, start = COMPONENTS[row["componentType"]], _index(row["count"]), _index(row.get("byteOffset", 0))
+        if WIDTHS.get(row["type"]) != width or "sparse" in row or "bufferView" not in row:
             raise DataError(
-                f"{self.path}: accessor {number} is a {quote(one['type'])}, sparse, or without data; expected {width} "
+                f"{self.path}: accessor {number} is a {quote(row['type'])}, sparse, or without data; expected {width} "
                 "numbers per row in a buffer; export it again without compression"
             )
-        data, offset, length, stride = self._view(one["bufferView"])
         size = width * np.dtype(kind).itemsize
-        stride = size if stride is None else stride
+        data, offset, length, stride = self._view(row["bufferView"], size)
         if stride < size:
             raise DataError(
                 f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected at least {size}; "
@@ -194,25 +188,25 @@ class Gltf:
             raise DataError(f"{self.path}: its accessors share too much data; export it again")
         require_memory(self.path, count, 0)
         rows = np.ndarray((count, width), kind, data, start + offset, (stride, np.dtype(kind).itemsize))
-        if not one.get("normalized") or kind == "<f4":
+        if not row.get("normalized") or kind == "<f4":
             return rows.astype(np.float32)
         return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
 
-    def _view(self, number: Any) -> tuple[bytes, int, int, int | None]:
-        """Return the data of a buffer, and offset, length, and stride of a view in it."""
+    def _view(self, number: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
+        """Return the data of a buffer, and offset, length, and stride of a view in it; stride: the default."""
         view = self.tree["bufferViews"][_index(number)]
         if compressed := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
         buffer = self.tree["buffers"][_index(view["buffer"])]
         data = self._content(buffer.get("uri"), view["buffer"])
         length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
-        held = min(_index(buffer["byteLength"]), len(data))
-        if offset + length > held:
+        size = min(_index(buffer["byteLength"]), len(data))
+        if offset + length > size:
             raise DataError(
-                f"{self.path}: view {number} has {length} bytes at {offset}, more than its buffer of {held} bytes; "
+                f"{self.path}: view {number} has {length} bytes at {offset}, more than its buffer of {size} bytes; "
                 "copy or export it again"
             )
-        return data, offset, length, _index(view["byteStride"]) if "byteStride" in view else None
+        return data, offset, length, _index(view.get("byteStride", stride))
 
     def _content(self, uri: Any, number: int) -> bytes:
         """Return the bytes of a buffer: of the GLB itself, of a data URI, or of a file in the same folder."""
@@ -286,14 +280,18 @@ def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:
     return {**extensions, **extensions.get(EXTENSION, {}).get("extensions", {})}
 
 
-def _has_gaussians(primitive: dict[str, Any]) -> bool:
-    extensions = _extensions(primitive)
+def _has_gaussians(extensions: dict[str, Any]) -> bool:
     return EXTENSION in extensions or _spz_view(extensions) is not None
 
 
 def _spz_view(extensions: dict[str, Any]) -> Any:
     """Return the view that holds an SPZ file, as several drafts name it, or None."""
-    return next((one["bufferView"] for name, one in extensions.items() if "spz" in name), None)
+    return next((extension["bufferView"] for name, extension in extensions.items() if "spz" in name), None)
+
+
+def _sh_names(degree: int) -> list[str]:
+    """Return the attributes of the SH coefficients up to a degree, in order."""
+    return [f"{PREFIX}SH_DEGREE_{d}_COEF_{m}" for d in range(degree + 1) for m in range(2 * d + 1)]
 
 
 def _to_srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -340,22 +338,22 @@ def read_gltf(path: Path) -> SplatFile:
         raise DataError(f"{path}: its JSON has {len(text)} bytes; expected at most {most}; export fewer primitives")
     try:
         tree = json.loads(text)
-        found = Gltf(path, tree, binary)
-        parameters = found.parameters()
+        gltf = Gltf(path, tree, binary)
+        parameters = gltf.parameters()
         extras = tree.get("asset", {}).get("extras")
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise DataError(
             f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
         ) from error
-    for note in sorted(found.notes):
+    for note in sorted(gltf.notes):
         LOG.warning("%s: %s", path, note)
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
-    rendering, placement = check_rendering(path, ours) if isinstance(ours, dict) else {}, found.placement
+    rendering, placement = check_rendering(path, ours) if isinstance(ours, dict) else {}, gltf.placement
     if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
         rendering["origin"] = placement[:3, 3].tolist()
         placement[:3, 3] = 0
     return SplatFile(
-        parameters, rendering, "mip" if rendering.get("compensate") or found.is_mip else "default", placement
+        parameters, rendering, "mip" if rendering.get("compensate") or gltf.is_mip else "default", placement
     )
 
 
@@ -384,6 +382,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SRGB}},
     }
     asset: dict[str, Any] = {"version": "2.0", "generator": "clsplat"}
+    origin = _origin(splats)
     if splats.rendering:
         asset["extras"] = {"clsplat": splats.rendering}
     tree = {
@@ -391,14 +390,12 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **({"translation": origin} if origin else {})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
     }
-    if origin := _origin(splats):
-        tree["nodes"] = [{"mesh": 0, "translation": origin}]
     text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     with open_hashed(path) as file:
@@ -427,14 +424,9 @@ def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
         f"{PREFIX}ROTATION": np.roll(unit(p["quats"]), -1, axis=1),
         f"{PREFIX}SCALE": scale,
         f"{PREFIX}OPACITY": alpha,
-        f"{PREFIX}SH_DEGREE_0_COEF_0": p["sh_base"],
     }
-    first = 0
-    for degree in range(1, MAX_DEGREE + 1):
-        for order in range(2 * degree + 1):
-            if first < p["sh_rest"].shape[1]:
-                tables[f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}"] = p["sh_rest"][:, first : first + 3]
-                first += 3
+    bands = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1)
+    tables |= {name: bands[:, 3 * i : 3 * i + 3] for i, name in enumerate(_sh_names(MAX_DEGREE)[: bands.shape[1] // 3])}
     written = {name: np.ascontiguousarray(table, "<f4") for name, table in tables.items()}
     written["COLOR_0"] = np.rint(255 * np.concatenate([linear, alpha], axis=1)).astype(np.uint8)
     return written

@@ -207,9 +207,8 @@ def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Sec
 
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
-MIP = re.compile(
-    r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE
-)  # spellings of several programs
+# a mip model, as several programs spell it
+MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)
 FILTER = "filter_3D"
 NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # numbers in the comment
 ROWS = 65_536  # rows in memory at once while reading and writing
@@ -230,14 +229,15 @@ def read_ply(path: Path) -> SplatFile:
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
-        warn_dropped(path, _degree(path, header.dtype.names or ()))
+        degree = _degree(path, header.dtype.names or ())
+        warn_dropped(path, degree)
         rendering, size = rendering_of(path, header), header.count * header.dtype.itemsize
         if header.format == "ascii":
             file.seek(0)
             parameters = _parameters(path, read_ascii(path, file.read(), header))
         else:
             require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
-            require_memory(path, header.count, _degree(path, header.dtype.names or ()))
+            require_memory(path, header.count, degree)
             file.seek(header.start)
             parameters = _read(path, file, header)
     return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else render_mode(header))
@@ -312,7 +312,8 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
                 "export it again, or correct that line"
             )
     origin = values.get("origin", [0, 0, 0])
-    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_coordinate, origin))):
+    is_list = isinstance(origin, list) and len(origin) == 3
+    if not is_list or not all(isinstance(value, int | float) and abs(value) < MAX_NUMBER for value in origin):
         raise DataError(f"{path}: its comment has the origin {quote(origin)}; expected 3 numbers: export it again")
     try:
         json.dumps(values, allow_nan=False)
@@ -321,10 +322,6 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
             f"{path}: its comment is not valid JSON ({quote(error)}); export it again, or correct it"
         ) from error
     return values
-
-
-def _is_coordinate(value: Any) -> bool:
-    return isinstance(value, int | float) and abs(value) < MAX_NUMBER
 
 
 def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
@@ -354,7 +351,7 @@ def _degree(path: Path, names: Sequence[str]) -> int:
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
     columns_of = dict(_COLUMNS)
-    if "scale_1" in names and "scale_2" not in names:  # 2DGS
+    if is_flat := "scale_1" in names and "scale_2" not in names:  # 2DGS
         columns_of["log_scales"] = ("scale_0", "scale_1")
     missing = [column for columns in columns_of.values() for column in columns if column not in names]
     if missing:
@@ -367,10 +364,9 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
         wide = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), wide, parameters["means"])
-    by_channel = _columns(vertices, columns)
-    most = 3 * (sh_coefficients(MAX_DEGREE) - 1)
-    parameters["sh_rest"] = np.ascontiguousarray(reorder_columns(by_channel, 3, len(columns) // 3)[:, :most])
-    if parameters["log_scales"].shape[1] == 2:
+    rest = reorder_columns(_columns(vertices, columns), 3, len(columns) // 3)
+    parameters["sh_rest"] = np.ascontiguousarray(rest[:, : 3 * (sh_coefficients(MAX_DEGREE) - 1)])
+    if is_flat:
         thin = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
         parameters["log_scales"] = np.hstack([parameters["log_scales"], thin]).astype(np.float32)
     parameters = {name: parameters[name] for name in PARAMETERS}
@@ -395,7 +391,6 @@ def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.flo
 
 # Joining PLY files piece by piece, in little memory.
 
-PIECE_ROWS = 1 << 16  # rows per piece
 Check = Callable[[int, NDArray[np.float32]], None]
 
 
@@ -418,8 +413,8 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
         for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
             with open_file(part, "a PLY file") as file:
                 file.seek(header.start)
-                for start in range(0, header.count, PIECE_ROWS):
-                    size = min(PIECE_ROWS, header.count - start) * header.dtype.itemsize
+                for start in range(0, header.count, ROWS):
+                    size = min(ROWS, header.count - start) * header.dtype.itemsize
                     piece = file.read(size)
                     if len(piece) < size:
                         raise DataError(f"{part}: is truncated; train that block again")

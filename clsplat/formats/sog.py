@@ -10,7 +10,6 @@ In version 1, scales, sh0, the opacity logit, and shN are 8-bit values between a
 
 import io
 import json
-import math
 import os
 import zipfile
 import zlib
@@ -75,7 +74,7 @@ def sog_folder_files(path: Path) -> list[Path]:
         return [path]
     parts = [meta.get(name) for name in (*PARTS, "shN")] if isinstance(meta, dict) else []
     lists = [part.get("files") for part in parts if isinstance(part, dict)]
-    names = {name: None for one in lists if isinstance(one, list) for name in one if isinstance(name, str)}
+    names = {name: None for files in lists if isinstance(files, list) for name in files if isinstance(name, str)}
     images = [path.with_name(name) for name in names if is_sibling(name) and name != META]
     return [path, *filter(os.path.isfile, images)]
 
@@ -178,7 +177,7 @@ class _Sog:
         version = 1 if self.old else meta.get("version")
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
-        self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
+        self.count = self._whole_number("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
 
@@ -186,11 +185,10 @@ class _Sog:
         """Decode all parameters."""
         base = self._pixels("sh0", 0)
         scales, opacity = self._looked_up("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
+        logit = logits(opacity[:, None] / 255.0)
         if self.old:
             lows, highs = self._ends("sh0", 4)
             logit = (lows[3] + (highs[3] - lows[3]) * (opacity[:, None] / 255.0)).astype(np.float32)
-        else:
-            logit = logits(opacity[:, None] / 255.0)
         parameters = {
             "means": self._means(),
             "quats": self._quats(),
@@ -233,8 +231,8 @@ class _Sog:
         if self.old:
             degree = self._degree_of_width(files[0])
         else:
-            entries = self._whole("shN.count", self._part("shN").get("count", used), MAX_PALETTE)
-            degree = self._whole("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
+            entries = self._whole_number("shN.count", self._part("shN").get("count", used), MAX_PALETTE)
+            degree = self._whole_number("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
         size = sh_coefficients(degree) - 1
         if used > entries:
             raise DataError(
@@ -273,10 +271,8 @@ class _Sog:
             raise DataError(
                 f"{self.path}: {name} names {len(group)} files; expected at least {number + 1}; export it again"
             )
-        pixels = packing.decode(
-            self.path, f"image {number} of {name}", group[number], self.count, self._most(self.count)
-        )
-        return pixels[: self.count]
+        label, most = f"image {number} of {name}", self._most(self.count)
+        return packing.decode(self.path, label, group[number], self.count, most)[: self.count]
 
     @staticmethod
     def _most(count: int) -> int:
@@ -293,7 +289,7 @@ class _Sog:
     def _data(self, name: str) -> list[bytes]:
         """Return the files of a part.  Raises DataError for names outside of the folder."""
         names = self._part(name).get("files")
-        if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(one, str) for one in names):
+        if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(file, str) for file in names):
             raise DataError(
                 f"{self.path}: {name}.files is {quote(names)}; expected one or two file names; export it again"
             )
@@ -312,14 +308,14 @@ class _Sog:
     def _numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
         """Validate a list of at least `count` numbers."""
         fits = isinstance(value, list) and count <= len(value) <= 256
-        if not fits or not all(isinstance(one, int | float) and abs(one) < LIMIT for one in value):
+        if not fits or not all(isinstance(number, int | float) and abs(number) < LIMIT for number in value):
             raise DataError(
                 f"{self.path}: {key_path} is {quote(value)}; expected {count} numbers below {LIMIT:g}; export it again"
             )
         return np.array(value, np.float64)
 
-    def _whole(self, key_path: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most or math.isnan(value):
+    def _whole_number(self, key_path: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
             raise DataError(
                 f"{self.path}: {key_path} is {quote(value)}; expected a whole number from 1 to {most}; export it again"
             )
@@ -329,14 +325,10 @@ class _Sog:
 # Writing SOG version 2; the same model gives the same bytes.
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # largest palette for training
-SHARES = {
-    "small": 0.16,
-    "balanced": 0.42,
-    "high": 0.45,
-}  # entries per splat, of a palette that is not trained
+RELATIVE_PALETTES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries per splat, if not for training
 MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in 128ths
 TURN_STEP = 4  # of quaternions, in levels of 255
-SIZE_SHARE = 0.25  # step of positions of median weight, relative to the Gaussian's size
+SIZE_STEP = 0.25  # step of positions of median weight, relative to the Gaussian's size
 SCALE_STEP = 0.1  # of log scales
 COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
 SMALLEST = 1024  # palette entries for 1,024 splats; grows in proportion
@@ -395,12 +387,12 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
 def _write_folder(path: Path, images: dict[str, bytes]) -> str:
     """Write images and then meta.json, so that the old model stays valid until then; remove unused images."""
     before, new = set(sog_folder_files(path)), {path.with_name(name) for name in images}
-    kept = before
+    unused = new - before
     try:
         sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
-        kept = new
+        unused = before - new
     finally:
-        for file in (before | new) - kept - set(sog_folder_files(path)):
+        for file in unused - set(sog_folder_files(path)):
             if file.suffix == ".webp":
                 with suppress(OSError):
                     file.unlink()
@@ -476,9 +468,9 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     Quality `high` rounds tables only to the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
-    most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(SHARES[options.quality] * len(rest))))
-    kept = unique_points(rest, most) if rest.shape[1] else None
-    harmonics = None if kept is None else Harmonics.from_vectors(*kept)
+    most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(RELATIVE_PALETTES[options.quality] * len(rest))))
+    exact = unique_points(rest, most) if rest.shape[1] else None
+    harmonics = None if exact is None else Harmonics.from_vectors(*exact)
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
@@ -488,7 +480,7 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
         return {**p, "sh_base": base}, harmonics
     quats, log_scales = round_quats(p["quats"], p["log_scales"], TURN_STEP)
     changed = {
-        "means": round_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
+        "means": round_means(p["means"], p["log_scales"], weights, SIZE_STEP),
         "quats": quats,
         "log_scales": round_to(log_scales, SCALE_STEP),
         "sh_base": round_to(base, COLOR_STEP),
@@ -496,11 +488,11 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     return {**p, **changed}, harmonics
 
 
-def _write_harmonics(found: Harmonics, bands: int, image: Any) -> dict[str, Any]:
-    size = found.palette.shape[1] // 3
-    files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
-    files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
-    return {"count": len(found.palette), "bands": bands, "codebook": found.numbers.tolist(), "files": files}
+def _write_harmonics(sh: Harmonics, bands: int, image: Any) -> dict[str, Any]:
+    size = sh.palette.shape[1] // 3
+    files = [image("shN_centroids", *sh.palette.reshape(-1, 3).T, across=PER_ROW * size)]
+    files.append(image("shN_labels", sh.labels & 255, sh.labels >> 8, np.zeros_like(sh.labels)))
+    return {"count": len(sh.palette), "bands": bands, "codebook": sh.numbers.tolist(), "files": files}
 
 
 def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:

@@ -24,9 +24,11 @@ from clsplat.formats.splats import (
     Parameters,
     SplatFile,
     Writing,
+    concatenate,
     logits,
     logs,
     opacities,
+    reorder_columns,
     require_gaussians,
     require_memory,
     require_size,
@@ -92,10 +94,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     warn_clipped(path, "splat", "colors from 0 to 1", outside_bytes(255 * color))
     if p["sh_rest"].shape[1]:
-        LOG.warning(
-            "%s: splat stores no spherical harmonics: colors do not depend on the view; other formats do",
-            path,
-        )
+        LOG.warning("%s: splat stores no spherical harmonics: colors do not depend on the view; other formats do", path)
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())
@@ -107,16 +106,13 @@ HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
 SH_ENDS = (-1.5, 1.5)
 RANGE = 32767
-KINDS = (
-    ("<f4", "<f4", "<f4"),
-    ("<u2", "<f2", "<f2"),
-    ("<u2", "<f2", "u1"),
-)  # position, scale and rotation, SH by level
+# position, scale and rotation, SH by level
+KINDS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 
 @dataclass(frozen=True)
 class SplatSection:
-    """Where the splats of one section lie."""
+    """The header of one section, and the layout of its splats."""
 
     count: int
     rows: int  # at least `count`
@@ -131,7 +127,7 @@ class SplatSection:
 
     @classmethod
     def parse(cls, data: bytes, start: int) -> "SplatSection":
-        """Take the numbers of a header."""
+        """Parse the header at an offset, in bytes."""
         count, rows, bucket_size, buckets = struct.unpack_from("<4I", data, start)
         (block,) = struct.unpack_from("<f", data, start + 16)
         (bucket_bytes,) = struct.unpack_from("<H", data, start + 20)
@@ -140,19 +136,19 @@ class SplatSection:
         return cls(count, rows, degree, bucket_size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
 
     def row(self, level: int) -> np.dtype[Any]:
-        """The layout of one splat."""
+        """Return the layout of one splat."""
         position, scale, sh = KINDS[level]
         fields: list[Any] = [("position", position, 3), ("scale", scale, 3), ("rotation", scale, 4)]
         fields += [("color", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
         return np.dtype(fields)
 
     def sizes(self, level: int) -> tuple[int, int, int]:
-        """Bytes of the counts of partial buckets, of the buckets, and of the splats."""
+        """Return the bytes of the counts of partial buckets, of the buckets, and of the splats."""
         return 4 * self.partial, self.bucket_bytes * self.buckets, self.row(level).itemsize * self.rows
 
 
 def looks_like_ksplat(data: bytes, size: int) -> bool:
-    """Return whether bytes that begin a file can be its header: the format has no mark."""
+    """Return whether the first bytes of a file of `size` bytes can be a header; the format has no magic number."""
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
     most, sections, _, splats = struct.unpack_from("<4I", data, 4)
@@ -181,10 +177,7 @@ def read_ksplat(path: Path) -> SplatFile:
         require_memory(path, section.count, section.degree)
         parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_ENDS))
         start += sum(sizes)
-    width = max(part["sh_rest"].shape[1] for part in parts)
-    for part in parts:
-        part["sh_rest"] = np.pad(part["sh_rest"], ((0, 0), (0, width - part["sh_rest"].shape[1])))
-    return SplatFile({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    return SplatFile(concatenate(parts))
 
 
 def _check(path: Path, section: SplatSection, number: int) -> None:
@@ -213,13 +206,14 @@ def _tables(
         sh = ends[0] + sh / 255 * (ends[1] - ends[0])
     color = rows["color"] / 255.0
     with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
+        bands = [band.astype(np.float32) for band in np.split(sh, [9], axis=1)]  # channel-major, for each degree
         return {
             "means": position.astype(np.float32),
             "quats": rows["rotation"].astype(np.float32),
             "log_scales": logs(rows["scale"]),
             "logit_opacity": logits(color[:, 3:]),
             "sh_base": ((color[:, :3] - 0.5) / SH_C0).astype(np.float32),
-            "sh_rest": _interleaved(sh).astype(np.float32),
+            "sh_rest": np.hstack([reorder_columns(band, 3, band.shape[1] // 3) for band in bands]),
         }
 
 
@@ -235,14 +229,3 @@ def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDAr
     table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial)
     centers = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
     return centers[bucket].astype(np.float64)
-
-
-def _interleaved(sh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert channel-major coefficients of each degree to coefficient-major order."""
-    bands, first = [], 0
-    for size in (3, 5):
-        if first < sh.shape[1]:
-            band = sh[:, first : first + 3 * size].reshape(len(sh), 3, size)
-            bands.append(band.transpose(0, 2, 1).reshape(len(sh), 3 * size))
-            first += 3 * size
-    return np.concatenate(bands, axis=1) if bands else sh

@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,13 +57,9 @@ def motion_degree(width: int) -> int:
 def motion_fields(width: int) -> dict[str, slice]:
     """Return the columns of each field of a motion table with `width` columns, by name, in order."""
     degree, turns = WIDTHS[width]
-    present = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
-    ends: dict[str, slice] = {}
-    start = 0
-    for name in present:
-        ends[name] = slice(start, start + FIELDS[name])
-        start += FIELDS[name]
-    return ends
+    names = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
+    ends = accumulate(FIELDS[name] for name in names)
+    return {name: slice(end - FIELDS[name], end) for name, end in zip(names, ends, strict=True)}
 
 
 def motion_columns(width: int) -> tuple[str, ...]:
@@ -75,21 +72,21 @@ def motion_columns(width: int) -> tuple[str, ...]:
 
 def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
     """Return the motion columns among a file's properties: () if there are none, None if the table is incomplete."""
-    own = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
-    return next((motion_columns(width) for width in WIDTHS if set(motion_columns(width)) == own), None) if own else ()
+    columns = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
+    return next((known for known in ((), *map(motion_columns, WIDTHS)) if set(known) == columns), None)
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 STORED_DEGREE = 4  # of some formats; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
-NEAR_SHARE = 0.04  # of the median distance of the means from their middle, for a near plane that no file or scene gives
+NEAR_SHARE = 0.04  # of the median distance of the means from their middle: the near plane without a file or scene
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-MOST = 0.5  # share of values outside of their range that shows another unit; mirrored axes have negative scales, too
+MOST = 0.5  # fraction of values outside of their range that shows another unit; mirrored axes have negative scales
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
@@ -164,6 +161,13 @@ def with_degree(parameters: Parameters, degree: int) -> Parameters:
     rest = parameters["sh_rest"][:, :columns]
     padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
     return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}
+
+
+def concatenate(parts: Sequence[Parameters]) -> Parameters:
+    """Return the rows of several tables one after the other, with the largest SH degree of them."""
+    degree = max(sh_degree_of(part["sh_rest"].shape[1]) for part in parts)
+    tables = [with_degree(part, degree) for part in parts]
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 
 
 def logits(alpha: Floats) -> NDArray[np.float32]:
@@ -245,10 +249,7 @@ def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArr
 
 def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
     """Return which Gaussians have NaN or infinity, [N]."""
-    found = np.zeros(len(parameters["means"]), np.bool_)
-    for table in parameters.values():
-        found |= ~np.isfinite(table).all(axis=1)
-    return found
+    return np.asarray(np.any([~np.isfinite(table).all(axis=1) for table in parameters.values()], axis=0))
 
 
 def typical_size(means: NDArray[np.floating]) -> float:
@@ -297,7 +298,7 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
 
 
 def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return logarithms of scales; mostly negative scales are logarithms already, which a note says."""
+    """Return logarithms of scales; if most are negative, they are logarithms already, as a note says."""
     if np.count_nonzero(scales < 0) > MOST * scales.size:
         notes.add("its scales are negative: they are read as logarithms")
         return scales.astype(np.float32)
@@ -305,7 +306,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return logits of opacities; values that are mostly outside of [0, 1] are logits already, which a note says."""
+    """Return logits of opacities; if most are outside of [0, 1], they are logits already, as a note says."""
     if np.count_nonzero((alpha < 0) | (alpha > 1)) > MOST * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)
@@ -315,7 +316,8 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     """Refuse, drop, or keep Gaussians with NaN or infinity; dropping includes values that are too large.
 
-    Raises DataError."""
+    Raises DataError.
+    """
     bad = not_finite(splats.parameters)
     if options.not_finite == "drop":
         if message := too_large_message(splats.parameters):

@@ -17,9 +17,9 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
 # step of positions for a Gaussian of median weight, relative to its smallest scale
-SMALLEST_SHARE = {"small": 0.5, "balanced": 0.5, "high": 0.0}
+SMALLEST_FRACTION = {"small": 0.5, "balanced": 0.5, "high": 0.0}
 # steps of colors, in levels of 255: for a Gaussian of median weight, and at most
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
@@ -210,18 +210,18 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     step = quantization_steps(weights, *BASE_STEP[options.quality])[:, None]
     levels["colors"] = np.rint(levels["colors"] / step) * step
     alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in levels.values())
-    positions = _fixed(p, weights, fraction, SMALLEST_SHARE[options.quality])
+    positions = _fixed(p, weights, fraction, SMALLEST_FRACTION[options.quality])
     rotations = _rotations(p["quats"], TURN_STEP[options.quality])
     return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
 
-def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, share: float) -> bytes:
-    """Encode positions in 24 bits, with power-of-two steps of about `share` of the smallest scale.
+def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
+    """Encode positions in 24 bits, with power-of-two steps of about `relative` times the smallest scale.
 
     Steps grow for small weights.
     """
     size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
-    step = np.exp2(np.clip(np.floor(size + np.log2(share) + fraction), 0, MAX_ZEROS)) if share else 1.0
+    step = np.exp2(np.clip(np.floor(size + np.log2(relative) + fraction), 0, MAX_ZEROS)) if relative else 1.0
     multiples = np.rint(p["means"].astype(np.float64) * 2**fraction / step) * step
     fixed = np.minimum(multiples, MAX_INT24 + 1 - step).astype("<i4")
     return np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
@@ -272,9 +272,8 @@ class ZstdFrame:
     """A frame of `size` bytes, read in parts.  Raises DataError for another size or a damaged frame."""
 
     def __init__(self, path: Path, data: bytes, size: int) -> None:
-        module, builtin = _module()
-        self.path, self.size, self.left, self.error = path, size, size, module.ZstdError
-        self.stream = _stream(module, builtin, data)
+        self.path, self.size, self.left = path, size, size
+        self.stream, self.error = _open_zstd(data)
 
     def read(self, size: int) -> bytes:
         """Return the next `size` bytes."""
@@ -293,27 +292,18 @@ class ZstdFrame:
         return data
 
 
-def _stream(module: ModuleType, builtin: bool, data: bytes) -> Any:
-    if builtin:
-        limit = {module.DecompressionParameter.window_log_max: MAX_WINDOW}
-        return module.ZstdFile(io.BytesIO(data), options=limit)
-    return module.ZstdDecompressor(max_window_size=1 << MAX_WINDOW).stream_reader(data)
-
-
-def _module() -> tuple[ModuleType, bool]:
-    """Return the Zstandard module, and whether it is Python's own."""
-    try:
+def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
+    """Return a stream that decompresses a frame, and the error that it raises for a damaged frame."""
+    with suppress(ImportError):
         from compression import zstd
 
-        return zstd, True
-    except ImportError:
-        pass
+        limit = {zstd.DecompressionParameter.window_log_max: MAX_WINDOW}
+        return zstd.ZstdFile(io.BytesIO(data), options=limit), zstd.ZstdError
     try:
         import zstandard
-
-        return zstandard, False
     except ImportError as error:
         raise ConfigError("SPZ of version 4 needs Zstandard; install it: pip install 'clsplat[spz]'") from error
+    return zstandard.ZstdDecompressor(max_window_size=1 << MAX_WINDOW).stream_reader(data), zstandard.ZstdError
 
 
 WRITTEN_VERSION = 3  # more programs read it than version 4
@@ -334,14 +324,9 @@ EXPECTED = "an SPZ file"
 def read_spz(path: Path, options: Reading) -> SplatFile:
     """Read an SPZ file.  Raises DataError if it is missing or damaged, and MemoryLimitError."""
     splats, axes = decode_spz(path, read_file(path, EXPECTED, limit=MAX_FILE))
-    if axes and not options.quiet:
-        LOG.info("%s: read with the axes that it declares, %s", path, axes)
-    elif not options.quiet:
-        LOG.info(
-            "%s: read with the axes of SPZ; if the model is upside down, use "
-            "`clsplat convert --transform 'rotate=180,0,0'`",
-            path,
-        )
+    if not options.quiet:
+        remedy = "if the model is upside down, use `clsplat convert --transform 'rotate=180,0,0'`"
+        LOG.info("%s: read with the axes %s", path, f"that it declares, {axes}" if axes else f"of SPZ; {remedy}")
     return splats
 
 
@@ -451,14 +436,14 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
     start, frames = table + 16 * streams, []
     for number, size in enumerate(present):
-        held, declared = struct.unpack_from("<2Q", data, table + 16 * number)
-        if declared != size or held > len(data) - start:
+        stored, declared = struct.unpack_from("<2Q", data, table + 16 * number)
+        if declared != size or stored > len(data) - start:
             raise DataError(
-                f"{path}: stream {number} declares {held} bytes for {declared}; expected {size} for {header.count} "
+                f"{path}: stream {number} declares {stored} bytes for {declared}; expected {size} for {header.count} "
                 "splats, inside the file; copy or export it again"
             )
-        frames.append(ZstdFrame(path, data[start : start + held], size))
-        start += held
+        frames.append(ZstdFrame(path, data[start : start + stored], size))
+        start += stored
     if start != len(data):
         raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
     return header, unpacked(header, [frame.read for frame in frames]), axes

@@ -23,15 +23,14 @@ from clsplat.formats.packing import morton_order, write_bytes
 from clsplat.formats.sog import MAX_META, META, read_sog, require_plausible, sog_folder_files, write_as_ordered
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
-    MAX_DEGREE,
     Parameters,
     SplatFile,
     Writing,
+    concatenate,
     require_gaussians,
     require_in_range,
     typical_size,
     unit,
-    with_degree,
 )
 
 LOD_META = "lod-meta.json"
@@ -51,16 +50,13 @@ def read_lod(path: Path) -> SplatFile:
     runs = _runs(path, meta)[0]
     if not runs:
         raise DataError(f"{path}: its leaves have no file of level 0; export it again")
-    count = sum(count for one in runs.values() for _, count in one)
+    count = sum(count for leaves in runs.values() for _, count in leaves)
     require_plausible(path, count, sum(file.stat().st_size for file in lod_files(path) if file.is_file()))
     parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
     _require_count(path, meta, 0, runs)
     if "environment" in meta:
         parts.append(read_sog(path.parent / _inside(path, meta["environment"])))
-    degree = min(MAX_DEGREE, max(part.sh_degree for part in parts))
-    tables = [with_degree(part.parameters, degree) for part in parts]
-    joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    return SplatFile(joined, parts[0].rendering, parts[0].mode)
+    return SplatFile(concatenate([part.parameters for part in parts]), parts[0].rendering, parts[0].mode)
 
 
 def find_level_faults(path: Path) -> list[str]:
@@ -78,11 +74,11 @@ def find_level_faults(path: Path) -> list[str]:
 
 
 def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
-    """Return a message for each of the given files that is missing or damaged."""
+    """Return a message for each of the files that is missing or damaged."""
     faults = []
-    for file, own in sorted(runs.items()):
+    for file, leaves in sorted(runs.items()):
         try:
-            _part(path, meta["filenames"][file], own)
+            _part(path, meta["filenames"][file], leaves)
         except DataError as error:
             faults.append(str(error))
     return faults
@@ -143,14 +139,14 @@ def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
     for level, runs in enumerate(levels):
         if max(runs, default=-1) >= len(meta["filenames"]):
             raise DataError(f"{path}: a leaf refers to a missing file of level {level}; export it again")
-    return [{file: sorted(one) for file, one in runs.items()} for runs in levels]
+    return [{file: sorted(leaves) for file, leaves in runs.items()} for runs in levels]
 
 
 def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> None:
-    found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
-    if found != declared:
+    count, declared = sum(count for leaves in runs.values() for _, count in leaves), meta["counts"][level]
+    if count != declared:
         raise DataError(
-            f"{path}: declares {quote(declared)} splats of level {level}, but its leaves have {found}; export it again"
+            f"{path}: declares {quote(declared)} splats of level {level}, but its leaves have {count}; export it again"
         )
 
 
@@ -240,8 +236,8 @@ def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
         return Node(low, high, rows=tuple(by_level(np.sort(rows))))
 
     def by_level(rows: Rows) -> Iterator[Rows]:
-        for own, start in zip(np.split(rows, np.searchsorted(rows, starts[1:-1])), starts, strict=False):
-            yield own[morton_order(means[own])] - start
+        for part, start in zip(np.split(rows, np.searchsorted(rows, starts[1:-1])), starts, strict=False):
+            yield part[morton_order(means[part])] - start
 
     return node(np.arange(len(means)))
 

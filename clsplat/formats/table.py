@@ -67,10 +67,10 @@ class Codec:
     keeps_mode: bool = True  # whether a model is a mip model
     keeps_numbers: bool = False  # numbers for rendering
     keeps_nan: bool = False
-    keeps_origin: bool = False  # in another place than the numbers for rendering
+    keeps_origin: bool = False  # apart from the numbers for rendering
     keeps_doubles: bool = False  # positions in float64
     has_quality: bool = False  # writing uses Writing.quality
-    has_mark: bool = True  # at the start of files
+    has_magic: bool = True  # a magic number, or another clear mark at the start of files
 
 
 # The files of a model.
@@ -183,7 +183,7 @@ CODECS = (
         lambda path, options: read_splat(path),
         write_splat,
         keeps_mode=False,
-        has_mark=False,
+        has_magic=False,
     ),
 )
 
@@ -194,14 +194,14 @@ def endings(reads: bool = False) -> list[str]:
 
 
 def detect(path: Path) -> Codec | None:
-    """Return the format of a file by its content, or None; one without a mark only if the name is not of another.
+    """Return the format of a file by its content, or None; without a magic number, the name must fit, too.
 
     Raises DataError if the file cannot be read.
     """
     with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
     named = format_of_name(path)
-    return next((c for c in CODECS if c.matches(start) and (c.has_mark or named in (None, c))), None)
+    return next((c for c in CODECS if c.matches(start) and (c.has_magic or named in (None, c))), None)
 
 
 def format_of_name(path: Path) -> Codec | None:
@@ -285,13 +285,13 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
         )
 
 
-USUAL = 10  # x the near plane of a file without one, and a share of it: between them, a file needs none
+USUAL = 10  # largest ratio of a near plane to that of a file without one, and its inverse, that a file need not store
 
 
 def _unusual(splats: SplatFile) -> str:
     """Describe the numbers for rendering that differ from the defaults of files without them."""
-    near, own = splats.rendering.get("near"), usual_near(splats.parameters["means"])
-    usual: dict[str, Any] = {} if near and own / USUAL < near < own * USUAL else {"near": near and own}
+    near, default = splats.rendering.get("near"), usual_near(splats.parameters["means"])
+    usual: dict[str, Any] = {} if near and default / USUAL < near < default * USUAL else {"near": near and default}
     usual |= {"screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None, "pixel_box": 0}
-    given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
-    return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])
+    values = {name: splats.rendering.get(name, value) for name, value in usual.items()}
+    return ", ".join(f"{name} = {value}" for name, value in values.items() if value != usual[name])

@@ -3,7 +3,7 @@
 import json
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,22 +13,25 @@ from clsplat.core.errors import ConfigError, DataError, PoseError, quote
 from clsplat.core.files import open_atomic, path_exists, write_text
 from clsplat.core.progress import counted
 from clsplat.core.reading import open_file, read_json
-from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
 from clsplat.scene.colmap_writer import FILES, MODEL, write_colmap
 from clsplat.scene.images import EXPOSURES_FILE, is_image, write_exposures
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud, Scene, Tracks
-from clsplat.scene.transforms_json import JsonFrame, opengl_matrix
-from clsplat.scene.view import NO_FILE, PosedView, View, load_exposures
+from clsplat.scene.transforms_json import POINTS, TRANSFORMS_FILE, JsonFrame, opengl_matrix
+from clsplat.scene.view import NO_FILE, Floats, PosedView, View, load_exposures
 
-# The views of a scene as files name them: unique names of images below one folder, and lenses.
+# The views of a scene with the unique names of their images below one folder.
 
-IMAGES = "images"  # the folder of the photographs, as COLMAP and nerfstudio have it
+IMAGES = "images"  # the folder of the photographs, as in COLMAP and nerfstudio
 
 
 def posed_views(scene: Scene) -> list[PosedView]:
-    """Return the views in their order.  Raises DataError for names that no line of text can hold, or that repeat."""
-    names = [_file_name(view) for view in scene.views]
+    """Return the views in their order.  Raises DataError for names that do not fit a line of text, or that repeat."""
+    names = []
+    for view in scene.views:  # with the suffix of the file, which some formats leave out
+        has_suffix = is_image(PurePosixPath(view.name)) or view.image_path == NO_FILE
+        names.append(view.name if has_suffix else f"{view.name}{view.image_path.suffix}")
     if all(name.startswith(f"{IMAGES}/") for name in names):
         names = [name.removeprefix(f"{IMAGES}/") for name in names]
     seen: set[str] = set()
@@ -42,65 +45,53 @@ def posed_views(scene: Scene) -> list[PosedView]:
     return [PosedView(name, view, i in test) for i, (name, view) in enumerate(zip(names, scene.views, strict=True))]
 
 
-def _file_name(view: View) -> str:
-    """A view's name with the suffix of its file, which some formats leave out."""
-    name = PurePosixPath(view.name)
-    if is_image(name) or view.image_path == NO_FILE:
-        return view.name
-    return f"{view.name}{view.image_path.suffix}"
-
-
 def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
-    """Return where each photograph lies, by where it belongs below a folder.  Raises DataError without a photograph."""
-    for one in views:
-        if one.view.image_path == NO_FILE:
-            raise DataError(f"the view {quote(one.name)} has no photograph to copy; write the cameras alone")
-        if one.view.lens is not None and one.view.lens.is_wide:
+    """Return the photograph of each view, by its path below `folder`.  Raises DataError without a photograph."""
+    for posed in views:
+        if posed.view.image_path == NO_FILE:
+            raise DataError(f"the view {quote(posed.name)} has no photograph to copy; write the cameras alone")
+        if posed.view.lens is not None and posed.view.lens.is_wide:
             raise DataError(
-                f"the view {quote(one.name)} is a part of a wide photograph; `clsplat data undistort` first, "
+                f"the view {quote(posed.name)} is a part of a wide photograph; `clsplat data undistort` first, "
                 "or write the cameras alone"
             )
-    return {folder / one.name: one.view.image_path for one in views}
+    return {folder / posed.name: posed.view.image_path for posed in views}
 
-
-# What a file of cameras cannot hold, and takes from them: said in a line.
 
 LOG = logging.getLogger("clsplat")
-TOLERANCE = 0.5  # px: less is no more than a convention about the middle of a pixel
-
-
-def warn_center_lost(path: Path, cameras: Sequence[Camera]) -> None:
-    """Warn where readers of a file look for the principal point elsewhere than it is."""
-    off = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
-    if off > TOLERANCE:
-        LOG.warning(
-            "%s: other programs take the middle of the image for the principal point, which is up to %.1f px away",
-            *(path, off),
-        )
-
 
 # cameras.json, as the reference implementation of 3DGS writes it next to a model (Kerbl et al. 2023).
 
 INRIA_FILE = "cameras.json"
 MAX_BYTES = 1 << 27
 MAX_VIEWS = 100_000
+TOLERANCE = 0.5  # px: a smaller difference is only a convention about pixel centers
 
 
 def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
-    """Write out/cameras.json; return it.  Points and tracks have no place in it.  Raises OutputError."""
-    write_text(out / INRIA_FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
-    warn_center_lost(out / INRIA_FILE, [one.view.camera for one in views])
+    """Write out/cameras.json, which does not hold points and tracks, and return its path.  Raises OutputError.
+
+    Warns if the principal point is not in the center of the image, where other programs assume it.
+    """
+    write_text(out / INRIA_FILE, json.dumps([_camera(posed, i) for i, posed in enumerate(views)], indent=1) + "\n")
+    cameras = [posed.view.camera for posed in views]
+    offset = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
+    if offset > TOLERANCE:
+        LOG.warning(
+            "%s: other programs take the middle of the image for the principal point, which is up to %.1f px away",
+            *(out / INRIA_FILE, offset),
+        )
     return [out / INRIA_FILE]
 
 
-def _camera(one: PosedView, number: int) -> dict[str, Any]:
-    camera, pose = one.view.camera, one.view.world_to_camera
+def _camera(posed: PosedView, number: int) -> dict[str, Any]:
+    camera, pose = posed.view.camera, posed.view.world_to_camera
     return {
         "id": number,
-        "img_name": one.name,
+        "img_name": posed.name,
         "width": camera.width,
         "height": camera.height,
-        "position": one.view.position.tolist(),
+        "position": posed.view.position.tolist(),
         "rotation": pose[:, :3].T.tolist(),
         "fy": camera.fy,
         "fx": camera.fx,
@@ -117,41 +108,37 @@ def read_inria(path: Path) -> list[View]:
     table = read_json(path, "a cameras.json of 3DGS", limit=MAX_BYTES)
     if not isinstance(table, list) or not 1 <= len(table) <= MAX_VIEWS or not all(isinstance(v, dict) for v in table):
         raise DataError(f"{path}: expected a list of 1 to {MAX_VIEWS} cameras, as 3DGS writes it")
-    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", one), i) for i, one in enumerate(table)]
+    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", frame), i) for i, frame in enumerate(table)]
 
 
-def _view(one: JsonFrame, number: int) -> View:
-    width, height, fx, fy = (one.number(key) or 0.0 for key in ("width", "height", "fx", "fy"))
+def _view(frame: JsonFrame, number: int) -> View:
+    width, height, fx, fy = (frame.number(key) or 0.0 for key in ("width", "height", "fx", "fy"))
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
-            f"{one.where}: the camera is {width:g}x{height:g} with focal lengths {fx:g}, {fy:g}; expected positive "
+            f"{frame.where}: the camera is {width:g}x{height:g} with focal lengths {fx:g}, {fy:g}; expected positive "
             f"numbers, sizes of at most {MAX_SIDE}: export the file again"
         )
-    cx, cy = one.number("cx"), one.number("cy")
+    cx, cy = frame.number("cx"), frame.number("cy")
     camera = Camera(int(width), int(height), fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    name = one.value("img_name")
-    rotation, position = _array(one, "rotation", (3, 3)), _array(one, "position", (3,))
+    name = frame.value("img_name")
+    rotation, position = _array(frame, "rotation", (3, 3)), _array(frame, "position", (3,))
     try:
         pose = np.column_stack([rotation.T, -rotation.T @ position])
         return View(name if isinstance(name, str) else f"{number:05d}", camera, pose)
     except PoseError as error:
-        raise DataError(f"{one.where}: {error}; remove that camera or export the file again") from error
+        raise DataError(f"{frame.where}: {error}; remove that camera or export the file again") from error
 
 
-def _array(one: JsonFrame, key: str, shape: tuple[int, ...]) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    try:
-        array = np.array(one.value(key), np.float64)
-    except (ValueError, TypeError, OverflowError):
-        array = np.empty(0)
+def _array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
+    array = frame.array(key)
     if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"{one.where}: {key} is {quote(one.value(key))}; expected finite numbers, {shape}")
+        raise DataError(f"{frame.where}: {key} is {quote(frame.value(key))}; expected finite numbers, {shape}")
     return array
 
 
 # nerfstudio's transforms.json, with points3d.ply next to it.
 
-NERFSTUDIO_FILE, POINTS = "transforms.json", "points3d.ply"
-DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the names of what follows the middle
+DISTORTION = {  # by COLMAP's model: nerfstudio's model, and the names of the distortion parameters
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
     "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
@@ -166,43 +153,42 @@ REMEDY = "write colmap, or `clsplat data undistort` first"
 
 
 def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
-    """Write out/transforms.json, and the points where there are some, without tracks; return the files.
+    """Write out/transforms.json, and the points, if any, without tracks; return the files.
 
-    nerfstudio evaluates at the validation views, for which the test views are named too.
-    Raises OutputError where it cannot be written.
+    The test views are listed as validation views, too, because nerfstudio evaluates those.  Raises OutputError.
     """
-    lenses = [_lens(one) for one in views]
+    lenses = [_lens(posed) for posed in views]
     model, common = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
-    matrices = [opengl_matrix(one.view.world_to_camera).tolist() for one in views]
+    matrices = [opengl_matrix(posed.view.world_to_camera).tolist() for posed in views]
     frames = [
         {
-            "file_path": f"{IMAGES}/{one.name}",
+            "file_path": f"{IMAGES}/{posed.name}",
             **({} if common else {key: value for key, value in lens.items() if key != "camera_model"}),
-            **({} if one.view.time is None else {"time": one.view.time}),
+            **({} if posed.view.time is None else {"time": posed.view.time}),
             "transform_matrix": matrix,
         }
-        for one, lens, matrix in zip(views, lenses, matrices, strict=True)
+        for posed, lens, matrix in zip(views, lenses, matrices, strict=True)
     ]
     table: dict[str, Any] = {"camera_model": model, **common, "frames": frames}
-    if any(one.test for one in views):
-        train, test = ([f"{IMAGES}/{one.name}" for one in views if one.test is held] for held in (False, True))
+    if any(posed.test for posed in views):
+        train, test = ([f"{IMAGES}/{posed.name}" for posed in views if posed.test is test] for test in (False, True))
         table |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
-    written = [out / NERFSTUDIO_FILE]
+    written = [out / TRANSFORMS_FILE]
     if points is not None:
         table["ply_file_path"] = POINTS
         write_points_ply(out / POINTS, points)
         written.append(out / POINTS)
-    write_text(out / NERFSTUDIO_FILE, json.dumps(table, indent=1) + "\n")
+    write_text(out / TRANSFORMS_FILE, json.dumps(table, indent=1) + "\n")
     return written
 
 
 def check_nerfstudio(views: list[PosedView]) -> None:
-    """Raise DataError for a lens that nerfstudio has no name for, and for kinds of lenses that one file cannot hold."""
+    """Raise DataError for a lens that nerfstudio does not support, and for lenses that do not fit in one file."""
     kinds = {}
-    for one in views:
-        if one.lens.model not in DISTORTION:
-            raise DataError(f"{one.name}: nerfstudio has no camera model {one.lens.model}; {REMEDY}")
-        kinds[DISTORTION[one.lens.model][0]] = one.name
+    for posed in views:
+        if posed.lens.model not in DISTORTION:
+            raise DataError(f"{posed.name}: nerfstudio has no camera model {posed.lens.model}; {REMEDY}")
+        kinds[DISTORTION[posed.lens.model][0]] = posed.name
     if len(kinds) > 1:
         model, name = kinds.popitem()
         raise DataError(
@@ -210,8 +196,8 @@ def check_nerfstudio(views: list[PosedView]) -> None:
         )
 
 
-def _lens(one: PosedView) -> dict[str, Any]:
-    lens: Lens = one.lens
+def _lens(posed: PosedView) -> dict[str, Any]:
+    lens = posed.lens
     model, names = DISTORTION[lens.model]
     camera, distortion = lens.camera, lens.params[len(lens.params) - len(names) :]
     return {
@@ -226,26 +212,26 @@ def _lens(one: PosedView) -> dict[str, Any]:
     }
 
 
-# The formats by their names.
+# The formats by name.
 
 WRITERS: dict[str, Callable[[Path, list[PosedView], PointCloud | None, Tracks | None], list[Path]]] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
     "inria": write_inria,
 }
-PLACES = {  # that each writes
+OUTPUTS = {  # files that each writes
     "colmap": [MODEL / name for name in FILES],
-    "nerfstudio": [Path(NERFSTUDIO_FILE), Path(POINTS)],
+    "nerfstudio": [Path(TRANSFORMS_FILE), Path(POINTS)],
     "inria": [Path(INRIA_FILE)],
 }
 UNDISTORTED = ("inria",)  # formats of cameras without lenses
 COPIES = ("none", "copy")  # of the photographs
-SPLIT = "nerfstudio"  # what keeps it, and times
-TRACKS = "colmap"  # what keeps which points the photographs show
+SPLIT = "nerfstudio"  # the format that keeps the split, and times
+TRACKS = "colmap"  # the format that keeps which points the photographs show
 
 
 def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
-    """Return the views as a format names them.  Raises DataError for what it cannot hold."""
+    """Return the views with the names of their images.  Raises DataError for views that the format cannot hold."""
     views = posed_views(scene)
     if format_ == "nerfstudio":
         check_nerfstudio(views)
@@ -253,32 +239,31 @@ def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
-    """Write the cameras of a scene, and the photographs where they are to be copied, with what their cameras noted of
-    the exposures; return the files of cameras.
+    """Write the cameras of a scene, and copies of the photographs, with their exposures, if `images` is copy.
 
-    The views have the size of the dataset.  over: whether files there may be replaced.
-    Raises ConfigError for another name and where a file is there, DataError where the format cannot hold the scene.
+    Returns the files of cameras.  The views have the size of the dataset.  over: whether to replace existing files.
+    Raises ConfigError for an unknown format and for an existing file, DataError if the format cannot hold the scene.
     """
-    for what, value, known in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
-        if value not in known:
-            raise ConfigError(f"no {what} {quote(value)}; there are {', '.join(known)}")
+    for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
+        if value not in choices:
+            raise ConfigError(f"no {name} {quote(value)}; there are {', '.join(choices)}")
     scene = scene.in_world()
     views = check_cameras(scene, format_)
-    if images == "copy" and format_ in UNDISTORTED and any(one.view.lens is not None for one in views):
+    if images == "copy" and format_ in UNDISTORTED and any(posed.view.lens is not None for posed in views):
         raise DataError(
             f"{scene.path}: {format_} holds cameras of undistorted photographs, and these are distorted; "
             "`clsplat data undistort` first, or write the cameras alone"
         )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
-    for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *sidecars):
+    for path in () if over else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     written = WRITERS[format_](out, views, scene.points, scene.tracks)
     if format_ != SPLIT and scene.test:
         lost = f"{len(scene.test)} of {len(views)}"
         LOG.warning("%s: %s does not keep which views are for testing, %s; %s does", out, format_, lost, SPLIT)
-    if format_ != SPLIT and any(one.view.time is not None for one in views):
+    if format_ != SPLIT and any(posed.view.time is not None for posed in views):
         LOG.warning("%s: %s does not keep the times of the views; %s does", out, format_, SPLIT)
     if format_ != TRACKS and copies and scene.tracks is not None:
         LOG.warning("%s: %s does not keep which points the photographs show; %s does", out, format_, TRACKS)
@@ -286,6 +271,6 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         with open_file(source, "an image") as old, open_atomic(path) as new:
             shutil.copyfileobj(old, new)
     if copies:
-        found = load_exposures([one.view for one in views])
-        write_exposures(out / IMAGES, {one.name: exposure for one, exposure in zip(views, found, strict=True)})
+        exposures = load_exposures([posed.view for posed in views])
+        write_exposures(out / IMAGES, dict(zip((posed.name for posed in views), exposures, strict=True)))
     return written

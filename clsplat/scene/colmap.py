@@ -63,11 +63,6 @@ class ImageRecord(NamedTuple):
     points: NDArray[np.int64] = np.empty(0, np.int64)
     pixels: NDArray[np.float64] = np.empty((0, 2))
 
-    @property
-    def observed(self) -> int:
-        """The number of 2D points that belong to a 3D point."""
-        return len(self.points)
-
 
 def parameter_count(where: str, model: str) -> int:
     """Return the number of parameters of a camera model.  Raises DataError, with `where`, for others."""
@@ -194,6 +189,7 @@ class _Binary:
 
     @property
     def where(self) -> str:
+        """The position in the file, for messages."""
         return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, what: str) -> int:
@@ -357,7 +353,7 @@ class ColmapReader(Reader):
             if view := parts.attempt(view_of, image, cameras, file, mask):
                 parts.views.append(fit_to_photograph(view) if file in files.reduced else view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
-                parts.observed[view.name] = image.observed
+                parts.observed[view.name] = len(image.points)
 
     def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
         """Return images with the names of their files, the files, and masks."""
@@ -441,11 +437,9 @@ def view_of(
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
     """Return the lens of a camera.  Raises DataError for invalid numbers."""
-    sizes = camera.width, camera.height
-    valid = (
-        min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(camera.params[: LENS_MODELS[camera.model][0]]) >= MIN_FOCAL
-    )
-    if not valid or not all(abs(value) < MAX_VALUE for value in camera.params):
+    sizes, focals = (camera.width, camera.height), camera.params[: LENS_MODELS[camera.model][0]]
+    is_valid = min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(focals) >= MIN_FOCAL
+    if not is_valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters "
             f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "

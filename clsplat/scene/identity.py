@@ -22,7 +22,7 @@ from clsplat.core.progress import Count
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
 from clsplat.scene.quality import excludes_all, shows_nothing
-from clsplat.scene.scene import SPLITS, PointCloud, Scene
+from clsplat.scene.scene import SPLITS, Scene
 from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene before training, so that damaged files are found early.
@@ -192,7 +192,9 @@ class Identity:
         train, test, fold = (
             {view.name: _row(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
         )
-        return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)
+        points = scene.points
+        arrays = [points.positions, points.colors, points.times] if points else []
+        return cls(train, test, _hash(*(array for array in arrays if array is not None)) if points else "", fold)
 
     @property
     def digest(self) -> str:
@@ -251,10 +253,6 @@ def _row(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
         "camera": _hash(numbers, view.world_to_camera, *([origin] if origin.any() else []), text=repr(distortion)),
         **({} if view.time is None else {"time": repr(view.time)}),
     }
-
-
-def _points_hash(points: PointCloud) -> str:
-    return _hash(points.positions, points.colors, *([] if points.times is None else [points.times]))
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:

@@ -98,7 +98,7 @@ def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _orientation(exif: bytes) -> int:
-    """The orientation in a TIFF block, 1 to 8; 1 if missing."""
+    """Return the orientation in a TIFF block, 1 to 8; 1 if missing."""
     at = find_orientation(exif)
     value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
     return int(value) if 1 <= value <= 8 else 1
@@ -119,13 +119,7 @@ def find_orientation(exif: bytes) -> int | None:
 
 # PNG files are checked and stripped before OpenCV reads them.
 
-USED = {
-    b"tRNS",
-    b"eXIf",
-    b"acTL",
-    b"fcTL",
-    b"fdAT",
-}  # besides the critical chunks, with a capital letter
+USED = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # next to the critical chunks, which have a capital letter
 
 
 def strip_png_metadata(data: bytes) -> bytes:
@@ -153,7 +147,7 @@ def strip_png_metadata(data: bytes) -> bytes:
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
 MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
-REDUCED = {  # what OpenCV decodes to gray, by the divisor of the size
+REDUCED = {  # OpenCV's flag for gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
     4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
@@ -226,12 +220,11 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
     pixels = _decoded(data, path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    if (level := _transparent_gray(data)) is not None and pixels.shape[2] == 1:
-        return np.dstack([pixels] * 3 + [np.where(pixels == level, 0, np.iinfo(pixels.dtype).max).astype(pixels.dtype)])
-    if pixels.shape[2] == 1:
-        return np.repeat(pixels, 3, axis=2)
+    if pixels.ndim == 2 or pixels.shape[2] == 1:
+        alpha = []
+        if (level := _transparent_gray(data)) is not None:
+            alpha = [np.where(pixels == level, 0, np.iinfo(pixels.dtype).max).astype(pixels.dtype)]
+        return np.dstack([pixels] * 3 + alpha)
     return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])  # OpenCV decodes to BGR
 
 
@@ -296,8 +289,7 @@ class CameraExposure:
 
 def read_exif_exposure(path: Path) -> CameraExposure | None:
     """Return the exposure in the EXIF data of a JPEG file, or None.  Raises DataError when it cannot be read."""
-    with open_file(path, "an image") as file:
-        tags = _read_tags(file.read(HEAD_SIZE))
+    tags = _read_tags(path)
     return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 
 
@@ -306,8 +298,7 @@ def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
 
     Raises DataError when it cannot be read.
     """
-    with open_file(path, "an image") as file:
-        tags = _read_tags(file.read(HEAD_SIZE))
+    tags = _read_tags(path)
     values = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
     return tuple(values) if any(values[2:]) else None
 
@@ -317,8 +308,7 @@ def read_exif_camera(path: Path) -> tuple[str, bool]:
 
     Raises DataError when it cannot be read.
     """
-    with open_file(path, "an image") as file:
-        tags = _read_tags(file.read(HEAD_SIZE))
+    tags = _read_tags(path)
     make, model, focal = (tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL))
     parts = [] if str(model).startswith(str(make)) else [str(make)]
     parts += [str(model), f"{focal:g} mm" if isinstance(focal, float) else ""]
@@ -337,8 +327,10 @@ def copy_exif(head: bytes, jpeg: bytes) -> bytes:
     return jpeg[:2] + bytes(block) + jpeg[2:]
 
 
-def _read_tags(head: bytes) -> dict[int, Value]:
-    """The readable EXIF values in the first bytes of a JPEG file, by tag."""
+def _read_tags(path: Path) -> dict[int, Value]:
+    """Return the readable EXIF values of a JPEG file, by tag."""
+    with open_file(path, "an image") as file:
+        head = file.read(HEAD_SIZE)
     segment = find_exif_segment(head)
     tags: dict[int, Value] = {}
     if segment is None:
@@ -356,7 +348,7 @@ def _read_tags(head: bytes) -> dict[int, Value]:
 
 
 def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """The values of an IFD by tag; of several numbers the first."""
+    """Return the values of an IFD by tag; of several numbers, the first."""
     values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for at in range(start + 2, start + 2 + 12 * entries, 12):
@@ -368,8 +360,8 @@ def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
         elif kind in (SHORT, LONG):
             (values[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
         elif kind == TEXT:
-            place = value if count > 4 else at + 8
-            values[tag] = block[place : place + count].split(b"\0")[0].decode("ascii", "replace").strip()
+            offset = value if count > 4 else at + 8
+            values[tag] = block[offset : offset + count].split(b"\0")[0].decode("ascii", "replace").strip()
     return values
 
 

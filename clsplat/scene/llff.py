@@ -30,9 +30,6 @@ class LlffReader(Reader):
     name = "LLFF"
     expects = POSES_FILE
 
-    def matches(self, path: Path) -> bool:
-        return (path / POSES_FILE).is_file()
-
     def read(self, path: Path, holdout: int) -> Scene:
         file = path / POSES_FILE
         rows, images = read_poses(file), image_files(path)

@@ -1,4 +1,4 @@
-"""Find the files that a dataset names, also where their names, suffixes or folders have changed since."""
+"""Find the files that a dataset names, even if their names, suffixes or folders have changed."""
 
 import difflib
 import logging
@@ -26,9 +26,9 @@ CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|r
 OTHER_CONTENT = re.compile(  # folders whose images are photographs only where a name contains the folder
     r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
-SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph of one is none of another
+SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph in one does not match another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
-ELSEWHERE = "…"  # stands for folders outside of the scene
+ELSEWHERE = "…"  # instead of folders outside of the scene, in paths of missing files
 logger = logging.getLogger("clsplat")
 
 
@@ -74,12 +74,12 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 class FileLookup:
     """The image files that a dataset names, which another machine or program may have written.
 
-    An image `name` below `folder` is taken as it is.  Otherwise a name and a file below `root` belong together if each
-    is the only best match of the other: the one with the longest common end of their paths.  Upper and lower case,
+    An image `name` that exists below `folder` is used.  Otherwise a name and a file below `root` belong together if
+    each is the only best match of the other: the one with the longest common end of their paths.  Upper and lower case,
     slashes, Unicode forms, URL escapes and the suffix of the image do not matter.  Links out of `root` are ignored.
 
-    spellings: the file names to look for first, instead of the name itself.  strict: for masks and depth maps, whose
-    whole path must match, below their folder or below that of the name.  taken: files that are something else.
+    spellings: returns the file names to try first for a name, by default the name itself.  strict: for masks and depth
+    maps, whose whole path must match, below their folder or below that of the name.  taken: files of another purpose.
     """
 
     def __init__(
@@ -92,8 +92,8 @@ class FileLookup:
         taken: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.given, self.names = list(names), list(names)  # in the dataset, and those of views
-        self.paths = [folder / ELSEWHERE / _printable(PureWindowsPath(name).name) for name in names]
+        self.given, self.names = list(names), list(names)  # the names in the dataset, and those of views
+        self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
         self.matched: dict[int, int] = {}  # the length of the common end of each inexact match
         self.reduced: set[Path] = set()  # photographs from a folder such as images_4
         self.choices: dict[int, list[Path]] = {}  # several files that fit a name equally well
@@ -116,7 +116,7 @@ class FileLookup:
         return False
 
     def _target(self, name: str) -> Parts:
-        """Return the comparable parts of a path, as far as they may be below `root`; none for an impossible name."""
+        """Return the comparable parts of a path that can be below `root`; none for an impossible name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
         if not parts or parts[-1] == ".." or min(name) < " ":
@@ -202,7 +202,7 @@ class FileLookup:
 
     @cached_property
     def hint(self) -> str:
-        """What is there instead of the first missing file, in brackets with a space before them; "" if all exist."""
+        """Which similar files or which folders exist, in brackets after a space; "" if no file is missing."""
         if not self.skipped:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
@@ -217,10 +217,6 @@ class FileLookup:
         nearest = f"the nearest file is {free[near[0]].as_posix()}, " if near else ""
         folders = Counter(path.parent.as_posix() for path in relative.values())
         return f" ({nearest}searched: {first_few([folder for folder, _ in folders.most_common()])})"
-
-
-def _printable(name: str) -> str:
-    return "".join(letter if letter >= " " else "?" for letter in name)
 
 
 def _comparable(text: str) -> str:
@@ -239,7 +235,7 @@ def _keys(parts: Parts) -> set[str]:
 
 
 def _common_end(a: Parts, b: Parts) -> int:
-    """Return how many parts two paths with matching file names have in common at their ends."""
+    """Return the length of the common end of two paths with matching file names, in parts."""
     return 1 + len([*takewhile(lambda pair: pair[0] == pair[1], zip(a[-2::-1], b[-2::-1], strict=False))])
 
 

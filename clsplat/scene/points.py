@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote
 from clsplat.core.files import open_atomic
 from clsplat.core.reading import read_file
-from clsplat.formats.ply import PlyHeader, format_ply_header, parse_ply_header, read_ascii
+from clsplat.formats.ply import format_ply_header, parse_ply_header, read_ascii
 from clsplat.formats.splats import require_size
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.times import Clock
@@ -46,11 +46,10 @@ class PointTable(NamedTuple):
 
         clock: of the frames; without it, points have no times.  Raises DataError for times in another unit.
         """
-        finite = self.is_finite()
+        finite, times = self.is_finite(), None
         if not finite.all():
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~finite):,}")
         colors = np.asarray(self.rgb[finite], np.float32) / np.float32(255)
-        times = None
         if clock and len(self.times):
             times = np.asarray(clock.of_points(self.file, self.times[finite]), np.float32)
         return PointCloud(self.positions[finite], colors, times)
@@ -74,7 +73,11 @@ def read_ply_table(path: Path) -> PointTable:
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
         raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quote(names)}")
-    table = read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
+    if header.format == "ascii":
+        table = read_ascii(path, data, header)
+    else:
+        require_size(path, len(data), header.start + header.count * header.dtype.itemsize, f"{header.count} points")
+        table = np.frombuffer(data, header.dtype, header.count, header.start)
     positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
     times = np.asarray(table[TIME], np.float64) if TIME in names else np.empty(0)
     return PointTable(path, positions, rgb, times=times)
@@ -96,9 +99,3 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
     properties = [f"{words[kind[name].str]} {name}" for name in kind.names or ()]
     with open_atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())
-
-
-def _read_binary(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
-    """Return the vertices as a structured array, [count]."""
-    require_size(path, len(data), header.start + header.count * header.dtype.itemsize, f"{header.count} points")
-    return np.frombuffer(data, header.dtype, header.count, header.start)

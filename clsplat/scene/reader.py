@@ -68,7 +68,7 @@ class Reader(ABC):
     """
 
     name: ClassVar[str]  # of the format
-    expects: ClassVar[str]  # the files that mark the format, in a few words
+    expects: ClassVar[str]  # the file that marks the format; with `matches`, in a few words
     missing: Missing = "refuse"  # what to do about missing photographs
     root: Path | None = None  # of the scene, where files are looked for; None: the folder of the dataset
     folder: Path = Path()  # of the dataset, in `root`
@@ -77,8 +77,8 @@ class Reader(ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        place = (cls.__module__, cls.__qualname__)
-        Reader.defined[:] = [kind for kind in Reader.defined if (kind.__module__, kind.__qualname__) != place] + [cls]
+        name = (cls.__module__, cls.__qualname__)
+        Reader.defined[:] = [kind for kind in Reader.defined if (kind.__module__, kind.__qualname__) != name] + [cls]
 
     def __init__(self) -> None:
         missing = [field for field in ("name", "expects") if not hasattr(self, field)]
@@ -93,9 +93,9 @@ class Reader(ABC):
             return ""
         return f"the {self.name} dataset in {self.folder.relative_to(self.root).as_posix()} is used{self.choice}"
 
-    @abstractmethod
     def matches(self, path: Path) -> bool:
-        """Return whether a folder holds a dataset of this format, without reading it."""
+        """Return whether a folder holds a dataset of this format, without reading it; by default, a file `expects`."""
+        return (path / self.expects).is_file()
 
     @abstractmethod
     def read(self, path: Path, holdout: int) -> Scene:

@@ -1,9 +1,9 @@
-"""Read a `transforms*.json`: the frames and points that Blender (NeRF) and nerfstudio datasets share."""
+"""Read datasets with cameras in JSON: Blender (NeRF), nerfstudio, and multi-scale Blender (mip-NeRF)."""
 
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -19,10 +19,11 @@ from clsplat.scene.images import stored_size
 from clsplat.scene.lookup import FileLookup, Missing, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
-from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
+from clsplat.scene.scene import Background, PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock, make_clock
 from clsplat.scene.view import Floats, View, fit_to_photograph
 
+POINTS = "points3d.ply"
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
@@ -31,24 +32,31 @@ LENSES = {  # the parameters of each camera_model, in COLMAP's order
     "EQUIRECTANGULAR": (),
 }
 COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
-MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; they take some 15 s
+MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; reading takes about 15 s
 MIN_SCALE = 1e-6  # of the rotation in a pose
 MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
 class JsonFrame:
-    """One image of the file, with values of its own, or else those of the whole file; `where` is for messages."""
+    """One image of a file: its values, with those of the whole file as defaults; `where` is for messages."""
 
-    def __init__(self, folder: Path, where: str, own: dict[str, Any], common: dict[str, Any] | None = None) -> None:
+    def __init__(self, folder: Path, where: str, values: dict[str, Any], common: dict[str, Any] | None = None) -> None:
         self.folder, self.where = folder, where
-        self._own, self._common = own, common or {}
+        self._values, self._common = values, common or {}
 
     def value(self, key: str) -> Any:
         """Return a value as the file holds it, or None."""
-        return self._own[key] if key in self._own else self._common.get(key)
+        return self._values[key] if key in self._values else self._common.get(key)
+
+    def array(self, key: str) -> Floats:
+        """Return a list of numbers as an array, without checks; [0] if it is none."""
+        try:
+            return np.array(self.value(key), np.float64)
+        except (ValueError, TypeError, OverflowError):
+            return np.empty(0)
 
     def number(self, key: str) -> float | None:
-        """Return a number below MAX_VALUE in size, or None where there is none.  Raises DataError for anything else."""
+        """Return a number below MAX_VALUE in size, or None without a value.  Raises DataError for anything else."""
         value = self.value(key)
         if value is None:
             return None
@@ -87,29 +95,28 @@ class Transforms:
             raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
         if len(frames) > MAX_FRAMES:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
-        self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
+        self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
 
     def moments(self) -> list[tuple[str, float | None]]:
-        """Return the place and the `time` of every frame, as the file has it.  Raises DataError for another value."""
+        """Return the position in the file and the `time` of every frame.  Raises DataError if one is not a number."""
         return [(frame.where, frame.number("time")) for frame in self.frames]
 
     def points(self, clock: Clock | None = None) -> PointCloud | None:
-        """Read the points; None when there are none."""
+        """Read the points; None without a file of points."""
         path = self.points_path()
-        points = read_points_ply(path, clock) if path else None
-        return points if points and len(points) else None
+        return read_points_ply(path, clock) if path else None
 
     def points_path(self) -> Path | None:
-        """Return `ply_file_path`, or else `points3d.ply` where that exists."""
-        given = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
-        beside = self.path.parent / "points3d.ply"
-        if given is None:
-            return beside if beside.is_file() else None
-        return safe_join(self.path.parent, given, str(self.path))
+        """Return `ply_file_path`, otherwise `points3d.ply` if it exists."""
+        name = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
+        if name is not None:
+            return safe_join(self.path.parent, name, str(self.path))
+        default = self.path.parent / POINTS
+        return default if default.is_file() else None
 
 
 class FrameFiles(FileLookup):
-    """The photographs of frames of one folder, looked for below `root`, and their masks."""
+    """The photographs of frames of one folder, searched below `root`, and their masks."""
 
     def __init__(self, root: Path, folder: Path, frames: Sequence[JsonFrame]) -> None:
         super().__init__(root, folder, [frame.image_name() for frame in frames], _with_png)
@@ -125,7 +132,7 @@ class FrameFiles(FileLookup):
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
     def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
-        """Return the view of each frame; of those whose image is missing as `missing` says.
+        """Return the views of the frames; `missing` says what to do about missing images.
 
         Raises DataError for damaged numbers and missing files.
         """
@@ -149,6 +156,13 @@ class FrameFiles(FileLookup):
         view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
         return fit_to_photograph(view) if path in self.reduced else view
 
+    def scene(
+        self, path: Path, views: list[View], test: Set[str], points: PointCloud | None, background: Background = "black"
+    ) -> Scene:
+        """Return the scene at `path` of some views of the frames; test: the names of the test views."""
+        held_out = {i for i, view in enumerate(views) if view.name in test}
+        return replace(make_scene(path, views, held_out, points, background), skipped=self.skipped)
+
     @cached_property
     def _first_size(self) -> tuple[int, int]:
         """The size of the first photograph that can be read.  Raises DataError when there is none."""
@@ -159,12 +173,12 @@ class FrameFiles(FileLookup):
 
 
 def _with_png(name: str) -> list[str]:
-    """Return a file name; Blender's exporter omits the suffix."""
+    """Return the spelling of a file name with a suffix, which Blender's exporter omits."""
     return [name if PurePosixPath(name).suffix else f"{name}.png"]
 
 
 def list_frames(parts: Parts, root: Path, *names: str) -> None:
-    """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
+    """Add the frames of the files `names`, if they exist, to `parts`, and the points of the first file."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
     moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
     clock = parts.attempt(make_clock, parts.path, moments)
@@ -175,13 +189,13 @@ def list_frames(parts: Parts, root: Path, *names: str) -> None:
         exists = [os.path.isfile(path) for path in lookup.paths]
         parts.attempt(lookup.find_masks, parts.path, np.flatnonzero(exists).tolist())
         for i, frame in enumerate(lookup.frames):
-            has_size = exists[i] or (frame.value("w") and frame.value("h"))  # or else only the missing file is a fault
+            has_size = exists[i] or (frame.value("w") and frame.value("h"))  # otherwise, the missing file is the fault
             parts.views += filter(None, [parts.attempt(lookup.view, i, clock) if has_size else None])
     if files and files[0]:
-        place = parts.attempt(files[0].points_path)
-        parts.points = parts.attempt(read_ply_table, place) if place else None
+        path = parts.attempt(files[0].points_path)
+        parts.points = parts.attempt(read_ply_table, path) if path else None
         if parts.points and clock and len(parts.points.times):
-            parts.attempt(clock.of_points, place, parts.points.times[parts.points.is_finite()])
+            parts.attempt(clock.of_points, path, parts.points.times[parts.points.is_finite()])
 
 
 def view_name(file_path: str) -> str:
@@ -190,9 +204,9 @@ def view_name(file_path: str) -> str:
 
 
 def view_of(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
-    """Return the view of a frame without a photograph; `size` is the image's where the frame has none.
+    """Return the view of a frame, without its photograph; `size` is that of the image, for a frame without a size.
 
-    clock: of the scene, where it moves.  Raises DataError.
+    clock: of a moving scene.  Raises DataError.
     """
     lens = intern_lens(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
@@ -205,10 +219,9 @@ def view_of(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Cl
 
 def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
-    default_width, default_height = size or (0, 0)
-    width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
+    width, height = (int(frame.number(key) or side) for key, side in zip("wh", size or (0, 0), strict=True))
     if frame.value("camera_model") == "EQUIRECTANGULAR" and 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
-        return panorama_lens(width, height).camera  # other programs write a focal length, which says nothing
+        return panorama_lens(width, height).camera  # other programs write a focal length without meaning
     fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
@@ -221,7 +234,7 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
 
 
 def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
-    """Return a focal length in pixels, given as such or as the angle (rad) that `pixels` span."""
+    """Return a focal length in pixels, from the file or from the field of view (rad) of `pixels`; None without both."""
     length, angle = frame.number(length_key), frame.number(angle_key)
     degrees = frame.number(f"{angle_key[-1]}_fov")  # of instant-ngp
     if angle is None and degrees is not None:
@@ -235,32 +248,29 @@ def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> fl
 
 def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
     """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one, or a panorama.  Raises DataError."""
-    named = frame.value("camera_model")
-    model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if named is None else named
+    model = frame.value("camera_model")
+    model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if model is None else model
     used = LENSES.get(model) if isinstance(model, str) else None
-    given = {key: frame.number(key) or 0.0 for key in DISTORTION}
-    surplus = [key for key, value in given.items() if value and key not in (used or DISTORTION)]
+    values = {key: frame.number(key) or 0.0 for key in DISTORTION}
+    surplus = [key for key, value in values.items() if value and key not in (used or DISTORTION)]
     if used is None or surplus:
         fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "export the cameras with one of these, or pinhole images without distortion"
         )
-    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(given[key] for key in used))
-    known = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)]
-    return Lens(camera.width, camera.height, known, params)
+    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(values[key] for key in used))
+    name = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)]
+    return Lens(camera.width, camera.height, name, params)
 
 
 def camera_to_world_of(frame: JsonFrame) -> Floats:
     """Return [4, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
-    try:
-        matrix = np.array(frame.value("transform_matrix"), np.float64)
-    except (ValueError, TypeError, OverflowError):
-        matrix = np.empty(0)
-    finite = (np.abs(matrix) < MAX_VALUE).all()
-    if matrix.shape in ((4, 4), (3, 4)) and finite and not _is_rotation(matrix[:3, :3]):
+    matrix = frame.array("transform_matrix")
+    is_finite = matrix.shape in ((4, 4), (3, 4)) and (np.abs(matrix) < MAX_VALUE).all()
+    if is_finite and not _is_rotation(matrix[:3, :3]):
         matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
-    if matrix.shape not in ((4, 4), (3, 4)) or not finite or not _is_rotation(matrix[:3, :3]):
+    if not is_finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
             f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
             "remove that frame or export the file again"
@@ -289,7 +299,7 @@ TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 
 
 class BlenderReader(Reader):
-    """A Blender scene; the test views are those of transforms_test.json, none where that is missing.
+    """A Blender scene; the test views are those of transforms_test.json, and none without that file.
 
     With a `time` in every frame of both files it moves (D-NeRF): the first moment of all frames is 0, the last 1.
     """
@@ -306,11 +316,9 @@ class BlenderReader(Reader):
         clock = make_clock(path, transforms.moments() + (held.moments() if held else []))
         files = FrameFiles(self.root or path, path, transforms.frames + (held.frames if held else []))
         views = files.views(path if held else transforms.path, self.missing, clock)
-        tested = {*files.names[len(transforms.frames) :]}
-        held_out = {i for i, view in enumerate(views) if view.name in tested}
+        test = {*files.names[len(transforms.frames) :]}
         # NeRF and later papers render these scenes on white.
-        scene = make_scene(path, views, held_out, transforms.points(clock), background="white")
-        return replace(scene, skipped=files.skipped)
+        return files.scene(path, views, test, transforms.points(clock), background="white")
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRAIN_FILE, TEST_FILE)
@@ -325,7 +333,7 @@ logger = logging.getLogger("clsplat")
 class NerfstudioReader(Reader):
     """A nerfstudio scene; views are in order of name.
 
-    The lists `train_filenames` and `test_filenames` are the split where the file has one of them; images on neither
+    The lists `train_filenames` and `test_filenames` are the split if the file has one of them; images on neither
     list are left out.  Otherwise every `holdout`-th view is for testing.  With a `time` in every frame the scene moves.
     """
 
@@ -343,21 +351,18 @@ class NerfstudioReader(Reader):
         renamed = dict(zip(files.given, files.names, strict=True))
         train, test = (_listed(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
-            scene = make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
-            return replace(scene, skipped=files.skipped)
-        test = test or set()
-        kept = views if train is None else [view for view in views if view.name in train | test]
-        if len(kept) < len(views):
-            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
-        held_out = {i for i, view in enumerate(kept) if view.name in test}
-        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=files.skipped)
+            test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
+        listed = views if train is None else [view for view in views if view.name in train | (test or set())]
+        if len(listed) < len(views):
+            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(listed))
+        return files.scene(path, listed, test or set(), transforms.points(clock))
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
 
 
 def _listed(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
-    """Return the view names of a list of file paths, or None where there is none.  Raises DataError."""
+    """Return the view names of a list of file paths, or None if the file has no such list.  Raises DataError."""
     entries = transforms.table.get(key)
     if entries is None:
         return None
@@ -374,7 +379,7 @@ def _listed(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set
 
 # Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes.
 
-METADATA_FILE, POINTS = "metadata.json", "points3d.ply"
+METADATA_FILE = "metadata.json"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
 
 
@@ -393,11 +398,9 @@ class MultiscaleReader(Reader):
         files = FrameFiles(self.root or path, path, train + test)
         levels = {name: frame.number("label") or 0 for name, frame in zip(files.names, files.frames, strict=True)}
         views = [replace(view, downscale=2 ** levels[view.name]) for view in files.views(path, self.missing)]
-        tested = {*files.names[len(train) :]}
-        held_out = {i for i, view in enumerate(views) if view.name in tested}
         points = path / POINTS
         cloud = read_points_ply(points) if points.is_file() else None
-        return replace(make_scene(path, views, held_out, cloud, background="white"), skipped=files.skipped)
+        return files.scene(path, views, {*files.names[len(train) :]}, cloud, background="white")
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)

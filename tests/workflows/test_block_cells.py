@@ -78,7 +78,7 @@ def written(path: Path, rng: np.random.Generator, count: int, near: float = 0.2)
 
 
 def test_joined_models_keep_row_order(rng, tmp_path, monkeypatch):
-    monkeypatch.setattr(ply, "PIECE_ROWS", 7)  # several pieces
+    monkeypatch.setattr(ply, "ROWS", 7)  # several pieces
     files = [tmp_path / f"{i}.ply" for i in range(3)]
     parts = [written(file, rng, count) for file, count in zip(files, (20, 1, 14), strict=True)]
     seen = []
