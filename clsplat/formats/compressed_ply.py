@@ -48,9 +48,8 @@ def read_compressed_ply(path: Path) -> SplatFile:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         size = file.seek(0, os.SEEK_END)
         tables = {}
-        for name in ("chunk", "vertex", "sh"):
-            if (section := header.sections.get(name)) is None:
-                continue
+        for name in filter(header.sections.__contains__, ("chunk", "vertex", "sh")):
+            section = header.sections[name]
             length = section.count * section.dtype.itemsize
             require_size(path, size, section.start + length, f"{section.count} rows of '{name}'")
             file.seek(section.start)

@@ -62,13 +62,10 @@ class Codec:
     read: Callable[[Path, Reading], SplatFile] | None = None
     write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256
     command: str = ""  # the only one that writes this format
-    keeps_filter: bool = False  # the world filter, filter_3D
-    keeps_motion: bool = False
+    keeps_all: bool = False  # the world filter, motion, values that are not finite, and positions in float64
     keeps_mode: bool = True  # whether a model is a mip model
     keeps_numbers: bool = False  # numbers for rendering
-    keeps_nan: bool = False
     keeps_origin: bool = False  # apart from the numbers for rendering
-    keeps_doubles: bool = False  # positions in float64
     has_quality: bool = False  # writing uses Writing.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
 
@@ -109,11 +106,8 @@ CODECS = (
         lambda start: (header := start.ply()) is not None and "f_dc_0" in (header.dtype.names or ()),
         lambda path, options: read_ply(path),
         lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
-        keeps_filter=True,
-        keeps_motion=True,
+        keeps_all=True,
         keeps_numbers=True,
-        keeps_nan=True,
-        keeps_doubles=True,
     ),
     Codec(
         "compressed PLY",
@@ -250,11 +244,11 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
     """
     codec = writing_format(path)
     assert codec.write is not None
-    if not codec.keeps_filter and "filter_variance" in splats.parameters:
+    if not codec.keeps_all and "filter_variance" in splats.parameters:
         raise ValueError(f"{path}: {codec.name} cannot store a world filter; call baked() first")
-    if not codec.keeps_motion:
+    if not codec.keeps_all:
         require_static(path, splats, codec.name)
-    if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
+    if not codec.keeps_all and (bad := int(not_finite(splats.parameters).sum())):
         raise DataError(
             f"{path}: {bad:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them, "
             "or write a PLY"

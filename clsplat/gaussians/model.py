@@ -288,7 +288,7 @@ class Model:
         Raises ConfigError for an unknown extension or world coordinates that the format cannot hold, and OutputError if
         the file cannot be written.
         """
-        model = self if writing_format(Path(path)).keeps_filter else self.baked()
+        model = self if writing_format(Path(path)).keeps_all else self.baked()
         splats = model.to_splat_file() if not (options and options.world) else model._in_world(Path(path))
         digest = write(Path(path), splats, options)
         write_sky_file(self.sky, Path(path), digest)
@@ -302,7 +302,7 @@ class Model:
         means: Any = self.means + self.origin
         if float32_holds(means, self.log_scales):
             means = means.astype(np.float32)
-        elif writing_format(path).keeps_doubles:
+        elif writing_format(path).keeps_all:
             LOG.info("%s: x, y, and z are doubles, since floats are too coarse for world coordinates", path)
         else:
             raise ConfigError(

@@ -30,10 +30,7 @@ def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
     points[~(points[:, 2] > 0)] = np.nan
     with np.errstate(all="ignore"):
-        if view.lens is not None:
-            return photo_lens(view).project(points)
-        camera = view.camera
-        return np.asarray(points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+        return photo_lens(view).project(points)
 
 
 def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:

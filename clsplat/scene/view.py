@@ -267,9 +267,9 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 
 
 def _as_taken(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
-    """Some channels of a file's pixels at the size of its camera before downscaling: upright and undistorted.
+    """Return some channels of a file at the size of the camera before downscaling: upright and undistorted.
 
-    Raises DataError as is_turned does.
+    Raises DataError as needs_rotation does.
     """
     if path == NO_FILE:
         raise DataError(f"the view {quote(view.name)} has no photograph; expected one with an image_path")
@@ -290,16 +290,16 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
     COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or upright with True.
     Raises DataError when neither fits.
     """
-    found = size(False)
-    if fits_camera(view, found):
+    width, height = size(False)
+    if fits_camera(view, (width, height)):
         return False
-    if fits_camera(view, found[::-1]):
-        found = size(True)
-        if fits_camera(view, found):
+    if fits_camera(view, (height, width)):
+        width, height = size(True)
+        if fits_camera(view, (width, height)):
             return True
     camera = view.lens or view.camera
     raise DataError(
-        f"{path}: the image is {found[0]}x{found[1]} pixels, its camera {camera.width}x{camera.height}; expected the "
+        f"{path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; expected the "
         f"same size{'' if view.lens else ', or a larger image of the same shape'}: use the images the cameras were "
         "made from"
     )
@@ -330,14 +330,10 @@ def fits_camera(view: View, size: Size) -> bool:
     """Return whether an image of `size` (width, height) fits the camera of a view."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
-    return _scales_to(size, (view.camera.width, view.camera.height))
-
-
-def _scales_to(file: Size, camera: Size) -> bool:
-    """Return whether one divisor >= 1 reduces the file's size to the camera's, rounded as in Camera.downscaled."""
-    smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
-    largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
-    return smallest <= largest
+    sides = [*zip(size, (view.camera.width, view.camera.height), strict=True)]
+    # a divisor >= 1 must reduce the file's size to the camera's, rounded as in Camera.downscaled
+    smallest = max(1.0, *(side / (c + 0.5) for side, c in sides))
+    return smallest <= min(side / (c - 0.5) if c > 1 else np.inf for side, c in sides)
 
 
 # Lenses with a changed focal length: the undistorted photograph stays the same.
@@ -406,7 +402,7 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
 
 
 def _below(view: View) -> Iterator[tuple[Path, str]]:
-    """The folders that contain the image, up to the one that the view's name starts from, and its path below each."""
+    """Yield the folders that contain the image, up to the one that its view's name starts from, and its path below."""
     parts = PurePosixPath(view.name if view.lens is None else photograph_of(view.name)).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:

@@ -20,7 +20,7 @@ from clsplat.scene.view import photograph_of
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
 TakenBy = Literal["holdout", "train", "missing"]
-Taken = Mapping[TakenBy, Sequence[str]]  # names that cannot be selected, by the setting that excludes them
+Taken = Mapping[TakenBy, Sequence[str]]  # names that cannot be selected, by the reason: a setting, or missing files
 NONE: Taken = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -145,16 +145,6 @@ def _excluded_error(source: str, name: str, key: TakenBy) -> DataError:
     return MissingViewError(f"{source}: {message}")
 
 
-def choose(
-    choice: int | ViewSelection, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE
-) -> set[int]:
-    """Return the indices of the selected names; a number selects every n-th, starting with the first, and 0 none.
-
-    Raises DataError as ViewSelection.select does.
-    """
-    return choice.select(names, folders, others) if isinstance(choice, ViewSelection) else every_nth(names, choice)
-
-
 class _NameIndex:
     """Find views by the last parts of their photographs' names: `a/b.png`, `b.png` and `b` name the same view."""
 
@@ -209,11 +199,8 @@ def _only_match(listed: str, matches: Sequence[int], names: Sequence[str], sourc
 
 def _unknown_name_error(listed: str, names: Sequence[str], source: str) -> DataError:
     similar = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
-    more = (
-        f"did you mean {quote(similar[0])}?"
-        if similar
-        else f"the first is {quote(names[0])}: correct or remove the name"
-    )
+    more = f"the first is {quote(names[0])}: correct or remove the name"
+    more = f"did you mean {quote(similar[0])}?" if similar else more
     return MissingViewError(f"{source}: no photograph is called {quote(listed)}; {more}")
 
 
@@ -244,18 +231,17 @@ class Split:
         Raises DataError for wrong names, or when one split takes all views.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
-        if isinstance(self.holdout, ViewSelection) and not (
-            self.holdout.every and scene.test
-        ):  # the dataset says which
+        holdout = self.holdout
+        if isinstance(holdout, ViewSelection) and not (holdout.every and scene.test):  # the split of the dataset wins
             names = [view.name for view in scene.views]
-            test = _select(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
+            test = _select(scene, "holdout", holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
                     f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; name fewer, "
                     "or raise `every`, to leave some for training"
                 )
             if not test:
-                remedy = "lower its offset" if self.holdout.every else "name photographs that are there"
+                remedy = "lower its offset" if holdout.every else "name photographs that are there"
                 raise DataError(
                     f"{scene.path}: scene.holdout takes 0 of {len(names)} photographs for testing; expected some: "
                     f"{remedy}, or set scene.holdout to 0 for none"
@@ -307,12 +293,10 @@ class Split:
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
             return scene
-        chosen = self.validation
-        fold = (
-            _validation_fold(scene)
-            if chosen == "auto"
-            else _select_training(scene, "validation", chosen, folders, left_out)
-        )
+        if self.validation == "auto":
+            fold = _validation_fold(scene)
+        else:
+            fold = _select_training(scene, "validation", self.validation, folders, left_out)
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
@@ -348,9 +332,12 @@ def _select(
     folders: Sequence[Path],
     others: Taken = NONE,
 ) -> set[int]:
-    """Return the indices of the selected names.  Raises DataError with the name of the setting."""
+    """Return the indices of the selected names; a number selects every n-th, starting with the first, and 0 none.
+
+    key: the setting, which a DataError names.
+    """
     try:
-        return choose(choice, names, folders, others)
+        return choice.select(names, folders, others) if isinstance(choice, ViewSelection) else every_nth(names, choice)
     except DataError as error:
         raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
 

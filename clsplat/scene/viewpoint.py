@@ -105,12 +105,8 @@ def scene_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
 
 
 def scene_center(views: Sequence[View]) -> NDArray[np.floating]:
-    """Return the point that the cameras look at, [3] scene units."""
-    return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
-
-
-def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the point nearest to all optical axes, in least squares, [3] scene units."""
+    """Return the point that the cameras look at, nearest to all optical axes in least squares, [3] scene units."""
+    positions, directions = np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views])
     planes = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point, *_ = np.linalg.lstsq(planes.sum(axis=0), np.einsum("nij,nj->i", planes, positions), rcond=None)
     return np.asarray(point)

@@ -11,7 +11,7 @@ from clsplat.core.errors import ConfigError, quote
 from clsplat.formats.splats import is_timestamp
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.view_selection import ViewSelection, choose
+from clsplat.scene.view_selection import ViewSelection
 from clsplat.viewer.video import camera_path, encoding
 from clsplat.viewer.video.frames import LAYERS, Canvas, Image, layer_image, side_by_side
 from clsplat.viewer.video.paths import (
@@ -168,7 +168,7 @@ def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Fl
     size = request.size or even_size(rig.camera)
     if SEPARATOR in request.path:
         names = [view.name for view in scene.views]
-        (chosen,) = choose(ViewSelection(names=[request.path.partition(SEPARATOR)[2]]), names, [])
+        (chosen,) = ViewSelection(names=[request.path.partition(SEPARATOR)[2]]).select(names, [])
         return VideoPlan(stay(scene.views[chosen], request.frames or FRAMES, size), request.fps or FPS)
     return VideoPlan(PATHS[request.path](rig, request.frames or FRAMES, size), request.fps or FPS)
 
