@@ -334,8 +334,8 @@ def read_gltf(path: Path) -> SplatFile:
     data = read_file(path, "a .glb or .gltf file", limit=MAX_FILE)
     is_text = not data.startswith(MAGIC) and (path.suffix.lower() == ".gltf" or data.lstrip()[:1] == b"{")
     text, binary = (data, None) if is_text else _chunks(path, data)
-    if len(text) > (most := MAX_TEXT if is_text else MAX_JSON):
-        raise DataError(f"{path}: its JSON has {len(text)} bytes; expected at most {most}; export fewer primitives")
+    if len(text) > (limit := MAX_TEXT if is_text else MAX_JSON):
+        raise DataError(f"{path}: its JSON has {len(text)} bytes; expected at most {limit}; export fewer primitives")
     try:
         tree = json.loads(text)
         gltf = Gltf(path, tree, binary)

@@ -1,4 +1,4 @@
-"""Help to write compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
+"""Pack numbers for compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
 
 import hashlib
 import logging
@@ -66,10 +66,10 @@ def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
     return (levels < -0.5) | (levels > 255.5)
 
 
-def warn_clipped(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
+def warn_clipped(path: Path, name: str, ranges: str, beyond: NDArray[np.bool_]) -> None:
     """Warn how many Gaussians, rows of `beyond`, have values outside of a format's range."""
     if count := int(beyond.any(axis=1).sum()):
-        LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, what, f"{count:,}")
+        LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
 
 # Lossless WebP images of 8-bit RGBA pixels that store numbers.
@@ -95,16 +95,16 @@ def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     return bytes(data.tobytes())
 
 
-def decode(path: Path, name: str, data: bytes, least: int, most: int) -> NDArray[np.uint8]:
-    """Decode the pixels of an image, [n, 4] RGBA, row by row, with `least` <= n <= `most`.
+def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
+    """Decode the pixels of an image, [n, 4] RGBA, row by row, with `min_pixels` <= n <= `max_pixels`.
 
     Raises DataError for another size, before decoding, and for another format.
     """
     width, height = size(path, name, data)
-    if not least <= width * height <= most:
+    if not min_pixels <= width * height <= max_pixels:
         raise DataError(
-            f"{path}: {name} has {width} x {height} px; expected {least} to {most} px for its numbers; export the file "
-            "again"
+            f"{path}: {name} has {width} x {height} px; expected {min_pixels} to {max_pixels} px for its numbers; "
+            "export the file again"
         )
     try:
         pixels = _rgba(np.frombuffer(data, np.uint8))
@@ -148,6 +148,7 @@ class Output:
         self._file, self._sum = file, hashlib.sha256()
 
     def write(self, data: bytes) -> None:
+        """Append bytes."""
         self._file.write(data)
         self._sum.update(data)
 

@@ -33,7 +33,7 @@ def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray
         for _ in range(LLOYD_STEPS):
             means = np.sort(cells.means(cuts))
             cuts[1:-1] = np.searchsorted(ordered, (means[1:] + means[:-1]) / 2)
-        cuts = cells.exchanged(cuts)
+        cuts = cells.rebalance(cuts)
     return np.sort(cells.means(cuts))
 
 
@@ -56,15 +56,15 @@ class _Cells:
         total = self.sums[last] - self.sums[first]
         return np.asarray(self.squares[last] - self.squares[first] - np.square(total) / np.maximum(last - first, 1))
 
-    def exchanged(self, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
+    def rebalance(self, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Merge the cheapest pair of cells and split the worst cell, as long as that reduces the error."""
         for _ in range(ENTRIES):
-            own = self.errors(cuts[:-1], cuts[1:])
-            joined = self.errors(cuts[:-2], cuts[2:]) - own[:-1] - own[1:]
+            errors = self.errors(cuts[:-1], cuts[1:])
+            joined = self.errors(cuts[:-2], cuts[2:]) - errors[:-1] - errors[1:]
             middle = np.clip(
                 np.searchsorted(self.ordered, self.means(cuts)), cuts[:-1], cuts[1:]
             )  # clipped for empty cells
-            gain = own - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
+            gain = errors - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
             worst = int(gain.argmax())
             joined[max(worst - 1, 0) : worst + 1] = np.inf  # neighbors of the split cell
             cheap = int(joined.argmin())
@@ -114,14 +114,14 @@ def palette(
     vectors, moved = sample[starts], sample_whole[starts]
     for _ in range(PALETTE_ROUNDS):
         labels, distance = _nearest_vectors(sample_whole, moved)
-        held = np.bincount(labels, minlength=entries)
+        counts = np.bincount(labels, minlength=entries)
         sums = [np.bincount(labels, column, minlength=entries) for column in sample_whole.T]
-        moved = np.rint(np.stack(sums, axis=1) / np.maximum(held, 1)[:, None]).astype(np.float32)
-        empty = np.flatnonzero(held == 0)
+        moved = np.rint(np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]).astype(np.float32)
+        empty = np.flatnonzero(counts == 0)
         farthest = np.argsort(-distance, kind="stable")[: len(empty)]
         moved[empty] = sample_whole[farthest]
     for column in range(points.shape[1]):
-        vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(held, 1)
+        vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(counts, 1)
     vectors[empty] = sample[farthest]
     return vectors, _nearest_vectors(whole, moved)[0]
 
@@ -146,13 +146,13 @@ def _nearest_vectors(
     return labels, distance
 
 
-def _sample_rows(count: int, most: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
+def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return ascending rows of points that train a palette, evenly spaced by weight, or by row without weights."""
-    most = min(count, most)
+    max_rows = min(count, max_rows)
     if not weights.any():
-        return np.linspace(0, count - 1, most).astype(np.int64)
+        return np.linspace(0, count - 1, max_rows).astype(np.int64)
     total = np.cumsum(weights)
-    return np.asarray(np.searchsorted(total, (np.arange(most) + 0.5) / most * total[-1]))
+    return np.asarray(np.searchsorted(total, (np.arange(max_rows) + 0.5) / max_rows * total[-1]))
 
 
 def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -161,12 +161,12 @@ def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))
 
 
-def unique_points(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Return the distinct points in order of appearance and the label of each point; None if more than `most`."""
-    if len(np.unique(points[:, 0])) > most:  # decides at once for most models
+def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """Return the distinct points in order of appearance and the label of each point; None if more than `max_points`."""
+    if len(np.unique(points[:, 0])) > max_points:  # decides at once for most models
         return None
     distinct, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    if len(distinct) > most:
+    if len(distinct) > max_points:
         return None
     order = np.argsort(first)
     rank = np.empty_like(order)

@@ -114,11 +114,11 @@ class Files:
                 f"{self.path}: {fault}; expected the files that {META} names, stored or deflated; export it again"
             )
         images = sum(len(data) for key, data in self.contents.items() if key != META)
-        most = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.max_size - images)
+        limit = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.max_size - images)
         with archive.open(info) as member:
-            data = member.read(most + 1)
-        if len(data) > most:
-            raise DataError(f"{self.path}: {quote(name)} has more than {most} bytes; export it again")
+            data = member.read(limit + 1)
+        if len(data) > limit:
+            raise DataError(f"{self.path}: {quote(name)} has more than {limit} bytes; export it again")
         return data
 
 
@@ -182,9 +182,9 @@ class _Sog:
         require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
 
     def splats(self) -> SplatFile:
-        """Decode all parameters."""
+        """Decode the parameters of all splats."""
         base = self._pixels("sh0", 0)
-        scales, opacity = self._looked_up("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
+        scales, opacity = self._decode("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
         logit = logits(opacity[:, None] / 255.0)
         if self.old:
             lows, highs = self._ends("sh0", 4)
@@ -194,7 +194,7 @@ class _Sog:
             "quats": self._quats(),
             "log_scales": scales,
             "logit_opacity": logit,
-            "sh_base": self._looked_up("sh0", base[:, :3]),
+            "sh_base": self._decode("sh0", base[:, :3]),
             "sh_rest": self._rest(),
         }
         mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
@@ -238,10 +238,10 @@ class _Sog:
             raise DataError(
                 f"{self.path}: labels of shN use {used} centroids, but shN.count is {entries}; export it again"
             )
-        most = self._most(size * MAX_PALETTE)
-        centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, most)
+        limit = self._most(size * MAX_PALETTE)
+        centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, limit)
         table = centroids[: entries * size, :3].reshape(entries, 3 * size)
-        return np.asarray(self._looked_up("shN", table)[chosen])
+        return np.asarray(self._decode("shN", table)[chosen])
 
     def _degree_of_width(self, data: bytes) -> int:
         """Return the SH degree of a version 1 file, from the width of its centroids, 64 per row."""
@@ -252,8 +252,8 @@ class _Sog:
             )
         return WIDTHS[width // PER_ROW]
 
-    def _looked_up(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Decode bytes: indices into a codebook, or, in version 1, fractions of a range."""
+    def _decode(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Decode bytes of a part: indices into its codebook, or, in version 1, fractions of its range."""
         if not self.old:
             entries = self._numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
@@ -271,8 +271,8 @@ class _Sog:
             raise DataError(
                 f"{self.path}: {name} names {len(group)} files; expected at least {number + 1}; export it again"
             )
-        label, most = f"image {number} of {name}", self._most(self.count)
-        return packing.decode(self.path, label, group[number], self.count, most)[: self.count]
+        label, limit = f"image {number} of {name}", self._most(self.count)
+        return packing.decode(self.path, label, group[number], self.count, limit)[: self.count]
 
     @staticmethod
     def _most(count: int) -> int:
@@ -314,10 +314,10 @@ class _Sog:
             )
         return np.array(value, np.float64)
 
-    def _whole_number(self, key_path: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
+    def _whole_number(self, key_path: str, value: Any, limit: int = packing.MAX_SIDE**2) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= limit:
             raise DataError(
-                f"{self.path}: {key_path} is {quote(value)}; expected a whole number from 1 to {most}; export it again"
+                f"{self.path}: {key_path} is {quote(value)}; expected a whole number from 1 to {limit}; export it again"
             )
         return value
 
@@ -468,13 +468,15 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     Quality `high` rounds tables only to the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
-    most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(RELATIVE_PALETTES[options.quality] * len(rest))))
-    exact = unique_points(rest, most) if rest.shape[1] else None
+    max_entries = min(
+        MAX_PALETTE, max(_few(len(rest), options.quality), int(RELATIVE_PALETTES[options.quality] * len(rest)))
+    )
+    exact = unique_points(rest, max_entries) if rest.shape[1] else None
     harmonics = None if exact is None else Harmonics.from_vectors(*exact)
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
-        harmonics = Harmonics.from_vectors(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
+        harmonics = Harmonics.from_vectors(*tree_palette(rest, weights, max_entries, MEDIAN_STEPS[options.quality]))
         base = compensate_base(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics

@@ -31,15 +31,15 @@ def round_to(values: Floats, step: float) -> NDArray[np.float32]:
 
 
 def round_means(
-    means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], share: float
+    means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], fraction: float
 ) -> NDArray[np.float32]:
-    """Round positions [N, 3] to about `share` of the size of each Gaussian, for those of median weight.
+    """Round positions [N, 3] to about `fraction` of the size of each Gaussian, for those of median weight.
 
     The step is as 1 / sqrt(weight) (see `quantization_steps`): a power of two of the levels of a SOG.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
-    wanted = np.log2(share * sizes) - log_weights[:, None] / 2
+    wanted = np.log2(fraction * sizes) - log_weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(wanted), 0, MOST_BITS))
     return _positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
 
@@ -94,16 +94,16 @@ USUAL = 0.028  # RMS of SH coefficients: fox after 7,000 steps; lego has 0.037, 
 ROWS = 1 << 15  # rows rounded at once
 
 
-def quantization_steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
-    """Return a step for each Gaussian, [N]: a power of two, about `median` for the median weight, from 1 to `most`."""
+def quantization_steps(log_weights: NDArray[np.float64], median: float, max_step: float) -> NDArray[np.float32]:
+    """Return a step for each Gaussian, [N]: a power of two up to `max_step`, about `median` for the median weight."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
-    return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(most))), np.float32)
+    return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(max_step))), np.float32)
 
 
-def usual_step(rest: Floats, step: float, most: float) -> float:
-    """Scale a step that suits SH of RMS size USUAL to these SH, up to `most`."""
+def usual_step(rest: Floats, step: float, max_step: float) -> float:
+    """Scale a step that suits SH of RMS size USUAL to the size of these SH, up to `max_step`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
-    return min(most, step * max(size / USUAL, 1e-3))
+    return min(max_step, step * max(size / USUAL, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
@@ -169,74 +169,76 @@ def tree_palette(
 ) -> tuple[NDArray[np.float64], Labels]:
     """Return at most `entries` vectors [E, 3 K] for SH [N, 3 K], and the label of each Gaussian, [N].
 
-    log_weights: as returned by `log_weights`; median_step: median step of vectors, in LEVELS, for SH of typical size.
+    log_weights: from `log_weights`; median_step: median step of vectors, in LEVELS, for SH of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _divided(_in_form(rest, form), weights, entries)
-    held = np.bincount(labels, weights)
-    vectors = _sums(labels, weights, rest, len(held)) / held[:, None]
-    log_held = np.log2(held)
-    step = quantization_steps(log_held - np.median(log_held), usual_step(rest, median_step, median_step), LARGEST_STEP)
-    first = np.zeros(len(held), np.int64)
+    totals = np.bincount(labels, weights)
+    vectors = _sums(labels, weights, rest, len(totals)) / totals[:, None]
+    log_totals = np.log2(totals)
+    step = quantization_steps(
+        log_totals - np.median(log_totals), usual_step(rest, median_step, median_step), LARGEST_STEP
+    )
+    first = np.zeros(len(totals), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
     rounded = round_sh(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
-    return rounded[order], place[labels]
+    return rounded[order], rank[labels]
 
 
 def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
     """Transform SH so that the metric becomes the squared Euclidean distance, [N, 3 K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
-    table, found = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
+    table, transformed = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
     for row in range(count):
         for column in range(row + 1):
-            found[:, column] += root[row, column] * table[:, row]
-    return found.reshape(rest.shape)
+            transformed[:, column] += root[row, column] * table[:, row]
+    return transformed.reshape(rest.shape)
 
 
 def _divided(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
     """Split points [N, c] into at most `entries` clusters; return the label of each point."""
     labels, parts = np.zeros(len(points), np.int64), 1
     while parts < entries:
-        held = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half can be empty
-        mean = _sums(labels, weights, points, parts) / held[:, None]
+        totals = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half can be empty
+        mean = _sums(labels, weights, points, parts) / totals[:, None]
         away = (points - mean[labels]).astype(np.float32)
         spread = _sums(labels, weights, np.square(away), parts)
         errors = np.where(np.bincount(labels, minlength=parts) > 1, spread.sum(axis=1), 0)
-        most = min(entries - parts, -(-parts // round(1 / AT_ONCE)))
-        chosen = np.argsort(-errors, kind="stable")[:most]
+        max_chosen = min(entries - parts, -(-parts // round(1 / AT_ONCE)))
+        chosen = np.argsort(-errors, kind="stable")[:max_chosen]
         chosen = chosen[errors[chosen] > 0]
         if not len(chosen):
             break
         new = np.full(parts, -1)
         new[chosen] = np.arange(len(chosen))
         rows = np.flatnonzero(new[labels] >= 0)
-        own = new[labels[rows]]
+        cluster = new[labels[rows]]
         beyond = away[rows, spread.argmax(axis=1)[labels[rows]]] > 0
-        beyond = _halves(points[rows], weights[rows], own, beyond)
-        labels[rows[beyond]] = parts + own[beyond]
+        beyond = _halves(points[rows], weights[rows], cluster, beyond)
+        labels[rows[beyond]] = parts + cluster[beyond]
         parts += len(chosen)
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
 def _halves(
-    points: NDArray[np.float32], weights: NDArray[np.float64], own: Labels, beyond: NDArray[np.bool_]
+    points: NDArray[np.float32], weights: NDArray[np.float64], cluster: Labels, beyond: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Run Lloyd's iteration with two means per cluster; return which points are in the second half."""
-    parts = int(own.max()) + 1
+    parts = int(cluster.max()) + 1
     for _ in range(LLOYD_STEPS):
-        half = 2 * own + beyond
-        held = np.maximum(np.bincount(half, weights, minlength=2 * parts), TINY_WEIGHT)
-        means = (_sums(half, weights, points, 2 * parts) / held[:, None]).reshape(parts, 2, -1)
+        half = 2 * cluster + beyond
+        totals = np.maximum(np.bincount(half, weights, minlength=2 * parts), TINY_WEIGHT)
+        means = (_sums(half, weights, points, 2 * parts) / totals[:, None]).reshape(parts, 2, -1)
         across = means[:, 1] - means[:, 0]
         middle = (across * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)
         along = np.zeros(len(points))
         for column in range(points.shape[1]):
-            along += points[:, column] * across[own, column]
-        beyond = along > middle[own]
+            along += points[:, column] * across[cluster, column]
+        beyond = along > middle[cluster]
     return beyond
 
 

@@ -151,23 +151,23 @@ def looks_like_ksplat(data: bytes, size: int) -> bool:
     """Return whether the first bytes of a file of `size` bytes can be a header; the format has no magic number."""
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
-    most, sections, _, splats = struct.unpack_from("<4I", data, 4)
+    max_sections, sections, _, splats = struct.unpack_from("<4I", data, 4)
     (level,) = struct.unpack_from("<H", data, 20)
-    return bool(sections <= most <= size // SECTION and level < len(KINDS) and 0 < splats <= size // 24)
+    return bool(sections <= max_sections <= size // SECTION and level < len(KINDS) and 0 < splats <= size // 24)
 
 
 def read_ksplat(path: Path) -> SplatFile:
     """Read a `.ksplat` file.  Raises DataError if it is missing or damaged."""
     data = read_file(path, "a .ksplat file", limit=MAX_FILE)
-    most, sections, _, splats, level = struct.unpack_from("<4IH", data.ljust(HEADER, b"\xff"), 4)
+    max_sections, sections, _, splats, level = struct.unpack_from("<4IH", data.ljust(HEADER, b"\xff"), 4)
     if len(data) >= HEADER and not data[0] and not sections + splats:
         raise DataError(f"{path}: has no splats; export it again")
     if not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
-    sections = sections or most  # the number of those loaded so far, which some writers leave at 0
+    sections = sections or max_sections  # the number of those loaded so far, which some writers leave at 0
     ends = struct.unpack_from("<2f", data, 36)
-    start = HEADER + SECTION * most
-    require_size(path, len(data), start, f"{most} sections")
+    start = HEADER + SECTION * max_sections
+    require_size(path, len(data), start, f"{max_sections} sections")
     parts = []
     for number in range(sections):
         section = SplatSection.parse(data, HEADER + SECTION * number)
@@ -223,9 +223,9 @@ def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDAr
     filled = section.full * section.bucket_size
     if filled + int(partial.sum()) < section.count or filled > section.rows:
         raise DataError(f"{path}: its buckets have fewer splats than the {section.count} declared; copy the file again")
-    held = np.concatenate([np.full(section.full, section.bucket_size), np.minimum(partial, section.count)])
-    ends = np.minimum(np.cumsum(held), section.count)
-    bucket = np.repeat(np.arange(len(held)), np.diff(ends, prepend=0))
+    counts = np.concatenate([np.full(section.full, section.bucket_size), np.minimum(partial, section.count)])
+    ends = np.minimum(np.cumsum(counts), section.count)
+    bucket = np.repeat(np.arange(len(counts)), np.diff(ends, prepend=0))
     table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial)
     centers = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
     return centers[bucket].astype(np.float64)

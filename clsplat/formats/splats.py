@@ -73,7 +73,7 @@ def motion_columns(width: int) -> tuple[str, ...]:
 def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
     """Return the motion columns among a file's properties: () if there are none, None if the table is incomplete."""
     columns = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
-    return next((known for known in ((), *map(motion_columns, WIDTHS)) if set(known) == columns), None)
+    return next((table for table in ((), *map(motion_columns, WIDTHS)) if set(table) == columns), None)
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
@@ -350,11 +350,11 @@ def require_static(path: Path, splats: SplatFile, name: str) -> None:
         )
 
 
-def require_size(path: Path, held: int, expected: int, what: str) -> None:
+def require_size(path: Path, size: int, expected: int, content: str) -> None:
     """Raise DataError if a file has fewer bytes than its header declares."""
-    if held < expected:
+    if size < expected:
         raise DataError(
-            f"{path}: has {held} bytes, but its header declares {what}, {expected} bytes; "
+            f"{path}: has {size} bytes, but its header declares {content}, {expected} bytes; "
             "the file is truncated: copy or export it again"
         )
 

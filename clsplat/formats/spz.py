@@ -241,10 +241,10 @@ def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
     """Return the SH step of each Gaussian, [N] levels; 1 for all if nothing is rounded."""
-    most = LARGEST_STEP[options.quality]
-    if most == 1 or not rest.shape[1]:
+    max_step = LARGEST_STEP[options.quality]
+    if max_step == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
-    return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), most)
+    return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), max_step)
 
 
 def _rounded_sh(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -454,11 +454,11 @@ def _most(data: bytes) -> int:
     return max(len(data) * RATIO, ALIKE)
 
 
-def _check_size(path: Path, header: SpzHeader, most: int) -> None:
+def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
     """Raise DataError, before allocating, if a file cannot contain as many splats as it declares."""
-    if (size := sum(header.sizes)) > most:
+    if (total := sum(header.sizes)) > limit:
         raise DataError(
-            f"{path}: declares {header.count} splats of {size} bytes, more than it can contain ({most}); "
+            f"{path}: declares {header.count} splats of {total} bytes, more than it can contain ({limit}); "
             "the file is truncated or damaged: copy or export it again"
         )
     require_memory(path, header.count, min(header.degree, MAX_DEGREE))

@@ -212,8 +212,8 @@ def read(path: Path, options: Reading | None = None) -> SplatFile:
     path = model_file(path)
     codec = detect(path) or format_of_name(path)  # the reader of the named format reports what is wrong
     if codec is None:
-        known = ", ".join(endings(reads=True))
-        raise DataError(f"{path}: unknown model format; expected one of {known}")
+        known_endings = ", ".join(endings(reads=True))
+        raise DataError(f"{path}: unknown model format; expected one of {known_endings}")
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} can be written but not read; convert the model that it was made from")
     with np.errstate(all="ignore"):  # values that are not finite are handled below

@@ -165,11 +165,11 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and th
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models of directions next to and behind the camera, too
 
-# Wide photographs: panoramas, and fisheyes of about 180 degrees and more, are cut into the faces of a cube.
+# Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
 MIN_WIDE = math.radians(80)  # to a side of the image: a pinhole image would be 3.6 times as wide
 MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
-RIM = 1.5  # px: a sample at the edge of what a fisheye shows would mix with the dark beyond
+RIM = 1.5  # px: a sample at the edge of a fisheye's circle would mix with the dark beyond it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
 FACE_GRID = 128  # directions to a side, at which the visible part of a face is measured
 MIN_SHOWN = 0.02  # visible fraction of a face; one with less is left out
@@ -195,7 +195,7 @@ class Lens:
     model: str
     params: tuple[float, ...]
     whole: bool = False  # keep the whole photograph, with undefined pixels, instead of cropping them away
-    face: str = field(default="", repr=False)  # of FACES, cut from a wide photograph; "": the photograph
+    face: str = field(default="", repr=False)  # a face of a wide photograph, from FACES; "": the photograph
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -210,7 +210,7 @@ class Lens:
 
     @cached_property
     def _angles(self) -> tuple[Floats, float]:
-        """The angles (rad) that the lens shows left, right, up and down, [4], and that beyond which it folds back."""
+        """The angles (rad) of view to the left, right, top and bottom, [4], and the angle where the lens folds back."""
         fx, fy, cx, cy, rest = self._split
         angle, sides, folds = np.linspace(0, np.pi, ANGLES), [], []
         sizes = cx / fx, (self.width - cx) / fx, cy / fy, (self.height - cy) / fy
@@ -242,12 +242,12 @@ class Lens:
         return self._shows(*_face_grid())
 
     def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return x, y, z in the camera of the wide photograph of normalized coordinates of the face."""
+        """Return the directions x, y, z in the camera of the photograph, from normalized coordinates of the face."""
         x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
         return x, y, z
 
     def _shows(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
-        """Return whether the wide photograph shows the rays with these normalized coordinates of the face."""
+        """Return which rays, in normalized coordinates of the face, the wide photograph shows."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
         (sides, fold), (x, y, z) = self._angles, self._directions(u, v)
@@ -267,9 +267,9 @@ class Lens:
         return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
 
     def _face_camera(self) -> Camera:
-        """Return the camera of the smallest part of a face that contains what the photograph shows.
+        """Return the camera of the smallest part of a face that contains all that the photograph shows.
 
-        Its pixels are as large in the center as those of the photograph, and smaller elsewhere.
+        In the center, its pixels are as large as those of the photograph.  Raises DataError.
         """
         focal = max(self._split[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
@@ -315,7 +315,7 @@ class Lens:
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Return the pixel coordinates, [M, 2], of points, [M, 3] in camera space, behind a wide lens too."""
+        """Return the pixel coordinates, [M, 2], of points in camera space, [M, 3]; for a wide lens, also behind it."""
         x, y, z = points.T
         return np.stack(self.distort(x, y, z) if self.is_wide else self.distort(x / z, y / z), axis=1)
 
@@ -384,7 +384,7 @@ class Lens:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph covers: those whose ray distorts into it and back."""
+        """Which pixels of `pinhole`, [H, W], the photograph covers, because their rays distort into it and back."""
         if self.is_wide:
             return np.concatenate([self._shows(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
@@ -415,7 +415,7 @@ def panorama_lens(width: int, height: int) -> Lens:
 
 
 def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
-    """One step of Newton's method toward the points, [2, M], whose distortion is `goal`."""
+    """Return the points, [2, M], after one step of Newton's method toward those that distort to `goal`."""
     step, (u, v) = 1e-7, point
     a, b = distortion(u, v, k)
     au, bu = distortion(u + step, v, k)
@@ -428,7 +428,7 @@ def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal
 
 @lru_cache(maxsize=2)  # a phone held upright and sideways; each takes 8 bytes per pixel
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The position in the photograph of each pixel of `pinhole`, [H, W] each; OpenCV's pixel centers are integers."""
+    """Return the position in the photograph of each pixel of `pinhole`, [H, W] each, for OpenCV's integer centers."""
     x, y = lens.distort(*_rays(lens.pinhole))
     return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
 

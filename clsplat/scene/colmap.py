@@ -192,29 +192,29 @@ class _Binary:
         """The position in the file, for messages."""
         return f"{self.path}: byte {self.offset}"
 
-    def skip(self, size: int, what: str) -> int:
+    def skip(self, size: int, label: str) -> int:
         """Skip `size` bytes and return the offset of the first."""
         left = len(self.data) - self.offset
         if size > left:
             raise DataError(
-                f"{self.where}: expected {size} bytes of {what}, found {left}; truncated or damaged: {REMEDY}"
+                f"{self.where}: expected {size} bytes of {label}, found {left}; truncated or damaged: {REMEDY}"
             )
         self.offset += size
         return self.offset - size
 
-    def read(self, layout: str, what: str) -> tuple[Any, ...]:
-        return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), what))
+    def read(self, layout: str, label: str) -> tuple[Any, ...]:
+        return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), label))
 
-    def count(self, stride: int, what: str) -> int:
+    def count(self, stride: int, label: str) -> int:
         """Read the number of records, and check that this many records of at least `stride` bytes can follow."""
-        (count,) = self.read("<Q", f"the number of {what}")
-        self.offset = self.skip(count * stride, f"{count} {what}")
+        (count,) = self.read("<Q", f"the number of {label}")
+        self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
 
-    def text(self, what: str) -> str:
+    def text(self, label: str) -> str:
         """Read UTF-8 text up to the next zero byte."""
         where, end = self.where, self.data.find(b"\0", self.offset)
-        start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, what)
+        start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, label)
         return decode(where, self.data[start:end])
 
     def finish(self) -> None:
@@ -380,11 +380,11 @@ def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[
     for image in images:
         named, first = np.unique(image.points, return_index=True)
         nearest = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
-        known = ids[order][nearest] == named if len(ids) else np.zeros(len(named), bool)
-        rows = seen[image.name] = order[nearest[known]] if len(ids) else np.empty(0, np.int64)
+        is_match = ids[order][nearest] == named if len(ids) else np.zeros(len(named), bool)
+        rows = seen[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
         view = by_name.get(image.name)
         if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
-            residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[known]])
+            residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[is_match]])
     return Tracks(positions, seen, residuals) if any(map(len, seen.values())) else None
 
 

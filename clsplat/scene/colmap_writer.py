@@ -24,8 +24,8 @@ NO_RESIDUAL = np.zeros((1, 2))
 
 def write_colmap(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write the model to out/sparse/0; return its files.  Raises OutputError."""
-    renamed = tracks and tracks.renamed({one.view.name: one.name for one in views})
-    write_model(out / MODEL, [replace(one.view, name=one.name) for one in views], points, renamed)
+    renamed = tracks and tracks.renamed({posed.view.name: posed.name for posed in views})
+    write_model(out / MODEL, [replace(posed.view, name=posed.name) for posed in views], points, renamed)
     return [out / MODEL / name for name in FILES]
 
 
@@ -66,9 +66,9 @@ def _points2d(points: PointCloud | None, view: View, tracks: Tracks | None) -> N
         return np.zeros(0, POINT2D)
     rows, residuals = tracks.seen[view.name], tracks.residuals.get(view.name, NO_RESIDUAL) / view.downscale
     pixels = project_points(view, points.positions[rows]) + np.nan_to_num(residuals)
-    known = np.isfinite(pixels).all(axis=1)
-    table = np.zeros(np.count_nonzero(known), POINT2D)
-    table["point"], table["xy"] = rows[known] + 1, pixels[known]
+    is_finite = np.isfinite(pixels).all(axis=1)
+    table = np.zeros(np.count_nonzero(is_finite), POINT2D)
+    table["point"], table["xy"] = rows[is_finite] + 1, pixels[is_finite]
     return table
 
 

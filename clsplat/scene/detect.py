@@ -56,7 +56,7 @@ logger = logging.getLogger("clsplat")
 
 
 def find_datasets(path: Path) -> list[Reader]:
-    """Return the reader of the dataset in a folder, otherwise those of all in the folders one and two levels below."""
+    """Return the reader of the dataset in a folder, otherwise of all datasets one or two levels below."""
     datasets = list[Reader]()
     for folder, _ in walk_folders(path, MAX_DEPTH):
         if not any(folder.is_relative_to(reader.folder) for reader in datasets) and (reader := find_reader(folder)):
@@ -68,10 +68,10 @@ def find_datasets(path: Path) -> list[Reader]:
 
 
 def find_dataset(path: Path) -> Reader | None:
-    """Return the reader of the dataset in a folder or, if it is the only one, below it; None without one.
+    """Return the reader of the dataset in a folder, or of the only one below it; None without a dataset.
 
-    Several COLMAP models of the same photographs count as one: that with the photographs, otherwise the largest, the
-    first by name in a tie.  Raises DataError, with a list, for other datasets.
+    Of several COLMAP models of the same photographs, the one with the photographs counts, otherwise the largest, the
+    first by name in a tie.  Raises DataError, with a list, for several datasets.
     """
     datasets = find_datasets(path)
     if len(datasets) < 2:
@@ -125,5 +125,5 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {above}: give that folder" if above else remedy
         raise DataError(f"{path}: photographs without cameras; {remedy}")
-    known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
-    raise DataError(f"{path}: no dataset found; looked for {known}")
+    formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
+    raise DataError(f"{path}: no dataset found; looked for {formats}")

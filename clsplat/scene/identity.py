@@ -58,16 +58,16 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
             if file is not None and file != NO_FILE:
                 users[file].append(view)
     files = {file: ImageFile() for file in users}
-    known, count = DecodedSizes(), Count("photographs decoded", len(users))
+    cache, count = DecodedSizes(), Count("photographs decoded", len(users))
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "decoding")
     try:
-        futures = [pool.submit(_examine, file, users[file], files[file], known) for file in users]
+        futures = [pool.submit(_examine, file, users[file], files[file], cache) for file in users]
         for number, future in enumerate(as_completed(futures), 1):
             future.result()
             count.reach(number)
     finally:
         pool.shutdown(cancel_futures=True)
-        known.save()
+        cache.save()
     return files
 
 
@@ -106,16 +106,16 @@ def _is_excluded(view: View, files: Mapping[Path, ImageFile]) -> bool:
     return bool((mask and mask.excluded) or (view.alpha == "mask" and image and image.transparent))
 
 
-def _examine(file: Path, views: list[View], result: ImageFile, known: "DecodedSizes") -> None:
+def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSizes") -> None:
     try:
         data = read_file(file, "an image", limit=MAX_BYTES)
         result.digest = hashlib.sha256(data).hexdigest()
         if header := parse_header(data, data[-TAIL_SIZE:], lambda: data):
             result.orientation, result.cut = header.orientation, not header.complete
-        result.size = known.size(result.digest, data, file)
-        result.blank, result.excluded, result.transparent = known.contents(result.digest)
+        result.size = cache.size(result.digest, data, file)
+        result.blank, result.excluded, result.transparent = cache.contents(result.digest)
         for view in views:
-            needs_rotation(view, file, lambda upright: known.size(result.digest, data, file, upright))
+            needs_rotation(view, file, lambda upright: cache.size(result.digest, data, file, upright))
     except DataError as error:
         result.fault = str(error)
 

@@ -374,9 +374,9 @@ def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExpos
 
 def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
     """Write the known exposures of the images in a folder, by name, if there are any.  Raises OutputError."""
-    known = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
-    if known:
-        write_text(folder / EXPOSURES_FILE, json.dumps(known, indent=1) + "\n")
+    table = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
+    if table:
+        write_text(folder / EXPOSURES_FILE, json.dumps(table, indent=1) + "\n")
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:

@@ -72,7 +72,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 
 
 class FileLookup:
-    """The image files that a dataset names, which another machine or program may have written.
+    """The image files of a dataset that another machine or program may have written.
 
     An image `name` that exists below `folder` is used.  Otherwise a name and a file below `root` belong together if
     each is the only best match of the other: the one with the longest common end of their paths.  Upper and lower case,
@@ -92,7 +92,7 @@ class FileLookup:
         taken: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.given, self.names = list(names), list(names)  # the names in the dataset, and those of views
+        self.listed, self.names = list(names), list(names)  # the names in the dataset, and those of views
         self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
         self.matched: dict[int, int] = {}  # the length of the common end of each inexact match
         self.reduced: set[Path] = set()  # photographs from a folder such as images_4
@@ -105,12 +105,12 @@ class FileLookup:
 
     def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
         """Take the file that a name spells, and return whether it exists."""
-        for name in filter(_is_safe, dict.fromkeys((self.given[i], PureWindowsPath(self.given[i]).as_posix()))):
+        for name in filter(_is_safe, dict.fromkeys((self.listed[i], PureWindowsPath(self.listed[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
                 self.paths[i] = path
                 if os.path.exists(path):
                     self.names[i] = name
-                    if name != self.given[i]:
+                    if name != self.listed[i]:
                         self.matched[i] = name.count("/") + 1
                     return True
         return False
@@ -139,7 +139,7 @@ class FileLookup:
         return files
 
     def _match(self, lost: Sequence[int], taken: set[Path]) -> None:
-        targets = list(map(self._target, self.given)) if lost else []
+        targets = list(map(self._target, self.listed)) if lost else []
         by_key = defaultdict[str, set[Parts]](set)
         for target in targets:
             for key in _keys(target):
@@ -149,22 +149,22 @@ class FileLookup:
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in taken]
             near = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
             for parts, path in near or files:
-                if rank := self._rank(self.given[i], targets[i], parts, path):
+                if rank := self._rank(self.listed[i], targets[i], parts, path):
                     ranked[rank].append((parts, path))
             best = ranked[max(ranked)] if ranked else []
             if len(best) > 1:
                 self.choices[i] = [path for _, path in best]
             for parts, path in best if len(best) == 1 else ():
                 length = _common_end(targets[i], parts)
-                others = by_key[_stem(path.name)] - {targets[i]}
-                if all(_common_end(other, parts) < length for other in others):
+                rivals = by_key[_stem(path.name)] - {targets[i]}
+                if all(_common_end(rival, parts) < length for rival in rivals):
                     base = self.folder if path.is_relative_to(self.folder) else self.root
                     self.names[i], self.paths[i], self.matched[i] = path.relative_to(base).as_posix(), path, length
                     self.reduced |= {path} if _divisor(parts[:-length]) > 1 else set()
 
-    def _rank(self, given: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
+    def _rank(self, listed: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return how well a file fits a name, or None if it does not."""
-        length, name = _common_end(target, parts), PureWindowsPath(given)
+        length, name = _common_end(target, parts), PureWindowsPath(listed)
         above = {*parts[:-length]}
         is_other = any(map(OTHER_CONTENT.search, above)) or (SPLITS & above and SPLITS.intersection(target))
         if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
@@ -174,13 +174,13 @@ class FileLookup:
 
     @property
     def note(self) -> str:
-        """What was matched, and how, in one sentence; "" if all names are exact."""
+        """How many names were matched, and how, in one sentence; "" if all names are exact."""
         for i, length in self.matched.items():
-            count = f"{len(self.matched)} of {pluralize(len(self.given), 'image' if self.strict else 'photograph')}"
+            count = f"{len(self.matched)} of {pluralize(len(self.listed), 'image' if self.strict else 'photograph')}"
             how = "base name" if length == 1 else "the end of their paths"
             reduced = ", with cameras scaled to these smaller photographs" if self.reduced else ""
             file = self.paths[i].relative_to(self.root).as_posix()
-            return f"{count} matched by {how}, such as {file} for {quote(self.given[i])}{reduced}"
+            return f"{count} matched by {how}, such as {file} for {quote(self.listed[i])}{reduced}"
         return ""
 
     def existing(self, where: Path, missing: Missing) -> list[int]:
@@ -192,7 +192,7 @@ class FileLookup:
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
         if lost := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
             fault = f"{where}: {_missing_text([str(self.paths[i]) for i in lost], len(self.paths))}"
-            for name in [self.given[i] for i in lost if not _is_safe(self.given[i])][:1]:
+            for name in [self.listed[i] for i in lost if not _is_safe(self.listed[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
                 skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
@@ -208,7 +208,7 @@ class FileLookup:
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
         for i, choices in self.choices.items():
             fit = [relative[path].as_posix() for path in choices]
-            return f" ({first_few(fit)} fit {quote(self.given[i])} equally well)"
+            return f" ({first_few(fit)} fit {quote(self.listed[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
         used = {*self.paths}

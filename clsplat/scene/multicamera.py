@@ -99,13 +99,13 @@ def _frames(path: Path) -> dict[str, list[Path]]:
             "images in each folder: add them, or remove the folder"
         )
     counts = {name: len(files) for name, files in frames.items()}
-    least, most = (select(counts, key=counts.__getitem__) for select in (min, max))
-    if counts[least] != counts[most]:
+    short, long = (select(counts, key=counts.__getitem__) for select in (min, max))
+    if counts[short] != counts[long]:
         raise DataError(
-            f"{path / VIDEOS}: {least} has {counts[least]} frames, {most} has {counts[most]}; expected the same "
+            f"{path / VIDEOS}: {short} has {counts[short]} frames, {long} has {counts[long]}; expected the same "
             "number of frames from every camera: trim the videos to the same start and end, and use the same frame rate"
         )
-    if counts[least] < 2:
+    if counts[short] < 2:
         raise DataError(f"{path / VIDEOS}: has one frame per camera; expected two or more, in order of name")
     return frames
 

@@ -53,10 +53,10 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
     sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
     for view in views:
         distances = np.linalg.norm(tracks.residuals.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
-        known = np.isfinite(distances)
-        if known.any():
-            np.add.at(sums, tracks.seen[view.name][known], distances[known])
-            np.add.at(counts, tracks.seen[view.name][known], 1)
+        is_known = np.isfinite(distances)
+        if is_known.any():
+            np.add.at(sums, tracks.seen[view.name][is_known], distances[is_known])
+            np.add.at(counts, tracks.seen[view.name][is_known], 1)
     errors = sums[counts > 0] / counts[counts > 0]
     return errors if len(errors) and errors.mean() > EXACT else None
 

@@ -29,7 +29,7 @@ LOG = logging.getLogger("clsplat")
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points from structure from motion, and the photographs in which each is seen."""
+    """Points from structure from motion, and the photographs that show them."""
 
     positions: NDArray[np.floating]  # [M, 3], scene units
     seen: Mapping[str, NDArray[np.int64]]  # by name of the view: rows of `positions`, in order of the point ids
@@ -194,7 +194,7 @@ class Scene:
         return summary(rows, list(self._thumbnails()))
 
     def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        """Some evenly spaced photographs with their names, without unreadable ones."""
+        """Yield some evenly spaced photographs with their names, without unreadable ones."""
         for i in np.unique(np.linspace(0, len(self.views) - 1, MAX_THUMBNAILS).astype(int)):
             with suppress(DataError):
                 yield self.views[i].name, load_image(self.views[i])

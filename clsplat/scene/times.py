@@ -25,10 +25,10 @@ class Clock:
         """
         span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
         slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)
-        least, most = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
-        if least < self.first - slack or most > self.last + slack:
+        low, high = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
+        if low < self.first - slack or high > self.last + slack:
             raise DataError(
-                f"{path}: its points have times from {least:.9g} to {most:.9g}; expected the unit of the frames, whose "
+                f"{path}: its points have times from {low:.9g} to {high:.9g}; expected the unit of the frames, whose "
                 f"times are {self.first:.9g} to {self.last:.9g}: write the points again, or without the property `time`"
             )
         return self(values)

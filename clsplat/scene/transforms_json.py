@@ -312,10 +312,12 @@ class BlenderReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRAIN_FILE)
-        held = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
-        clock = make_clock(path, transforms.moments() + (held.moments() if held else []))
-        files = FrameFiles(self.root or path, path, transforms.frames + (held.frames if held else []))
-        views = files.views(path if held else transforms.path, self.missing, clock)
+        test_transforms = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
+        clock = make_clock(path, transforms.moments() + (test_transforms.moments() if test_transforms else []))
+        files = FrameFiles(
+            self.root or path, path, transforms.frames + (test_transforms.frames if test_transforms else [])
+        )
+        views = files.views(path if test_transforms else transforms.path, self.missing, clock)
         test = {*files.names[len(transforms.frames) :]}
         # NeRF and later papers render these scenes on white.
         return files.scene(path, views, test, transforms.points(clock), background="white")
@@ -348,7 +350,7 @@ class NerfstudioReader(Reader):
         clock = make_clock(transforms.path, transforms.moments())
         files = FrameFiles(self.root or path, path, transforms.frames)
         views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
-        renamed = dict(zip(files.given, files.names, strict=True))
+        renamed = dict(zip(files.listed, files.names, strict=True))
         train, test = (_listed(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
