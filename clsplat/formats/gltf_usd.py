@@ -24,7 +24,7 @@ from clsplat.core.harmonics import map_colors
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats.packing import Output, open_hashed
-from clsplat.formats.ply import check_rendering
+from clsplat.formats.ply import read_extras
 from clsplat.formats.splats import (
     FLIP,
     MAX_DEGREE,
@@ -72,10 +72,8 @@ class Gltf:
         self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
         self.notes: set[str] = set()  # about the file, for the user
         self.is_mip = False
-        primitives = [
-            (primitive, matrix) for mesh, matrix in self._meshes() for primitive in tree["meshes"][mesh]["primitives"]
-        ]
-        self.primitives = [pair for pair in primitives if _has_gaussians(_extensions(pair[0]))]
+        pairs = [(part, matrix) for mesh, matrix in self._meshes() for part in tree["meshes"][mesh]["primitives"]]
+        self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
         placement = FLIP_4 @ self.primitives[0][1] @ FLIP_4
@@ -340,15 +338,13 @@ def read_gltf(path: Path) -> SplatFile:
         tree = json.loads(text)
         gltf = Gltf(path, tree, binary)
         parameters = gltf.parameters()
-        extras = tree.get("asset", {}).get("extras")
+        rendering, placement = read_extras(path, tree.get("asset", {})), gltf.placement
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise DataError(
             f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
         ) from error
     for note in sorted(gltf.notes):
         LOG.warning("%s: %s", path, note)
-    ours = extras.get("clsplat") if isinstance(extras, dict) else None
-    rendering, placement = check_rendering(path, ours) if isinstance(ours, dict) else {}, gltf.placement
     if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
         rendering["origin"] = placement[:3, 3].tolist()
         placement[:3, 3] = 0

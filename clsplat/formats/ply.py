@@ -302,6 +302,13 @@ def rendering_of(path: Path, header: PlyHeader) -> dict[str, Any]:
     return check_rendering(path, values) if isinstance(values, dict) else {}
 
 
+def read_extras(path: Path, table: dict[str, Any]) -> dict[str, Any]:
+    """Return our rendering values in the extras of a JSON table, or {}.  Raises DataError for an invalid number."""
+    extras = table.get("extras")
+    values = extras.get("clsplat") if isinstance(extras, dict) else None
+    return check_rendering(path, values) if isinstance(values, dict) else {}
+
+
 def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
     """Validate the rendering values of a file and return them.  Raises DataError for an invalid number."""
     for name in NUMBERS:

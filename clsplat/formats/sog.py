@@ -29,7 +29,7 @@ from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, write_bytes
 from clsplat.formats.palette import codebook, nearest_entries, palette, unique_points
-from clsplat.formats.ply import check_rendering
+from clsplat.formats.ply import read_extras
 from clsplat.formats.sog_quantize import (
     compensate_base,
     log_weights,
@@ -198,10 +198,7 @@ class _Sog:
             "sh_rest": self._rest(),
         }
         mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
-        extras = self.meta.get("extras")
-        ours = extras.get("clsplat") if isinstance(extras, dict) else None
-        rendering = check_rendering(self.path, ours) if isinstance(ours, dict) else {}
-        return SplatFile(parameters, rendering, "mip" if mip else "default")
+        return SplatFile(parameters, read_extras(self.path, self.meta), "mip" if mip else "default")
 
     def _means(self) -> NDArray[np.float32]:
         low, high = (self._pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
@@ -225,7 +222,7 @@ class _Sog:
         files = self._data("shN")
         if len(files) != 2:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels; export it again")
-        labels = packing.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
+        labels = packing.decode(self.path, "labels of shN", files[1], self.count, SLACK + 4 * self.count)
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
         used = entries = 1 + int(chosen.max(initial=0))
         if self.old:
@@ -238,7 +235,7 @@ class _Sog:
             raise DataError(
                 f"{self.path}: labels of shN use {used} centroids, but shN.count is {entries}; export it again"
             )
-        limit = self._most(size * MAX_PALETTE)
+        limit = SLACK + 4 * size * MAX_PALETTE
         centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, limit)
         table = centroids[: entries * size, :3].reshape(entries, 3 * size)
         return np.asarray(self._decode("shN", table)[chosen])
@@ -271,12 +268,8 @@ class _Sog:
             raise DataError(
                 f"{self.path}: {name} names {len(group)} files; expected at least {number + 1}; export it again"
             )
-        label, limit = f"image {number} of {name}", self._most(self.count)
+        label, limit = f"image {number} of {name}", SLACK + 4 * self.count
         return packing.decode(self.path, label, group[number], self.count, limit)[: self.count]
-
-    @staticmethod
-    def _most(count: int) -> int:
-        return SLACK + 4 * count
 
     def _part(self, name: str) -> dict[str, Any]:
         part = self.meta.get(name) if isinstance(self.meta, dict) else None
@@ -468,9 +461,8 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     Quality `high` rounds tables only to the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
-    max_entries = min(
-        MAX_PALETTE, max(_few(len(rest), options.quality), int(RELATIVE_PALETTES[options.quality] * len(rest)))
-    )
+    relative = int(RELATIVE_PALETTES[options.quality] * len(rest))
+    max_entries = min(MAX_PALETTE, max(_few(len(rest), options.quality), relative))
     exact = unique_points(rest, max_entries) if rest.shape[1] else None
     harmonics = None if exact is None else Harmonics.from_vectors(*exact)
     if harmonics and rest.any():

@@ -176,9 +176,8 @@ def tree_palette(
     totals = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(totals)) / totals[:, None]
     log_totals = np.log2(totals)
-    step = quantization_steps(
-        log_totals - np.median(log_totals), usual_step(rest, median_step, median_step), LARGEST_STEP
-    )
+    log_totals -= np.median(log_totals)
+    step = quantization_steps(log_totals, usual_step(rest, median_step, median_step), LARGEST_STEP)
     first = np.zeros(len(totals), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step))

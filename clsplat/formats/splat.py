@@ -128,12 +128,9 @@ class SplatSection:
     @classmethod
     def parse(cls, data: bytes, start: int) -> "SplatSection":
         """Parse the header at an offset, in bytes."""
-        count, rows, bucket_size, buckets = struct.unpack_from("<4I", data, start)
-        (block,) = struct.unpack_from("<f", data, start + 16)
-        (bucket_bytes,) = struct.unpack_from("<H", data, start + 20)
-        scale, _, full, partial = struct.unpack_from("<4I", data, start + 24)
-        (degree,) = struct.unpack_from("<H", data, start + 40)
-        return cls(count, rows, degree, bucket_size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
+        numbers = struct.unpack_from("<4IfH2x4IH", data, start)
+        count, rows, size, buckets, block, bucket_bytes, scale, _, full, partial, degree = numbers
+        return cls(count, rows, degree, size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
 
     def row(self, level: int) -> np.dtype[Any]:
         """Return the layout of one splat."""
@@ -151,8 +148,7 @@ def looks_like_ksplat(data: bytes, size: int) -> bool:
     """Return whether the first bytes of a file of `size` bytes can be a header; the format has no magic number."""
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
-    max_sections, sections, _, splats = struct.unpack_from("<4I", data, 4)
-    (level,) = struct.unpack_from("<H", data, 20)
+    max_sections, sections, _, splats, level = struct.unpack_from("<4IH", data, 4)
     return bool(sections <= max_sections <= size // SECTION and level < len(KINDS) and 0 < splats <= size // 24)
 
 

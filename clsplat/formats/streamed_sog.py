@@ -293,7 +293,6 @@ class _Files:
 
     splats: int
     rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
-    counts: dict[str, int] = field(default_factory=dict)  # splats, by name
     open: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
     def shape(self, node: Node) -> dict[str, Any]:
@@ -308,10 +307,9 @@ class _Files:
         number = self.open.setdefault(level, 0)
         name = f"{level}_{number}/{META}"
         runs = self.rows.setdefault(name, (level, []))[1]
-        offset = self.counts.get(name, 0)
+        offset = sum(map(len, runs))
         runs.append(rows)
-        self.counts[name] = offset + len(rows)
-        if self.counts[name] > self.splats:
+        if offset + len(rows) > self.splats:
             self.open[level] += 1
         return {"file": list(self.rows).index(name), "offset": offset, "count": len(rows)}
 

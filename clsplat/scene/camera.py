@@ -376,11 +376,10 @@ class Lens:
 
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
-        camera = self.pinhole
         if self.is_wide:
             return self._cut(pixels)
         undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return undistorted.reshape(camera.height, camera.width, -1)
+        return undistorted.reshape(self.pinhole.height, self.pinhole.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:

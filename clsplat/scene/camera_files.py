@@ -182,20 +182,6 @@ def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | Non
     return written
 
 
-def check_nerfstudio(views: list[PosedView]) -> None:
-    """Raise DataError for a lens that nerfstudio does not support, and for lenses that do not fit in one file."""
-    kinds = {}
-    for posed in views:
-        if posed.lens.model not in DISTORTION:
-            raise DataError(f"{posed.name}: nerfstudio has no camera model {posed.lens.model}; {REMEDY}")
-        kinds[DISTORTION[posed.lens.model][0]] = posed.name
-    if len(kinds) > 1:
-        model, name = kinds.popitem()
-        raise DataError(
-            f"{name}: is {model}, other views are {next(iter(kinds))}; nerfstudio allows one model per file; {REMEDY}"
-        )
-
-
 def _lens(posed: PosedView) -> dict[str, Any]:
     lens = posed.lens
     model, names = DISTORTION[lens.model]
@@ -232,9 +218,16 @@ TRACKS = "colmap"  # the format that keeps which points the photographs show
 
 def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
     """Return the views with the names of their images.  Raises DataError for views that the format cannot hold."""
-    views = posed_views(scene)
-    if format_ == "nerfstudio":
-        check_nerfstudio(views)
+    views, models = posed_views(scene), dict[str, str]()
+    for posed in views if format_ == "nerfstudio" else ():
+        if posed.lens.model not in DISTORTION:
+            raise DataError(f"{posed.name}: nerfstudio has no camera model {posed.lens.model}; {REMEDY}")
+        models[DISTORTION[posed.lens.model][0]] = posed.name
+    if len(models) > 1:
+        model, name = models.popitem()
+        raise DataError(
+            f"{name}: is {model}, other views are {next(iter(models))}; nerfstudio allows one model per file; {REMEDY}"
+        )
     return views
 
 

@@ -50,8 +50,8 @@ def write_model(folder: Path, views: Sequence[View], points: PointCloud | None, 
 
 
 def _camera(number: int, lens: Lens) -> bytes:
-    head = struct.pack("<IiQQ", number, MODELS.index(lens.model), lens.width, lens.height)
-    return head + struct.pack(f"<{len(lens.params)}d", *lens.params)
+    numbers = number, MODELS.index(lens.model), lens.width, lens.height, *lens.params
+    return struct.pack(f"<IiQQ{len(lens.params)}d", *numbers)
 
 
 def _image(number: int, view: View, camera: int, points2d: NDArray[Any]) -> bytes:

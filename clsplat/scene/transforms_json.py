@@ -213,8 +213,7 @@ def view_of(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Cl
     moment = frame.number("time")
     time = None if clock is None or moment is None else float(clock(moment))
     matrix = camera_to_world_of(frame)
-    pose = np.linalg.inv(matrix)[:3]
-    return View(name, camera, pose, lens=distortion, time=time, camera_to_world=matrix)
+    return View(name, camera, np.linalg.inv(matrix)[:3], lens=distortion, time=time, camera_to_world=matrix)
 
 
 def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:

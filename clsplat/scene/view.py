@@ -366,10 +366,9 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
             f"the focal length of the {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
             "run `clsplat data undistort` first"
         )
-    focals = MODELS[lens.model][0]
-    lengths, middle, rest = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
-    scaled = [value * factor**degree for value, degree in zip(rest, DEGREES[lens.model], strict=True)]
-    return replace(lens, params=(*(factor * length for length in lengths), *middle, *scaled))
+    degrees = *[1] * MODELS[lens.model][0], 0, 0, *DEGREES[lens.model]  # of focal lengths, principal point, distortion
+    params = tuple(value * factor**degree for value, degree in zip(lens.params, degrees, strict=True))
+    return replace(lens, params=params)
 
 
 def photo_lens(view: View) -> Lens:
