@@ -221,7 +221,7 @@ def test_metrics_refuse_incomparable_images(metric):
     with pytest.raises(ValueError, match=r"shape \(0, 6, 3\), the photograph \(0, 6, 3\); .* at least one pixel"):
         metric(black[:0], black[:0])
     for mask in (np.zeros((5, 6), bool), np.ones((6, 5), bool), np.ones((5, 6))):
-        with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of \(5, 6\)"):
+        with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of shape \(5, 6\)"):
             metric(black, black, mask)
 
 

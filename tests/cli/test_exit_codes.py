@@ -244,7 +244,7 @@ def test_too_long_output_name_is_an_output_error(tmp_path):
         write_text(tmp_path / f"{LONG}.ply", "")
 
 
-def test_too_little_address_space_is_reported_before_libraries_crash(monkeypatch):
+def test_too_little_address_space_is_refused_at_the_start(monkeypatch):
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(resource, "getrlimit", lambda number: (500 << 20, 500 << 20))
     message = "limits clsplat to 500 MiB of address space; libraries crash with less than 1024: raise it"
