@@ -429,7 +429,7 @@ def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """Return the JSON and the binary chunk."""
+    """Return the JSON and the binary chunk of a .glb file.  Raises DataError."""
     chunks: dict[int, bytes] = {}
     start = 12
     if data[:4] != MAGIC or len(data) < 20 or data[4:8] != b"\2\0\0\0":

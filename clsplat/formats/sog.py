@@ -425,7 +425,7 @@ class Harmonics:
         better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Fit a small palette to SH [N, c], for training; the result of `values` is reproduced exactly.
+        """Fit a small palette to SH [N, c], for training; writing a model with its `values` does not change them.
 
         weights: weights of errors, [N].  better: refines a palette [E, c] and returns it with the label of each splat.
         step: rounding of codebook numbers, used if few enough remain.

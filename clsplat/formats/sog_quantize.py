@@ -172,7 +172,7 @@ def tree_palette(
     log_weights: from `log_weights`; median_step: median step of vectors, in LEVELS, for SH of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
-    labels = _divided(_in_form(rest, form), weights, entries)
+    labels = _split_clusters(_to_euclidean(rest, form), weights, entries)
     totals = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(totals)) / totals[:, None]
     log_totals = np.log2(totals)
@@ -187,7 +187,7 @@ def tree_palette(
     return rounded[order], rank[labels]
 
 
-def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
+def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
     """Transform SH so that the metric becomes the squared Euclidean distance, [N, 3 K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
@@ -198,7 +198,7 @@ def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np
     return transformed.reshape(rest.shape)
 
 
-def _divided(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
+def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
     """Split points [N, c] into at most `entries` clusters; return the label of each point."""
     labels, parts = np.zeros(len(points), np.int64), 1
     while parts < entries:

@@ -118,7 +118,7 @@ class SpzHeader:
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
-def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
+def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
     """Decode the planes to parameters; each entry of `planes` is a function that reads the next bytes of a plane."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
@@ -189,7 +189,7 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
     return bits
 
 
-def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
+def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
     """Encode the planes; values outside of their range are clipped.
 
     weights: base-2 logarithms, [N], of `log_weights`.  Gaussians with fine SH steps come first and otherwise keep their
@@ -198,7 +198,7 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
     p, weights = {name: table[order] for name, table in p.items()}, weights[order]
-    harmonics, base = _rounded_sh(p, sh_steps[order])
+    harmonics, base = _round_sh_bands(p, sh_steps[order])
     levels = {
         "alphas": 255 * opacities(p["logit_opacity"]),
         "colors": 255 * (COLOR * base.astype(np.float64) + 0.5),
@@ -210,12 +210,12 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     step = quantization_steps(weights, *BASE_STEP[options.quality])[:, None]
     levels["colors"] = np.rint(levels["colors"] / step) * step
     alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in levels.values())
-    positions = _fixed(p, weights, fraction, SMALLEST_FRACTION[options.quality])
-    rotations = _rotations(p["quats"], TURN_STEP[options.quality])
+    positions = _encode_positions(p, weights, fraction, SMALLEST_FRACTION[options.quality])
+    rotations = _encode_rotations(p["quats"], TURN_STEP[options.quality])
     return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
 
-def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
+def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
     """Encode positions in 24 bits, with power-of-two steps of about `relative` times the smallest scale.
 
     Steps grow for small weights.
@@ -227,7 +227,7 @@ def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, relative:
     return np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
 
 
-def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
+def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
     """Encode the three smallest components of quaternions in 9 bits each, as multiples of `step`, with signs."""
     largest, others = smallest_three(np.roll(unit(quats), -1, axis=1))
     multiples = np.rint(511 / step * np.abs(others) * 2**0.5) * step
@@ -247,7 +247,7 @@ def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: 
     return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), max_step)
 
 
-def _rounded_sh(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def _round_sh_bands(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Round SH to levels, 128 for 0: multiples of each Gaussian's step.
 
     Also returns band 0, corrected for the rounding errors.
@@ -333,7 +333,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
     """Decode the bytes of an SPZ file; also return the axes that it declares, or ''.  Raises as `read_spz`."""
     is_new = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
-    header, parameters, axes = (_unpacked_4 if is_new else _unpacked)(path, data)
+    header, parameters, axes = (_decode_4 if is_new else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)
     name = axes or USUAL_AXES
     if name[1] in "BF":  # z is vertical
@@ -354,7 +354,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
-    planes = packed(path, flip_axes(p), weights, fraction, options)
+    planes = encode(path, flip_axes(p), weights, fraction, options)
     numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
 
@@ -367,7 +367,7 @@ def _gzip(data: bytes) -> bytes:
     return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
+def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     """Decode header, parameters, and declared axes of versions 1 to 3, in gzip or plain."""
     stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
     header = SpzHeader.parse(path, stream.read(HEADER))
@@ -381,7 +381,7 @@ def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
             raise DataError(f"{path}: too short: {header.count} splats take {expected} bytes; copy or export it again")
         return part
 
-    parameters = unpacked(header, [read] * len(header.sizes))
+    parameters = decode(header, [read] * len(header.sizes))
     axes = _read_axes(path, stream.read) if header.flags & EXTENSIONS else ""
     if stream.read(1):
         raise DataError(f"{path}: has data after its {header.count} splats; copy or export it again")
@@ -420,7 +420,7 @@ class _Gzip:
             raise DataError(f"{self.path}: has {rest} bytes after its gzip data; copy or export it again")
 
 
-def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
+def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     """Decode header, parameters, and declared axes of version 4."""
     header = SpzHeader.parse(path, data)
     if len(data) < HEADER4:
@@ -446,7 +446,7 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
         start += stored
     if start != len(data):
         raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
-    return header, unpacked(header, [frame.read for frame in frames]), axes
+    return header, decode(header, [frame.read for frame in frames]), axes
 
 
 def _most(data: bytes) -> int:

@@ -125,7 +125,7 @@ def _is_meta_below(name: str) -> bool:
 
 
 def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
-    """Return the runs of each level."""
+    """Return the runs of the leaves in each file, for each level.  Raises DataError for a damaged leaf."""
     levels: list[Runs] = [{} for _ in meta["counts"]]
     numbers = {str(level): level for level in range(len(levels))}
     for leaf in _leaves(path, meta.get("tree")):

@@ -121,7 +121,7 @@ def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSi
 
 
 class DecodedSizes:
-    """A cache of the sizes of images that this version of the decoder has decoded, by content hash, and what they show.
+    """A cache of the sizes and contents of images that this version of the decoder has decoded, by content hash.
 
     It is a text file in the user's cache folder; if that cannot be used, all images are decoded.
     """
@@ -209,12 +209,12 @@ class Identity:
         old, new = before._rows, self._rows
         for part in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(part) != new[name].get(part)]
-            changes += [f"the {part} of {_named(names)}"] if names else []
+            changes += [f"the {part} of {_list_views(names)}"] if names else []
         moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
-        changes += [f"the split of {_named(moved)}"] if moved else []
-        changes += [f"{_named(removed)}, removed"] if removed else []
-        changes += [f"{_named(added)}, added"] if added else []
+        changes += [f"the split of {_list_views(moved)}"] if moved else []
+        changes += [f"{_list_views(removed)}, removed"] if removed else []
+        changes += [f"{_list_views(added)}, added"] if added else []
         if not (moved or removed or added) and list(self.train) != list(before.train):
             changes.append("the order of the training views")
         return changes + (["the points"] if self.points != before.points else [])
@@ -264,6 +264,6 @@ def _hash(*arrays: ArrayLike, text: str = "") -> str:
     return state.hexdigest()
 
 
-def _named(names: list[str]) -> str:
+def _list_views(names: list[str]) -> str:
     more = ", …" if len(names) > MAX_NAMES else ""
     return f"{len(names)} view{'s' if len(names) > 1 else ''} ({', '.join(names[:MAX_NAMES])}{more})"

@@ -26,12 +26,12 @@ def load_photograph(
     undistorted: a folder that caches undistorted photographs.  Raises DataError like load_image.
     """
     if view.lens is None or undistorted is None:
-        return _loaded(view, background)
+        return _load(view, background)
     file = undistorted / f"{view.name}.{_key(view, background)}.png"
     try:
         return read_image(file).astype(np.uint8)
     except DataError:
-        pixels = _loaded(view, background)
+        pixels = _load(view, background)
     write_image(file, pixels)
     return pixels
 
@@ -44,7 +44,7 @@ def _key(view: View, background: tuple[float, float, float]) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
 
 
-def _loaded(view: View, background: tuple[float, float, float]) -> NDArray[np.uint8]:
+def _load(view: View, background: tuple[float, float, float]) -> NDArray[np.uint8]:
     pixels, mask = load_image(view, background), load_mask(view)
     return pixels if mask is None else np.dstack([pixels, mask.astype(np.uint8)])
 

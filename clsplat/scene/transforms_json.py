@@ -350,7 +350,7 @@ class NerfstudioReader(Reader):
         files = FrameFiles(self.root or path, path, transforms.frames)
         views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
         renamed = dict(zip(files.listed, files.names, strict=True))
-        train, test = (_listed(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
+        train, test = (_read_list(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
         listed = views if train is None else [view for view in views if view.name in train | (test or set())]
@@ -362,7 +362,7 @@ class NerfstudioReader(Reader):
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
 
 
-def _listed(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
+def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
     """Return the view names of a list of file paths, or None if the file has no such list.  Raises DataError."""
     entries = transforms.table.get(key)
     if entries is None:

@@ -201,7 +201,7 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     `background` is a color in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
     16-bit image, or when its size does not fit the camera.
     """
-    pixels = _as_taken(view, view.image_path)
+    pixels = _read_original(view, view.image_path)
     width, height = view.camera.width, view.camera.height
     opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
     if opaque and not resized and pixels.dtype == np.uint8:
@@ -226,7 +226,7 @@ def load_rgba(view: View) -> NDArray[np.uint8] | None:
 
     Raises DataError as load_image does.
     """
-    pixels = _as_taken(view, view.image_path)
+    pixels = _read_original(view, view.image_path)
     if pixels.shape[2] == 3 or load_mask(view) is not None:
         return None
     size = view.camera.width, view.camera.height
@@ -252,9 +252,9 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     """
     layers = []
     if view.mask_path is not None:
-        layers.append(_as_taken(view, view.mask_path, slice(1)))
+        layers.append(_read_original(view, view.mask_path, slice(1)))
     if view.alpha == "mask":
-        pixels = _as_taken(view, view.image_path, slice(3, 4))
+        pixels = _read_original(view, view.image_path, slice(3, 4))
         layers += [pixels] if pixels.size else []
     if view.lens is not None and view.lens.whole:
         layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
@@ -266,7 +266,7 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     return np.logical_and.reduce(masks) if masks else None
 
 
-def _as_taken(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
+def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
     """Return some channels of a file at the size of the camera before downscaling: upright and undistorted.
 
     Raises DataError as needs_rotation does.

@@ -89,7 +89,7 @@ class ViewSelection(Settings):
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
-        source, listed = self._listed(folders)
+        source, listed = self._read_names(folders)
         index, excluded = _NameIndex(names), {key: _NameIndex(taken) for key, taken in others.items()}
         matches_of = {name: index.indices_of(name) for name in listed}
         for name in [name for name, matches in matches_of.items() if not matches]:
@@ -108,7 +108,7 @@ class ViewSelection(Settings):
         """
         if self.every is not None:
             return []
-        source, listed = self._listed(folders)
+        source, listed = self._read_names(folders)
         index, excluded = _NameIndex(names), {key: {*taken} for key, taken in others.items()}
         matches = {name: index.indices_of(name) for name in listed}
         for name, indices in matches.items():
@@ -118,7 +118,7 @@ class ViewSelection(Settings):
                 raise _excluded_error(source, name, key)
         return [names[i] for indices in matches.values() for i in indices]
 
-    def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
+    def _read_names(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
         """Return the source of the names, for messages, and the names.  Raises DataError for a bad or empty file."""
         if self.file is None:
             return "the list of names", self.names or []
@@ -156,8 +156,8 @@ class _NameIndex:
         paths = [PurePosixPath(name) for name in names]
         stems = [path.with_suffix("") for path in paths]
         self._at = {name: i for i, name in reversed([*enumerate(names)])}
-        self._ends, self._stems = _grouped(_ends_of(paths)), _grouped(_ends_of(stems))
-        self._whole = _grouped((stem.parts, i) for i, stem in enumerate(stems))
+        self._ends, self._stems = _group(_ends_of(paths)), _group(_ends_of(stems))
+        self._whole = _group((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, listed: str) -> list[int]:
         """Return the indices of the names that end with a listed name, with or without its suffix.
@@ -179,7 +179,7 @@ def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], 
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
-def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
+def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
     """Return the indices of each key."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for parts, i in indexed:
