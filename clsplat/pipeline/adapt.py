@@ -1,4 +1,4 @@
-"""Choose settings by the photos (`adapt:`): a class gets measurements, and decides with reasons."""
+"""Choose settings based on the photos (`adapt:`): a class decides from measurements, and gives reasons."""
 
 import json
 from abc import abstractmethod
@@ -22,7 +22,7 @@ class Decision(Settings):
     value: Any
     """Its value, as in `--set`; may be null."""
     reason: str
-    """What was measured, and what follows from it, in one sentence."""
+    """The measurement and its consequence, in one sentence."""
     matters: bool = True
     """Whether the decision changes this run; only then the log gives the reason."""
 
@@ -33,7 +33,7 @@ class Decision(Settings):
 
 
 class Adaptation(Settings):
-    """Decides settings by the photos, before the first step of a run."""
+    """Decides settings based on the photos, before the first step of a run."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"decisions"})
 
@@ -41,7 +41,7 @@ class Adaptation(Settings):
     keep: list[str] = Field([])
     """Keys that are not decided; `--set` of a key adds it here."""
     decisions: list[Decision] | None = None
-    """What was decided, written by a run.  A run that has decisions makes no others."""
+    """Decisions, written by a run.  A run that has decisions makes no new ones."""
 
     @abstractmethod
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
@@ -51,21 +51,21 @@ class Adaptation(Settings):
         """
 
     def keys(self, training: Optimize) -> list[str]:
-        """Return the keys that it decides."""
+        """Return the keys that are decided."""
         return [decision.key for decision in self.decide(training, Measures(0))]
 
 
-FEW = 40  # training photos; a model overfits fewer
+FEW = 40  # training photos; with fewer, a model overfits
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
-MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # from a fraction of photos with sky on: Gaussians per pixel
-MISS = 1.0  # px of mean reprojection error, at the size of training, from which poses are optimized
+MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # smallest fraction of photos with sky, Gaussians per pixel
+MAX_ERROR = 1.0  # px of mean reprojection error at the training size; from here on, poses are optimized
 STEPS = 3400  # of `photos`: the steps below are for a training of this length
 DROPOUT_UNTIL, POSES_START = 1460, 500
 
 
 class Photos(Adaptation):
-    """Decides for folders of photos.  Fewer than 40: dropout, fewer Gaussians, perhaps a sky.  Cameras that miss the
-    points by a pixel: their poses are optimized."""
+    """Decides for folders of photos.  With fewer than 40: dropout, fewer Gaussians, perhaps a sky.  With a reprojection
+    error of a pixel or more: optimized poses."""
 
     type: Literal["photos"] = "photos"
 
@@ -75,43 +75,45 @@ class Photos(Adaptation):
         has_alpha = measures.scene is not None and is_transparent(measures.scene)
         lacks_points = measures.scene is not None and measures.scene.points is None
 
-        why = "the hull of few silhouettes is too large, so points start at random"
-        why = f"{count}: {why if few else 'points start in the hull of the silhouettes'}"
+        reason = "the hull of few silhouettes is too large, so points start at random"
+        reason = f"{count}: {reason if few else 'points start in the hull of the silhouettes'}"
         yield Decision(
-            key="init.transparent", value="random" if few else "hull", reason=why, matters=has_alpha and lacks_points
+            key="init.transparent", value="random" if few else "hull", reason=reason, matters=has_alpha and lacks_points
         )
-        yield Decision(key="init.count", value=100_000 if few else 60_000, reason=why, matters=False)
+        yield Decision(key="init.count", value=100_000 if few else 60_000, reason=reason, matters=False)
 
         dropout = {"probability": [[0, 0.0], [DROPOUT_UNTIL * training.steps // STEPS, 0.2]]} if few else None
-        why = f"{count}: {'dropout against overfitting' if few else 'enough to train without dropout'}"
-        yield Decision(key="optimize.modules.dropout", value=dropout, reason=why, matters=few)
+        reason = f"{count}: {'dropout against overfitting' if few else 'enough to train without dropout'}"
+        yield Decision(key="optimize.modules.dropout", value=dropout, reason=reason, matters=few)
         random = {"when": "transparent"} if few else None
-        why = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
-        yield Decision(key="optimize.modules.random_background", value=random, reason=why, matters=few and has_alpha)
+        reason = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
+        yield Decision(key="optimize.modules.random_background", value=random, reason=reason, matters=few and has_alpha)
 
         densify = next((i for i, stage in enumerate(training.during) if isinstance(stage, Densify)), 0)
-        per_pixel, why = _max_per_pixel(measures) if few else (None, ": enough for as many Gaussians as grow")
-        yield Decision(key=f"optimize.during.{densify}.per_pixel", value=per_pixel, reason=f"{count}{why}", matters=few)
+        per_pixel, reason = _max_per_pixel(measures) if few else (None, ": enough for as many Gaussians as grow")
+        yield Decision(
+            key=f"optimize.during.{densify}.per_pixel", value=per_pixel, reason=f"{count}{reason}", matters=few
+        )
 
-        # Of the sky and of exposures the modules log what they choose.
+        # The modules log what they choose for the sky and for exposures.
         sky = {"type": "auto", "photographs": 0.25} if MIN_FOR_SKY <= measures.photographs < FEW else None
-        why = "a sky, if they show one" if sky else "too few for a sky" if few else "enough to do without a sky"
-        yield Decision(key="model.background", value=sky, reason=f"{count}: {why}", matters=False)
+        reason = "a sky, if they show one" if sky else "too few for a sky" if few else "enough to do without a sky"
+        yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 
         error = measures.reprojection_error
-        misses = error is not None and error >= MISS
+        misses = error is not None and error >= MAX_ERROR
         fit = "the reprojection error is unknown" if error is None else f"cameras fit the points to {error:,.4g} px"
         poses = {"start": POSES_START * training.steps // STEPS} if misses else None
-        why = f"{fit}: poses {'are optimized' if misses else 'stay as they are'}"
-        yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=why, matters=error is not None)
+        reason = f"{fit}: poses {'are optimized' if misses else 'stay as they are'}"
+        yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=reason, matters=error is not None)
         exposure = {"when": "auto"} if misses else {"when": "auto", "min_spread": 0.2}
-        why = f"{fit}: {'small' if misses else 'only large'} differences of exposure are corrected"
-        yield Decision(key="optimize.modules.exposure", value=exposure, reason=why, matters=False)
+        reason = f"{fit}: {'small' if misses else 'only large'} differences of exposure are corrected"
+        yield Decision(key="optimize.modules.exposure", value=exposure, reason=reason, matters=False)
 
 
 def _max_per_pixel(measures: Measures) -> tuple[float, str]:
     """Return how many Gaussians per pixel few photos can constrain, and the reason."""
     sky = measures.sky
     count = next(count for fraction, count in MAX_PER_PIXEL if (sky or 0.0) >= fraction)
-    seen = "" if sky is None else f", {sky:.0%} of them with sky"
-    return count, f"{seen}: at most {count:g} Gaussians per pixel"
+    sky_text = "" if sky is None else f", {sky:.0%} of them with sky"
+    return count, f"{sky_text}: at most {count:g} Gaussians per pixel"

@@ -16,7 +16,7 @@ from clsplat.core.settings import InputPath, Settings
 from clsplat.pipeline.explanation import explain, first_fault
 from clsplat.pipeline.yaml_file import read_yaml
 
-HERE = r"^(inline|local)$"
+LOCAL_ENGINE = r"^(inline|local)$"
 ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
 LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -37,12 +37,12 @@ class Tls(Settings):
     ca: InputPath
     """Certificate of the authority."""
     cert: InputPath
-    """Certificate of this side."""
+    """Certificate of this machine."""
     key: InputPath
-    """Its private key."""
+    """Private key of that certificate."""
 
 
-def _engine(value: Any) -> Any:
+def _check_engine(value: Any) -> Any:
     match = re.fullmatch(ENGINE, value) if isinstance(value, str) else None
     if isinstance(value, str) and (match is None or int(match[3] or 0) > LAST_PORT):
         scheduler = "dask://HOST:PORT (tcp:// in Dask) or tls://HOST:PORT"
@@ -50,8 +50,8 @@ def _engine(value: Any) -> Any:
     return value
 
 
-def _engine_here(value: Any) -> Any:
-    if isinstance(value, str) and not re.fullmatch(HERE, value):
+def _check_local_engine(value: Any) -> Any:
+    if isinstance(value, str) and not re.fullmatch(LOCAL_ENGINE, value):
         raise ValueError("expected inline or local; give the address of a scheduler in a file with --on")
     return value
 
@@ -61,7 +61,7 @@ class LocalExecution(Settings):
 
     unavailable: ClassVar[Mapping[str, str]] = dict.fromkeys(("store", "insecure", "tls"), ON_ONLY)
 
-    engine: Annotated[str, BeforeValidator(_engine_here), Field(pattern=HERE)] = "inline"
+    engine: Annotated[str, BeforeValidator(_check_local_engine), Field(pattern=LOCAL_ENGINE)] = "inline"
     """inline: one after another in this process; local: one process per device of this machine, with a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
     """Devices of this machine, named as for `--device`; auto: all that work; engine inline uses the first."""
@@ -73,17 +73,17 @@ class LocalExecution(Settings):
     """Number of failures without a newer checkpoint after which a cell is given up."""
 
     @model_validator(mode="after")
-    def _has_effect(self) -> "LocalExecution":
+    def _refuse_unused_keys(self) -> "LocalExecution":
         """Refuse keys without an effect."""
-        for key, reason in self._unused().items():
+        for key, reason in self._unused_keys().items():
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; leave it out")
         return self
 
-    def _unused(self) -> dict[str, str]:
-        """Return the keys that have no effect, with the reasons."""
+    def _unused_keys(self) -> dict[str, str]:
+        """Return the keys that have no effect, each with the reason."""
         unused = {} if self.has_store else dict.fromkeys(STORE_KEYS, "it needs a store")
-        return unused if self.engine == "local" else unused | {"packing": "it is for engine local"}
+        return unused if self.engine == "local" else unused | {"packing": "it applies only to engine local"}
 
     @property
     def has_store(self) -> bool:
@@ -94,7 +94,7 @@ class LocalExecution(Settings):
 class Execution(LocalExecution):
     """Where the cells of a matrix run, and where they are kept."""
 
-    engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
+    engine: Annotated[str, BeforeValidator(_check_engine), Field(pattern=ENGINE)] = "inline"
     """inline: one after another in this process; local: one process per device of this machine; dask://HOST:PORT or
     tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
     store: InputPath | None = None
@@ -107,13 +107,13 @@ class Execution(LocalExecution):
 
     @field_validator("store")
     @classmethod
-    def _names_a_folder(cls, store: str | None) -> str | None:
-        if store == "":  # from an unset variable: it would mean the working folder
+    def _refuse_empty_store(cls, store: str | None) -> str | None:
+        if store == "":  # from an unset variable; it would select the working folder
             raise ValueError("expected the path of a folder")
         return store
 
     @model_validator(mode="after")
-    def _is_safe(self) -> "Execution":
+    def _refuse_unsafe_scheduler(self) -> "Execution":
         """Refuse a scheduler that anyone could reach."""
         if self.engine.startswith("dask://") and not self.is_local and not self.insecure:
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
@@ -123,14 +123,14 @@ class Execution(LocalExecution):
             )
         return self
 
-    def _unused(self) -> dict[str, str]:
-        unused = super()._unused()
+    def _unused_keys(self) -> dict[str, str]:
+        unused = super()._unused_keys()
         if self.has_workers:
             unused["devices"] = "the workers choose the devices they offer"
         if not self.engine.startswith("tls://"):
-            unused["tls"] = "it is for engine tls://HOST:PORT"
+            unused["tls"] = "it applies only to engine tls://HOST:PORT"
         if not self.engine.startswith("dask://"):
-            unused["insecure"] = "it is for engine dask://HOST:PORT"
+            unused["insecure"] = "it applies only to engine dask://HOST:PORT"
         return unused
 
     @property

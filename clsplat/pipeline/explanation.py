@@ -1,4 +1,4 @@
-"""Explain a failed validation in one sentence: file, line, key, what was expected, the nearest match."""
+"""Explain a failed validation in one sentence: file, line, key, expectation, nearest match."""
 
 import difflib
 import re
@@ -63,19 +63,19 @@ def tags(model: type[BaseModel]) -> tuple[Any, ...]:
     return typing.get_args(field.annotation) if field else ()
 
 
-def inside_list(annotation: Any) -> Any:
+def item_annotation(annotation: Any) -> Any:
     """Return the annotation of a list's items."""
     if typing.get_origin(annotation) is typing.Annotated:
-        return inside_list(typing.get_args(annotation)[0])
+        return item_annotation(typing.get_args(annotation)[0])
     return next(iter(typing.get_args(annotation)), None)
 
 
 def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
-    """Return the model that plain data has by its tag; None if it is unknown."""
+    """Return the model that the tag of plain data selects; None if it is unknown."""
     allowed = models(annotation)
     if len(allowed) > 1 and isinstance(data, dict):
-        named = [data[name] for name in TAGS if name in data]
-        allowed = [model for model in allowed for name in named if name in tags(model)]
+        names = [data[name] for name in TAGS if name in data]
+        allowed = [model for model in allowed for name in names if name in tags(model)]
     return allowed[0] if len(allowed) == 1 else None
 
 
@@ -84,7 +84,7 @@ def with_tags(data: Any, annotation: Any) -> Any:
     if not isinstance(data, list | dict | str):
         return data
     if isinstance(data, list):
-        return [with_tags(item, inside_list(annotation)) for item in data]
+        return [with_tags(item, item_annotation(annotation)) for item in data]
     for mark in map(Variants, bases(annotation)):
         if isinstance(data, str):
             data = {mark.tag: data}
@@ -93,8 +93,8 @@ def with_tags(data: Any, annotation: Any) -> Any:
             if name != "stage" and isinstance(fields, dict | None):
                 data = {"stage": name, **(fields or {})}
     if isinstance(data, dict) and (model := model_of(data, annotation)):
-        known = annotations(model)
-        return {key: with_tags(value, known.get(key)) for key, value in data.items()}
+        types_ = annotations(model)
+        return {key: with_tags(value, types_.get(key)) for key, value in data.items()}
     return data
 
 
@@ -123,14 +123,14 @@ EXPECTATIONS = {
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
     """Describe the first fault, with its file and line."""
     key_path, complaint = first_fault(error, root)
-    where = f"{key_path_text(key_path)}: " if key_path else ""  # else the whole file
+    where = f"{key_path_text(key_path)}: " if key_path else ""  # else the file as a whole
     return f"{path}:{document.line(key_path)}: {where}{complaint}"
 
 
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
     """Return the first fault, with its key path in the file.
 
-    A misspelled key comes before a missing one, because it often causes it.
+    A misspelled key comes before a missing key, because it is often its cause.
     """
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     key_path, model, annotation = _follow(first["loc"], root)
@@ -149,7 +149,7 @@ def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] 
     if kind == "union_tag_invalid":
         known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shorten(str(error["ctx"]["tag"]))
-        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; a plug-in's needs --plugin FILE.py"
+        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; plug-ins need --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"
@@ -162,10 +162,10 @@ def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] 
 
 
 def _nearest(word: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    if near:
-        return f"; did you mean '{near[0]}'?"
-    return f"; there are {', '.join(sorted(known))}" if known else "; remove it, as there are no other keys"
+    matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if matches:
+        return f"; did you mean '{matches[0]}'?"
+    return f"; expected one of {', '.join(sorted(known))}" if known else "; remove it, no key is allowed here"
 
 
 def _kind(annotation: Any) -> str:
@@ -198,7 +198,7 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Key
         tagged = [m for m in members if part in tags(m)]
         if isinstance(part, int):
             key_path.append(part)
-            annotation = inside_list(annotation)
+            annotation = item_annotation(annotation)
         elif tagged and not (len(members) == 1 and part in members[0].model_fields):
             annotation = model = tagged[0]
             if "stage" in model.model_fields:

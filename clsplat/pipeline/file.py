@@ -62,13 +62,13 @@ class SceneSettings(Settings):
     with the fifth, and at least two."""
     extent: Annotated[float, Field(gt=0)] | None = None
     """Radius of the scene, scene units, to which sizes and rates are relative; default: that of the training cameras.
-    A part of a scene is trained with the extent of the whole."""
+    To train a part of a scene, set the extent of the whole scene."""
     missing: Missing = "refuse"
     """Images that the dataset names but does not have: refuse the scene, or skip them."""
 
     @field_validator("masks")
     @classmethod
-    def _from_any_folder(cls, masks: str | None) -> str | None:
+    def _make_absolute(cls, masks: str | None) -> str | None:
         """Make the path absolute, as a run may be evaluated from another working folder."""
         return masks and str(Path(masks).absolute())
 
@@ -90,17 +90,17 @@ class SceneSettings(Settings):
         lists = None if self.path is None else Path(self.path)
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
-    def masked(self, scene: Scene) -> Scene:
-        """Return a scene with the masks of these settings.  Raises DataError if the folder has none of them."""
+    def apply_masks(self, scene: Scene) -> Scene:
+        """Return a scene with the masks of these settings.  Raises DataError if the folder has no masks for it."""
         return with_masks(scene, None if self.masks is None else Path(self.masks))
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
         """Read a scene with these settings; return it and its background.  Raises DataError."""
-        return self.applied(read_scene(folder, self.split))
+        return self.apply(read_scene(folder, self.split))
 
-    def applied(self, scene: Scene) -> tuple[Scene, Background]:
+    def apply(self, scene: Scene) -> tuple[Scene, Background]:
         """Return a scene with these settings of alpha, masks and extent, and its background.  Raises DataError."""
-        changed = replace(self.masked(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
+        changed = replace(self.apply_masks(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
         return changed, scene.background if self.background == "auto" else self.background
 
 
@@ -117,7 +117,7 @@ class RasterizerSettings(Settings):
     """MiB of gradient records at a time; default: the largest buffer of the device."""
     harmonics: Harmonics = "auto"
     """Memory for the spherical harmonics above band 0 and their Adam moments in training.  `host`: each step uploads
-    the ones that its view sees and downloads them again; the others are updated later (`optimize.update: deferred`).
+    those that its view sees and downloads them again; the others are updated later (`optimize.update: deferred`).
     `auto`: the device, or the host once the device cannot hold the expected number of Gaussians."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles per launch, for devices whose display driver limits the time of a launch; 0: all."""
@@ -125,7 +125,7 @@ class RasterizerSettings(Settings):
     def conflict_names(self) -> set[str]:
         return {ON_HOST} if self.harmonics == "host" else set()
 
-    def budget(self) -> RenderLimits | None:
+    def limits(self) -> RenderLimits | None:
         """Return the rasterizer's limits of memory and launches; None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
@@ -148,7 +148,7 @@ Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_fold
 class PipelineFile(Settings):
     """The keys of a pipeline file."""
 
-    output_keys: ClassVar[frozenset[str]] = frozenset({"adapt"})  # what it decides is compared at its own keys
+    output_keys: ClassVar[frozenset[str]] = frozenset({"adapt"})  # decisions are compared at the keys that they set
 
     name: Name
     """Name of the pipeline, and of its run folder."""
@@ -163,28 +163,30 @@ class PipelineFile(Settings):
     prepare: list[OneOf[Step]] = Field([])
     """Steps from photos to a scene; later runs reuse their results."""
     adapt: OneOf[Adaptation] | None = None
-    """Decides settings by the photos, before the first step."""
+    """Decides settings based on the photos, before the first step."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})
     """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run needs them."""
 
-    def check_together(self) -> None:
-        """Raise ConfigError for the first settings that exclude each other, as their classes say."""
+    def check_conflicts(self) -> None:
+        """Raise ConfigError for the first two settings that exclude each other according to their classes."""
         parts = list(iter_settings(self))
         for path, part in parts:
             part.check_pipeline(self)
-            for name, why in part.excluded().items():
+            for name, reason in part.excluded().items():
                 for other, rival in parts:
                     is_elsewhere = other.startswith("stages[") and other.partition(".")[0] != path.partition(".")[0]
                     if name in rival.conflict_names() and not is_elsewhere:
                         label = getattr(part, "type", getattr(part, "stage", path))
-                        remedy = "" if ";" in why else "; leave one of them out"
-                        raise ConfigError(f"{path}: '{label}' cannot be combined with {name} ({other}): {why}{remedy}")
+                        remedy = "" if ";" in reason else "; leave one of them out"
+                        raise ConfigError(
+                            f"{path}: '{label}' cannot be combined with {name} ({other}): {reason}{remedy}"
+                        )
 
     @property
     def harmonics(self) -> Harmonics:
-        """Where spherical harmonics are kept.  `auto` means the device if a stage needs them there, or at degree 0."""
+        """Where spherical harmonics are stored; `auto`: on the device if a stage needs them there, or at degree 0."""
         setting = self.rasterizer.harmonics
         is_needed = any(ON_HOST in part.excluded() for _, part in iter_settings(self.stages))
         return "device" if setting == "auto" and (self.model.sh_degree == 0 or is_needed) else setting

@@ -55,7 +55,7 @@ def find(name: str) -> Path:
     if is_folder:
         remedy = f"to train on it, use `clsplat run splat_7k --scene {shell_quote(path)}`"
         raise ConfigError(f"{path}: is a folder; expected a pipeline file; {remedy}")
-    near = difflib.get_close_matches(name, files, n=1)
+    matches = difflib.get_close_matches(name, files, n=1)
     unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"
-    hint = f"; did you mean '{near[0]}'?" if near else unknown
+    hint = f"; did you mean '{matches[0]}'?" if matches else unknown
     raise ConfigError(f"no pipeline named {quote(name)}{hint}")

@@ -19,38 +19,38 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import fingerprint
 from clsplat.scene.images import is_image
 
-Change = Callable[[str, Path], str]  # of the text of a path, and the path that it means, to another text
+Change = Callable[[str, Path], str]  # of a path as text, and as the path it refers to, to another text
 
 
 def with_content_hashes(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the resolved pipeline with the hash of the content in place of the path of each file that it reads.
+    """Return the resolved pipeline with the content hash instead of the path of each file that it reads.
 
-    The folder of the scene is left out, as a scene has an identity.  Raises DataError if a file cannot be read.
+    The folder of the scene is left out, as a scene is identified otherwise.  Raises DataError for unreadable files.
     """
-    return _with(pipeline, lambda text, path: content_of(path) or text, None).resolved()
+    return _map_paths(pipeline, lambda text, path: hash_content(path) or text, None).resolved()
 
 
 def with_absolute_paths(pipeline: Pipeline) -> Pipeline:
     """Return the pipeline with absolute paths, for a process with another working folder."""
     scene = pipeline.settings.scene.path
-    return _with(pipeline, lambda text, path: str(path.absolute()), scene and str(Path(scene).absolute()))
+    return _map_paths(pipeline, lambda text, path: str(path.absolute()), scene and str(Path(scene).absolute()))
 
 
-def contents(pipeline: Pipeline) -> dict[str, str]:
-    """Return the hash of each file that is read, by the text that names it, without files that cannot be read."""
+def content_hashes(pipeline: Pipeline) -> dict[str, str]:
+    """Return the hash of each readable input file, by the text of its path."""
     hashes: dict[str, str] = {}
 
     def add(text: str, path: Path) -> str:
         with suppress(DataError):
-            if digest := content_of(path):
+            if digest := hash_content(path):
                 hashes[text] = digest
         return text
 
-    _with(pipeline, add, None)
+    _map_paths(pipeline, add, None)
     return hashes
 
 
-def content_of(path: Path) -> str:
+def hash_content(path: Path) -> str:
     """Return a hash of a file, of a model and its side files, or of a folder of images; "" if the path does not exist.
 
     Raises DataError for other folders, and for files that cannot be read.
@@ -58,50 +58,50 @@ def content_of(path: Path) -> str:
     if not os.path.exists(path):
         return ""
     try:
-        return _content_of(path)
+        return _hash_content(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
 
 
-def _content_of(path: Path) -> str:
+def _hash_content(path: Path) -> str:
     model = model_path(path)
     if not model.is_file() and any(is_image(file) for file in path.rglob("*")):
         return f"sha256:{fingerprint(path, path / 'nothing')}"
     if not model.is_file():
-        raise DataError(f"{path}: has no model; expected a file, or the folder of a finished run")
-    others = [file for file in (*model_files(model), sky_path(model)) if file != model and file.is_file()]
-    digests = " ".join(map(_digest, (model, *others)))
-    return f"sha256:{hashlib.sha256(digests.encode()).hexdigest() if others else digests}"
+        raise DataError(f"{path}: no model here; expected a file, or the folder of a finished run")
+    side_files = [file for file in (*model_files(model), sky_path(model)) if file != model and file.is_file()]
+    digests = " ".join(map(_digest, (model, *side_files)))
+    return f"sha256:{hashlib.sha256(digests.encode()).hexdigest() if side_files else digests}"
 
 
 def _digest(file: Path) -> str:
     state = file.stat()
-    return _known(file.absolute(), state.st_ino, state.st_size, state.st_mtime_ns)
+    return _cached_sha256(file.absolute(), state.st_ino, state.st_size, state.st_mtime_ns)
 
 
 @lru_cache(maxsize=256)  # the cells of a sweep name the same files
-def _known(file: Path, number: int, size: int, time: int) -> str:
+def _cached_sha256(file: Path, inode: int, size: int, time: int) -> str:
     return sha256(file)
 
 
-def _with(pipeline: Pipeline, change: Change, scene: str | None) -> Pipeline:
+def _map_paths(pipeline: Pipeline, change: Change, scene: str | None) -> Pipeline:
     """Return the pipeline with changed paths of the files that it reads, and with another folder of its scene."""
     settings = pipeline.settings
-    other = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
-    changed = _changed(other, settings.scene.path, change)
+    without_scene = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
+    changed = _map_value(without_scene, settings.scene.path, change)
     moved = changed.scene.model_copy(update={"path": scene})
     return replace(pipeline, settings=changed.model_copy(update={"scene": moved}))
 
 
-def _changed(value: Any, scene: str | None, change: Change) -> Any:
+def _map_value(value: Any, scene: str | None, change: Change) -> Any:
     if isinstance(value, Settings):
         changes = {}
         for key in type(value).model_fields:
             before, path = getattr(value, key), value.input_path(key, scene)
-            changes[key] = _changed(before, scene, change) if path is None else change(before, path)
+            changes[key] = _map_value(before, scene, change) if path is None else change(before, path)
         return value.model_copy(update=changes)
     if isinstance(value, list | tuple):
-        return type(value)(_changed(item, scene, change) for item in value)
+        return type(value)(_map_value(item, scene, change) for item in value)
     if isinstance(value, dict):
-        return {key: _changed(item, scene, change) for key, item in value.items()}
+        return {key: _map_value(item, scene, change) for key, item in value.items()}
     return value

@@ -19,7 +19,7 @@ from clsplat.pipeline.adapt import Decision
 from clsplat.pipeline.explanation import explain, first_fault, key_path_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
-from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, split, suggestion
+from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, list_keys, split, suggestion
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_yaml, yaml_text
 from clsplat.prepare.cache import PlannedStep, plan
 from clsplat.scene.quality import Measures
@@ -48,7 +48,7 @@ class Pipeline:
 
     @property
     def decisions(self) -> list[Decision]:
-        """What was decided by the photos."""
+        """The decisions that follow from the photos."""
         return (self.settings.adapt and self.settings.adapt.decisions) or []
 
     @property
@@ -68,7 +68,7 @@ class Pipeline:
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:
             raise ConfigError(
-                "scene.masks: masks do not fit photos that are still to be undistorted; run without scene.masks first, "
+                "scene.masks: masks do not fit photos before they are undistorted; run without scene.masks first, "
                 f"then use the scene in {folder} as --scene, with masks of its images"
             )
         return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
@@ -76,7 +76,7 @@ class Pipeline:
     def resolved(self) -> dict[str, Any]:
         """Return every setting with its value, as plain data with the structure of a file."""
         data = self.settings.model_dump(mode="json")
-        data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
+        data |= {key: [_untag_stage(stage) for stage in data[key]] for key in STAGE_LISTS}
         return {key: value for key, value in data.items() if value or key not in ("plugins", "adapt")}
 
     def text(self) -> str:
@@ -102,13 +102,13 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     """Check a document with overrides, without changing it.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    tagged = _tagged_file(document, path)
+    tagged = _tag_file(document, path)
     try:
         data = copy.deepcopy(without_decisions(tagged) if any(map(_changes_photos, overrides)) else tagged)
         key_paths = [apply(data, override, PipelineFile) for override in overrides]
-        return _without_done_steps(Pipeline(path, _keep_overrides(_validated(data, path, document), key_paths)))
+        return _without_done_steps(Pipeline(path, _keep_overrides(_validate(data, path, document), key_paths)))
     except ConfigError:
-        _blame(tagged, overrides, path, document)
+        _raise_cause(tagged, overrides, path, document)
         raise
 
 
@@ -122,7 +122,7 @@ def _without_done_steps(pipeline: Pipeline) -> Pipeline:
     return replace(pipeline, settings=pipeline.settings.model_copy(update={"prepare": []}), reason=reason)
 
 
-def _validated(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:
+def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:
     if isinstance(recorded := data.get("plugins"), dict):
         plugins.require({str(name): str(digest) for name, digest in recorded.items()}, str(path))
     try:
@@ -131,7 +131,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
     try:
-        settings.check_together()
+        settings.check_conflicts()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
     parts = [part for _, part in iter_settings(settings)]
@@ -139,9 +139,9 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
 
 
-def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
+def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
     """Raise the error of the file without overrides, or that of the first invalid override."""
-    known = [key.key_path for key in settable(_validated(data, path, document))]
+    known = [key.key_path for key in list_keys(_validate(data, path, document))]
     conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
     for override in overrides:
         names, _ = split(override)
@@ -152,12 +152,14 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
         try:
             settings = PipelineFile.model_validate(data)
             _check_order(path, settings)
-            settings.check_together()
+            settings.check_conflicts()
             conflict = None
         except ValidationError as error:
             where, complaint = first_fault(error, PipelineFile)
-            around = where == key_path[: len(where)]
-            raise OverrideError(override, complaint if around else f"{key_path_text(where)}: {complaint}") from error
+            contains_key = where == key_path[: len(where)]
+            raise OverrideError(
+                override, complaint if contains_key else f"{key_path_text(where)}: {complaint}"
+            ) from error
         except ConfigError as error:
             conflict = (conflict[0] if conflict else override), error
     if conflict:
@@ -169,14 +171,14 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
 AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
 
 
-def adapted(pipeline: Pipeline, measures: Measures) -> Pipeline:
-    """Return the pipeline with the decisions of its `adapt`; existing decisions stay.  Raises ConfigError."""
+def apply_adaptation(pipeline: Pipeline, measures: Measures) -> Pipeline:
+    """Return the pipeline with the decisions of its `adapt`; existing decisions are kept.  Raises ConfigError."""
     adapt = pipeline.settings.adapt
     return with_decisions(pipeline, adapt.decide(pipeline.settings.optimize, measures)) if adapt else pipeline
 
 
 def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipeline:
-    """Return the pipeline with decisions, except for keys that it keeps; its own stay.  Raises ConfigError."""
+    """Return the pipeline with decisions, except for keys it keeps and existing decisions.  Raises ConfigError."""
     if (adapt := pipeline.settings.adapt) is None or adapt.decisions is not None:
         return pipeline
     data = pipeline.settings.model_dump(mode="json")
@@ -185,10 +187,12 @@ def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipelin
         for decision in new:
             apply(data, decision.override, PipelineFile)
         data["adapt"]["decisions"] = [decision.model_dump() for decision in new]
-        return replace(pipeline, settings=_validated(data, pipeline.path, Document(data)))
+        return replace(pipeline, settings=_validate(data, pipeline.path, Document(data)))
     except ConfigError as error:
         keys = ", ".join(decision.key for decision in new)
-        raise ConfigError(f"adapt: {adapt.type}: {one_line(error)}; --set of one of its keys wins: {keys}") from error
+        raise ConfigError(
+            f"adapt: {adapt.type}: {one_line(error)}; override one of its keys with --set: {keys}"
+        ) from error
 
 
 def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> PipelineFile:
@@ -197,28 +201,28 @@ def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> Pip
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
     if unknown := [key for key in (*keep, *(decision.key for decision in adapt.decisions or ())) if key not in keys]:
-        raise ConfigError(f"adapt: {adapt.type} does not decide {quote(unknown[0])}; there are {', '.join(keys)}")
+        raise ConfigError(f"adapt: {adapt.type} does not decide {quote(unknown[0])}; expected one of {', '.join(keys)}")
     for key in keys:
         try:
-            own = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
+            key_path = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
         except OverrideError as error:
             raise ConfigError(f"adapt: {adapt.type}: {key}: {error.reason}") from error
-        if own[0] not in ("model", "stages"):
+        if key_path[0] not in ("model", "stages"):
             raise ConfigError(f"adapt: {adapt.type}: {key} is used before the photos are measured")
-        if key not in keep and any(own[: len(path)] == path[: len(own)] for path in key_paths):
+        if key not in keep and any(key_path[: len(path)] == path[: len(key_path)] for path in key_paths):
             keep = [*keep, key]
     decisions = adapt.decisions and [decision for decision in adapt.decisions if decision.key not in keep]
     return settings.model_copy(update={"adapt": adapt.model_copy(update={"keep": keep, "decisions": decisions})})
 
 
 def without_decisions(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data without what a run decided by its photos, so that it is decided again."""
+    """Return a file's data without the decisions of a run, so that they are made again."""
     adapt = data.get("adapt")
     return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
 
 
 def without_auto(data: Any) -> Any:
-    """Return plain data of a resolved pipeline without what keys `auto` chose."""
+    """Return plain data of a resolved pipeline without the choices of keys that are `auto`."""
     if isinstance(data, list):
         return [without_auto(item) for item in data]
     if not isinstance(data, dict):
@@ -235,16 +239,16 @@ def _changes_photos(override: str) -> bool:
     return names[0] == "scene" and names[1:2] != ["validation"]
 
 
-def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
+def _tag_file(document: Document, path: Path) -> dict[str, Any]:
     """Return the file's data with each stage as {stage: name, …}, which selects its model, and without `short`."""
     data = {key: value for key, value in document.data.items() if key != "short"}
     for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
-            data[key] = [_tagged(item, (key, i), document, path) for i, item in enumerate(data[key])]
+            data[key] = [_tag_stage(item, (key, i), document, path) for i, item in enumerate(data[key])]
     return data
 
 
-def _tagged(item: Any, key_path: tuple[str | int, ...], document: Document, path: Path) -> Any:
+def _tag_stage(item: Any, key_path: tuple[str | int, ...], document: Document, path: Path) -> Any:
     if isinstance(item, str):
         return {"stage": item}
     if not (isinstance(item, dict) and len(item) == 1 and isinstance(next(iter(item.values())), dict | None)):
@@ -257,22 +261,23 @@ def _tagged(item: Any, key_path: tuple[str | int, ...], document: Document, path
         raise ConfigError(f"{path}:{document.line(inner)}: {key_path_text(inner)}: unknown key 'stage'; remove it")
     if isinstance(fields.get("during"), list):
         fields["during"] = [
-            _tagged(inner, (*key_path, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
+            _tag_stage(inner, (*key_path, name, "during", i), document, path)
+            for i, inner in enumerate(fields["during"])
         ]
     return {"stage": name, **fields}
 
 
-def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
+def _untag_stage(stage: dict[str, Any]) -> dict[str, Any]:
     fields = {key: value for key, value in stage.items() if key != "stage"}
     if fields.get("every") is None:  # only stages inside `during` have a cadence
         fields = {key: value for key, value in fields.items() if key not in CADENCE}
     if "during" in fields:
-        fields["during"] = [_untagged(inner) for inner in fields["during"]]
+        fields["during"] = [_untag_stage(inner) for inner in fields["during"]]
     return {stage["stage"]: fields}
 
 
-def _late(stages: Sequence[Stage], need: str) -> str:
-    """Explain why a stage inside `during` does not make what another needs, as it is due too late; "" if none does."""
+def _explain_late_stage(stages: Sequence[Stage], need: str) -> str:
+    """Explain which stage inside `during` makes what another needs, but too late; "" if there is none."""
     step = 0
     for training in stages:
         if not isinstance(training, Training):
@@ -298,12 +303,12 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
         for need in sorted(stage.needs - available):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             if need in removed:
-                reason = f"which {removed[need]} removes ({makers} makes it again)"
+                reason = f"which {removed[need]} removes (made again by {makers})"
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {reason}")
-            if late := _late(settings.stages[:i], need):
-                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {late}")
+            if reason := _explain_late_stage(settings.stages[:i], need):
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {reason}")
             raise ConfigError(
-                f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
+                f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes (made by {makers})"
             )
         removed |= dict.fromkeys(available & stage.removes, f"stages[{i}] {stage.stage}")
         available = (available - stage.removes) | stage.makes

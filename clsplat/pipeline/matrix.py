@@ -34,10 +34,10 @@ from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
-# Short labels for the values of a matrix, which make up the names of its cells.
+# Short labels for the values of a matrix, from which the names of its cells are made.
 
 
-def distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
+def shortest_labels(paths: Sequence[tuple[str, ...]]) -> list[str]:
     """Return the shortest distinct endings of paths, joined by hyphens."""
     for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
         names = ["-".join(parts[-length:]) for parts in paths]
@@ -73,13 +73,13 @@ class Matrix(Settings):
     """Settings of all cells, as key=value.  A run writes those of --set and --scene here, in its folder."""
 
     @model_validator(mode="after")
-    def _has_cells(self) -> "Matrix":
+    def _check_axes(self) -> "Matrix":
         axes: list[list[Any]] = [self.pipelines, self.scenes, self.seeds, *self.set.values()]
         if not any(axes):
             raise ValueError("expected one of pipelines, scenes, seeds and set")
         for axis in axes:
             if len({json.dumps(value) for value in axis}) < len(axis):
-                raise ValueError(f"the same value twice in {quote(axis)}")
+                raise ValueError(f"duplicate value in {quote(axis)}")
         return self
 
 
@@ -127,7 +127,7 @@ def load_experiment(
 ) -> Experiment | None:
     """Read and check a pipeline file with `matrix:` and all its cells; None for a file without `matrix:`.
 
-    execution: keys that replace those of the file, and are not in the text of the experiment, which may be passed on.
+    execution: keys that replace those of the file, and are left out of the text of the experiment, which may be shared.
     Raises ConfigError with file and line.
     """
     path = find(name)
@@ -141,7 +141,7 @@ def load_experiment(
     except ValidationError as error:
         raise ConfigError(explain(error, MatrixFile, path, document)) from error
     has_options = bool(overrides) or execution is not None
-    overrides = _last_of_each([*file.matrix.options, *overrides])
+    overrides = _last_overrides([*file.matrix.options, *overrides])
     axes = _axes(file.matrix)
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
@@ -192,12 +192,12 @@ def _axes(matrix: Matrix) -> list[list[_Choice]]:
     """Return all axes except the pipelines, in the order in which they appear in the names of cells."""
     axes = []
     if matrix.scenes:
-        labels = distinct([Path(scene).parts for scene in matrix.scenes])
+        labels = shortest_labels([Path(scene).parts for scene in matrix.scenes])
         axes.append([
             _Choice(label, _override("scene.path", str(Path(scene).resolve())), ("matrix", "scenes", i))
             for i, (label, scene) in enumerate(zip(labels, matrix.scenes, strict=True))
         ])  # fmt: skip
-    keys = distinct([tuple(key.split(".")) for key in matrix.set])
+    keys = shortest_labels([tuple(key.split(".")) for key in matrix.set])
     for short, (key, values) in zip(keys, matrix.set.items(), strict=True):
         axes.append([
             _Choice(f"{short}={value_text(value)}", _override(key, value), ("matrix", "set", key, i))
@@ -228,7 +228,7 @@ def _in_steps(cell: Cell, steps: int) -> Cell:
 def _check_choices(
     path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
 ) -> None:
-    """Check each value of the matrix by itself.  Raises ConfigError with the key of the first invalid one."""
+    """Check each value of the matrix separately.  Raises ConfigError with the key of the first invalid one."""
     checked(base.path, base.document, list(overrides))
     for choice in itertools.chain(*axes):
         try:
@@ -239,9 +239,9 @@ def _check_choices(
 
 
 def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]) -> None:
-    swept = {choice.override.partition("=")[0] for axis in axes for choice in axis}
+    swept_keys = {choice.override.partition("=")[0] for axis in axes for choice in axis}
     for override in overrides:
-        if (key_path := override.partition("=")[0]) in swept:
+        if (key_path := override.partition("=")[0]) in swept_keys:
             raise ConfigError(f"{path}: the matrix lists values of {key_path}; change them there, not by an option")
 
 
@@ -250,11 +250,13 @@ def _check_names(path: Path, cells: Sequence[Cell]) -> None:
         if fault := invalid_output_reason(cell.name):
             raise ConfigError(f"{path}: a cell of the matrix would be named '{shorten(cell.name)}': {fault}")
     names = [cell.name.casefold() for cell in cells]  # some file systems ignore case
-    if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
-        raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")
+    if duplicate := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
+        raise ConfigError(
+            f"{path}: two cells of the matrix would be named '{duplicate}'; rename a pipeline or a folder"
+        )
 
 
-def _last_of_each(overrides: Sequence[str]) -> list[str]:
+def _last_overrides(overrides: Sequence[str]) -> list[str]:
     """Return the last override of each key."""
     keys = [override.partition("=")[0] for override in overrides]
     return [override for i, override in enumerate(overrides) if keys[i] not in keys[i + 1 :]]

@@ -17,11 +17,11 @@ from pydantic import BaseModel
 
 from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.settings import TAGS, Variants, descriptions, variants
-from clsplat.pipeline.explanation import annotations, bases, inside_list, model_of, with_tags
+from clsplat.pipeline.explanation import annotations, bases, item_annotation, model_of, with_tags
 from clsplat.pipeline.yaml_file import KeyPath, parse_value
 
 MAX_SUGGESTIONS = 3
-MAX_PARTS = 32  # of a key path; real ones have up to ten
+MAX_PARTS = 32  # of a key path; those of the settings have up to ten
 NOT_SETTABLE = {"plugins": "runs write it; load a plug-in with --plugin FILE"}
 
 
@@ -54,7 +54,7 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
         return (*node.key_path, last)
     if isinstance(node.data, list):
         i = node.number(last, text)
-        node.data[i] = with_tags(parsed, node.inside)
+        node.data[i] = with_tags(parsed, node.items)
         return (*node.key_path, i)
     if not isinstance(node.data, dict):
         raise NoSuchKey(text, f"{quote(node.key_path[-1])} has no keys")
@@ -82,7 +82,7 @@ class _Node:
         self.data = data
         self.key_path = key_path
         self.model = model_of(data, annotation)
-        self.inside = inside_list(annotation) if isinstance(data, list) else None
+        self.items = item_annotation(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":
         """Return the node of a key, which is created from its default if missing.  Raises OverrideError."""
@@ -90,7 +90,7 @@ class _Node:
             if all(item["type"] != name for item in self.data):
                 self.put(name, {}, text)
             item = next(item for item in self.data if item["type"] == name)
-            return _Node(item, self.inside, (*self.key_path, name))
+            return _Node(item, self.items, (*self.key_path, name))
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
@@ -107,7 +107,7 @@ class _Node:
 
     def is_keyed(self, name: str) -> bool:
         """Return whether the name is the type of a list item, and not an index."""
-        keyed_by_type = any(base.keyed_by_type for base in bases(self.inside))
+        keyed_by_type = any(base.keyed_by_type for base in bases(self.items))
         return (
             keyed_by_type
             and not name.isdigit()
@@ -115,14 +115,14 @@ class _Node:
         )
 
     def put(self, name: str, value: Any, text: str) -> None:
-        """Insert a list item of a type in its position, or replace the item of that type; None removes it.
+        """Insert a list item at the position of its type, or replace the item of that type; None removes it.
 
         Raises OverrideError.
         """
-        kinds: dict[str, Any] = {key: kind for base in bases(self.inside) for key, kind in variants(base).items()}
+        kinds: dict[str, Any] = {key: kind for base in bases(self.items) for key, kind in variants(base).items()}
         if name not in kinds:
-            near = difflib.get_close_matches(name, kinds, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
+            matches = difflib.get_close_matches(name, kinds, n=1)
+            hint = f"; did you mean {matches[0]}?" if matches else ""
             raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{hint}")
         if value is not None and not isinstance(value, dict):
             raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
@@ -135,7 +135,7 @@ class _Node:
         if index is None:
             index = sum(getattr(kinds.get(type_), "order", 0) <= kinds[name].order for type_ in types)
         item = {"type": name, **{key: setting for key, setting in value.items() if key != "type"}}
-        self.data.insert(index, with_tags(item, self.inside))
+        self.data.insert(index, with_tags(item, self.items))
 
     def number(self, name: str, text: str) -> int:
         """Return a name as an index of the list.  Raises OverrideError."""
@@ -160,17 +160,21 @@ class _Node:
     def _item(self, i: int) -> "_Node":
         item = self.data[i]
         name = [item["stage"]] if isinstance(item, dict) and "stage" in item else []
-        return _Node(item, self.inside, (*self.key_path, i, *name))
+        return _Node(item, self.items, (*self.key_path, i, *name))
 
     def _stages(self) -> "list[_Node]":
         """Return the stages in the lists of a map."""
-        lists = [self._key(key) for key, value in self.data.items() if isinstance(value, list) and self._may_hold(key)]
+        lists = [
+            self._key(key)
+            for key, value in self.data.items()
+            if isinstance(value, list) and self._may_contain_stages(key)
+        ]
         items = [node._item(i) for node in lists for i in range(len(node.data))]
         return [item for item in items if isinstance(item.data, dict) and "stage" in item.data]
 
-    def _may_hold(self, key: str) -> bool:
-        """Return whether a list may contain stages: it does, or its type is unknown."""
-        kinds = bases(inside_list(self.annotation(key)))
+    def _may_contain_stages(self, key: str) -> bool:
+        """Return whether a list contains stages or has an unknown type."""
+        kinds = bases(item_annotation(self.annotation(key)))
         return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
@@ -189,7 +193,7 @@ class _Node:
 
 
 def _as_written(default: BaseModel) -> dict[str, Any]:
-    """Return a default as in a file: its tag, and the keys that differ from their own defaults."""
+    """Return a default as in a file: its tag, and the keys whose values are not their defaults."""
     written = default.model_dump(mode="json", exclude_defaults=True)
     return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
 
@@ -200,7 +204,7 @@ def _address(key_path: KeyPath) -> str:
 
 
 def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
-    """Return '; did you mean …?' with the known key paths that end with `names` or are similar; '' if none is."""
+    """Return '; did you mean …?' with the known key paths that end with `names` or resemble them; '' without any."""
     key_path = ".".join(names)
     near = [path for path in known if path.endswith(f".{key_path}")]
     near = near or difflib.get_close_matches(key_path, known, n=1)
@@ -211,7 +215,7 @@ def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
     return f"; did you mean {' or '.join(near[:MAX_SUGGESTIONS])}?" if near else ""
 
 
-# The keys of a pipeline that `--set` can change, as `--set` writes them.
+# The keys of a pipeline that `--set` can change, in its syntax.
 
 CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 
@@ -220,36 +224,36 @@ CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 class Key:
     """One setting."""
 
-    key_path: str  # as --set writes it, such as optimize.losses.0.weight
+    key_path: str  # in the syntax of --set, such as optimize.losses.0.weight
     value: Any  # plain data
     description: str
 
     @property
     def text(self) -> str:
-        """KEY=VALUE, as --set writes it."""
+        """KEY=VALUE, in the syntax of --set."""
         return f"{self.key_path}={value_text(self.value)}"
 
 
-def settable(settings: BaseModel) -> list[Key]:
+def list_keys(settings: BaseModel) -> list[Key]:
     """List every key of checked settings, in order."""
     return list(_keys(settings, "", _addresses(settings)))
 
 
 def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[Key]:
     plain = model.model_dump(mode="json")
-    outside = hasattr(model, "every") and model.every is None
+    lacks_cadence = hasattr(model, "every") and model.every is None
     fields, texts = type(model).model_fields, descriptions(type(model))
     for name in sorted(fields, key=lambda name: name != "type"):
         value = getattr(model, name)
-        if name in ("stage", *NOT_SETTABLE) or (outside and name in CADENCE):
+        if name in ("stage", *NOT_SETTABLE) or (lacks_cadence and name in CADENCE):
             continue
         items = value if isinstance(value, list) and value and isinstance(value[0], BaseModel) else None
         if isinstance(value, BaseModel):
             yield from _keys(value, f"{prefix}{name}.", addresses)
         elif items is not None:
             for i, item in enumerate(items):
-                own = item.type if getattr(item, "keyed_by_type", False) else i
-                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{own}") + ".", addresses)
+                part = item.type if getattr(item, "keyed_by_type", False) else i
+                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{part}") + ".", addresses)
         else:
             yield Key(prefix + name, plain.get(name), texts.get(name, ""))
 
@@ -264,15 +268,15 @@ def _addresses(settings: BaseModel) -> dict[int, str]:
         id(stage): stage.stage if names.count(stage.stage) == 1 else key_path for key_path, stage in outer
     }  # fmt: skip
     for i, stages in inner:
-        own = [stage.stage for _, stage in stages]
-        around = addresses[id(outer[i][1])]
+        siblings = [stage.stage for _, stage in stages]
+        prefix = addresses[id(outer[i][1])]
         for key_path, stage in stages:
             if stage.stage not in names and inner_names.count(stage.stage) == 1:
                 addresses[id(stage)] = stage.stage
-            elif own.count(stage.stage) == 1:
-                addresses[id(stage)] = f"{around}.{stage.stage}"
+            elif siblings.count(stage.stage) == 1:
+                addresses[id(stage)] = f"{prefix}.{stage.stage}"
             else:
-                addresses[id(stage)] = f"{around}.{key_path}"
+                addresses[id(stage)] = f"{prefix}.{key_path}"
     return addresses
 
 
@@ -286,7 +290,7 @@ def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value as --set writes it, with as few quotes as possible."""
+    """Return a value in the syntax of --set, with as few quotes as possible."""
     text = f"[{','.join(map(value_text, value))}]" if isinstance(value, list) else str(value)
     try:
         return text if parse_value(text) == value and not isinstance(value, bool) else json.dumps(value)

@@ -47,14 +47,14 @@ def load_file(path: Path) -> Plugin:
     if not path.is_file():
         raise ConfigError(f"--plugin {path}: no such file; expected a Python file")
     name = f"clsplat_plugin_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}"
-    if (before := _loaded.get(path.stem)) is not None:
-        if before.path != path:
+    if (earlier := _loaded.get(path.stem)) is not None:
+        if earlier.path != path:
             raise ConfigError(
-                f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {before.path}; rename the file"
+                f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {earlier.path}; rename the file"
             )
-        if before.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
+        if earlier.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
             raise ConfigError(f"--plugin {path}: its files have changed since it was loaded; restart Python")
-        return before
+        return earlier
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"--plugin {path}: expected a Python file with the suffix .py")
@@ -113,17 +113,17 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
 
 def digest_of(*modules: Path) -> str:
     """Return the sha256 of Python files, and of the kernel files and headers next to them that they name."""
-    digest, waiting = sha256(), list(dict.fromkeys(modules))
-    seen = set(waiting)
-    while waiting:
-        file = waiting.pop(0)
+    digest, queue = sha256(), list(dict.fromkeys(modules))
+    visited = set(queue)
+    while queue:
+        file = queue.pop(0)
         content = read_file(file, "a file of a plug-in", ConfigError)
         digest.update(f"{file.name}\n{len(content)}\n".encode() + content)
-        named = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
-        named |= {file.with_suffix(".cl")} if file in modules else set()
-        new = sorted(path for path in named if path not in seen and path.is_file())
-        waiting += new
-        seen.update(new)
+        references = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
+        references |= {file.with_suffix(".cl")} if file in modules else set()
+        new = sorted(path for path in references if path not in visited and path.is_file())
+        queue += new
+        visited.update(new)
     return digest.hexdigest()
 
 
@@ -134,8 +134,8 @@ def _load_entry(entry: EntryPoint) -> Plugin:
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
         digest = digest_of(path, *files)
-    defined = [kind for known in _lists() for kind in known]
-    earlier = [kind for kind in defined if _within(kind.__module__, package.__name__)]  # imported by others
+    defined = [kind for classes in _class_lists() for kind in classes]
+    earlier = [kind for kind in defined if _is_within(kind.__module__, package.__name__)]  # imported by another plug-in
     return Plugin(entry.name, path, digest, installed=True, kinds=tuple(dict.fromkeys([*kinds, *earlier])))
 
 
@@ -143,17 +143,17 @@ def _load_entry(entry: EntryPoint) -> Plugin:
 def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
     """Yield a list that receives the classes that the block defines.
 
-    If the block fails, or a class has the name of another, undo all that the block defined and raise ConfigError.
+    If the block fails, or a class has the name of another, remove all that the block defined and raise ConfigError.
     Every exception is caught except KeyboardInterrupt.
     """
     kinds: list[type] = []
-    lists = _lists()  # these have the whole package already, so that new classes belong to the plug-in
-    before, modules = [list(known) for known in lists], set(sys.modules)
+    lists = _class_lists()  # complete for this package, so that new classes belong to the plug-in
+    before, modules = [list(classes) for classes in lists], set(sys.modules)
     try:
         with redirect_stdout(sys.stderr):  # stdout is for results
             yield kinds
-        added = [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
-        kinds += [kind for kind in added if not _within(kind.__module__, "clsplat")]
+        added = [kind for classes, old in zip(lists, before, strict=True) for kind in classes if kind not in old]
+        kinds += [kind for kind in added if not _is_within(kind.__module__, "clsplat")]
         rebuild_models()
         readers()
         for kind in kinds:
@@ -161,45 +161,47 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
             if issubclass(kind, Settings) and (fault := invalid_variant_reason(kind)):
                 raise ConfigError(f"class {kind.__name__}: {fault}")
     except BaseException as error:
-        where = _where(module, path, error)
-        new = {kind.__module__ for known, old in zip(lists, before, strict=True) for kind in known if kind not in old}
+        location = _locate(module, path, error)
+        new = {
+            kind.__module__ for classes, old in zip(lists, before, strict=True) for kind in classes if kind not in old
+        }
         for name in set(sys.modules) - modules:
-            if name in new or _within(name, module.partition(".")[0]):
+            if name in new or _is_within(name, module.partition(".")[0]):
                 del sys.modules[name]
-        for known, old in zip(lists, before, strict=True):
-            known[:] = [kind for kind in known if kind in old or _within(kind.__module__, "clsplat")]
+        for classes, old in zip(lists, before, strict=True):
+            classes[:] = [kind for kind in classes if kind in old or _is_within(kind.__module__, "clsplat")]
         rebuild_models()
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise _failure(where, error) from error
+        raise _failure(location, error) from error
 
 
-def _lists() -> tuple[list[type], list[type]]:
+def _class_lists() -> tuple[list[type], list[type]]:
     """Return the lists of all settings and all readers, which importing `clsplat.pipeline.file` has filled."""
     return Settings.defined, Reader.defined
 
 
-def _within(module: str, package: str) -> bool:
+def _is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(f"{package}.")
 
 
 def _package_of(module: ModuleType) -> ModuleType:
     """Return the outermost package of a module that is not a namespace package, or the module itself."""
     parts = module.__name__.split(".")
-    around = [sys.modules[".".join(parts[:i])] for i in range(1, len(parts) + 1)]
-    return next((package for package in around if package.__file__), module)
+    packages = [sys.modules[".".join(parts[:i])] for i in range(1, len(parts) + 1)]
+    return next((package for package in packages if package.__file__), module)
 
 
 def _helpers(module: ModuleType, folder: Path) -> list[Path]:
     """Return the files in a folder that a module imports, directly or indirectly."""
-    waiting, files = [module], set[Path]()
-    while waiting:
-        for helper in _imports(waiting.pop()):
+    stack, files = [module], set[Path]()
+    while stack:
+        for helper in _imports(stack.pop()):
             file = Path(helper.__file__ or "").resolve()
             is_inside = file.suffix == ".py" and file.is_relative_to(folder) and "site-packages" not in file.parts
             if is_inside and file not in files and helper.__name__.partition(".")[0] != "clsplat":
                 files.add(file)
-                waiting.append(helper)
+                stack.append(helper)
     return sorted(files)
 
 
@@ -214,33 +216,33 @@ def _imports(module: ModuleType) -> list[ModuleType]:
             base = importlib.util.resolve_name(relative, module.__package__ or "")
             names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     parts = [name.split(".") for name in names]
-    every = dict.fromkeys(".".join(path[:i]) for path in parts for i in range(1, len(path) + 1))
-    return [sys.modules[name] for name in every if getattr(sys.modules.get(name), "__file__", None)]
+    prefixes = dict.fromkeys(".".join(path[:i]) for path in parts for i in range(1, len(path) + 1))
+    return [sys.modules[name] for name in prefixes if getattr(sys.modules.get(name), "__file__", None)]
 
 
-def _where(module: str, path: Path | None, error: BaseException) -> str:
-    """Return file and line of a failure: the last line in the plug-in, or else the last outside the import system."""
+def _locate(module: str, path: Path | None, error: BaseException) -> str:
+    """Return the file and line of a failure: the last in the plug-in, else the last outside the import system."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{error.filename}:{error.lineno}"
     frames = [
         (str(frame.f_globals.get("__name__")), frame.f_code.co_filename, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
     ]
-    frames = [one for one in frames if "importlib" not in one[0] and one[0] not in (__name__, "contextlib")]
-    own = [
+    frames = [frame for frame in frames if "importlib" not in frame[0] and frame[0] not in (__name__, "contextlib")]
+    inside = [
         (file, line)
         for name, file, line in frames
-        if _within(name, module.partition(".")[0]) or (path and Path(file).is_relative_to(path.parent))
+        if _is_within(name, module.partition(".")[0]) or (path and Path(file).is_relative_to(path.parent))
     ]
-    if own or (frames and not isinstance(error, ClsplatError)):
-        file, line = own[-1] if own else frames[-1][1:]
+    if inside or (frames and not isinstance(error, ClsplatError)):
+        file, line = inside[-1] if inside else frames[-1][1:]
         return f"{file}:{line}"
     return str(path or getattr(sys.modules.get(module), "__file__", None) or module)
 
 
-def _failure(where: str, error: BaseException) -> ConfigError:
-    """Return an error in one line: file, line and reason."""
+def _failure(location: str, error: BaseException) -> ConfigError:
+    """Return a one-line error: file, line and reason."""
     if isinstance(error, ClsplatError):
-        return ConfigError(f"{where}: {error}")
+        return ConfigError(f"{location}: {error}")
     reason = error.msg if isinstance(error, SyntaxError) else " ".join(str(error).split()) or "no message"
-    return ConfigError(f"{where}: importing the plug-in failed: {type(error).__name__}: {reason[:300]}")
+    return ConfigError(f"{location}: importing the plug-in failed: {type(error).__name__}: {reason[:300]}")

@@ -15,7 +15,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.files import find, origin, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix
-from clsplat.pipeline.overrides import Key, settable
+from clsplat.pipeline.overrides import Key, list_keys
 from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.prepare.steps import Step
 from clsplat.training.stage import Scheduled, Stage, Training
@@ -55,7 +55,7 @@ def manual(name: str) -> dict[str, Any]:
         "summary": summary(pipeline.path),
         "path": str(origin(pipeline.path)),
         "stages": pipeline.names,
-        "keys": [asdict(key) for key in settable(settings)],
+        "keys": [asdict(key) for key in list_keys(settings)],
     }
 
 
@@ -83,7 +83,7 @@ def copy(name: str, file: Path) -> Path:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the schema of the file, where a stage is its name, or its name with settings."""
+    """Return the JSON schema of the file, in which a stage is a name, or a name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
     for kind in (*variants(Stage).values(), *variants(Step).values()):
@@ -93,14 +93,14 @@ def json_schema() -> dict[str, Any]:
         ]
     schema["properties"]["stages"]["items"] = _items(variants(Stage))
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
-    others: dict[str, type[Settings]] = {"matrix": Matrix, "execution": LocalExecution}
-    for key, kind in others.items():
-        own = kind.model_json_schema()
-        definitions |= {**own.pop("$defs", {}), kind.__name__: own}
+    models: dict[str, type[Settings]] = {"matrix": Matrix, "execution": LocalExecution}
+    for key, kind in models.items():
+        part = kind.model_json_schema()
+        definitions |= {**part.pop("$defs", {}), kind.__name__: part}
         schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
     short = "Values for the pipeline NAME_7k, by keys as for --set; the comment above describes that pipeline."
     schema["properties"]["short"] = {"type": "object", "title": "Short", "description": short}
-    schema["required"].remove("stages")  # not required with a matrix that names pipelines
+    schema["required"].remove("stages")  # not required if the matrix lists pipelines
     schema["anyOf"] = [
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
@@ -112,18 +112,18 @@ def json_schema() -> dict[str, Any]:
 
 
 def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the schema of a list's stages, each with the `required` keys in addition to its own."""
-    bare = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
+    """Return the schema of the stages in a list, which need the `required` keys in addition to their own."""
+    names = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
     with_settings = [
         {
             "type": "object",
-            "properties": {name: _settings(kind.__name__, required, name in bare)},
+            "properties": {name: _settings(kind.__name__, required, name in names)},
             "required": [name],
             "additionalProperties": False,
         }
         for name, kind in stages.items()
     ]
-    return {"oneOf": [*([{"enum": bare}] if bare else []), *with_settings]}
+    return {"oneOf": [*([{"enum": names}] if names else []), *with_settings]}
 
 
 def _settings(title: str, required: Sequence[str], optional: bool) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """Stretch the schedules of a pipeline to another number of training steps.
 
 Steps, durations and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
-order as before, and stages that act at the same step still do.  Intervals may become fractional.  If there are so few
-steps that two actions fall on one, they happen in the order of the list.  Learning rates of what is learned over the
-whole training, such as a filter, are divided by the factor.
+order as before, and stages that acted at the same step still do.  Intervals may become fractional.  If there are so few
+steps that two actions fall on one, they happen in the order of the list.  Learning rates of parameters that are
+learned over the whole training, such as a filter, are divided by the factor.
 """
 
 import math
@@ -47,28 +47,35 @@ class Axis:
 
     def every(self, every: float) -> float:
         """Return a stretched interval; 1 stays 1, and no interval becomes shorter."""
-        stretched = Fraction(str(every)) * self.factor
-        if every == 1 or stretched <= 1:
+        interval = Fraction(str(every)) * self.factor
+        if every == 1 or interval <= 1:
             return 1
-        bounded = min(stretched, Fraction(MAX_STEP))
+        bounded = min(interval, Fraction(MAX_STEP))
         return int(bounded) if bounded.denominator == 1 else float(bounded)
 
     def start(self, start: int, every: float) -> int:
         """Return a stretched `start`: between the last action that it excludes and the first that it allows."""
         number = count_fired(every, start)
-        return max(0, min(max(self.at(start), self._act(every, number)), self._act(every, number + 1) - 1))
+        return max(
+            0, min(max(self.at(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
+        )
 
     def stop(self, stop: int, every: float) -> int:
         """Return a stretched `stop`: after the last action that it allows."""
         number = count_fired(every, stop - 1)
-        return min(max(self._act(every, number) + 1, min(self.at(stop), self._act(every, number + 1))), MAX_STEP)
+        return min(
+            max(self._action_step(every, number) + 1, min(self.at(stop), self._action_step(every, number + 1))),
+            MAX_STEP,
+        )
 
     def until(self, until: int, every: float) -> int:
         """Return a stretched `until`: after the actions before it, and not after the next one."""
         number = count_fired(every, until - 1)
-        return max(1, min(max(self._act(every, number) + 1, self.at(until)), self._act(every, number + 1)))
+        return max(
+            1, min(max(self._action_step(every, number) + 1, self.at(until)), self._action_step(every, number + 1))
+        )
 
-    def _act(self, every: float, number: int) -> int:
+    def _action_step(self, every: float, number: int) -> int:
         return math.floor(number * Fraction(str(every)) * self.factor)
 
 
@@ -79,18 +86,18 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     fraction of the remaining steps.
     """
 
-    def changed(training: Training) -> Training:
+    def change(training: Training) -> Training:
         last = last_edit(training)
         fixed = max(done, last) if last < min(steps, training.steps) else done
-        left = (steps - fixed) / (training.steps - fixed)
-        during = [_moved(stage, fixed, left) for stage in training.during]
+        factor = (steps - fixed) / (training.steps - fixed)
+        during = [_stretch_rest(stage, fixed, factor) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
-    return map_trainings(settings, Training, changed)
+    return map_trainings(settings, Training, change)
 
 
 def last_edit(training: Training) -> int:
-    """Return the step until which Gaussians grow and the size of photos changes; 0 if the settings do not say.
+    """Return the last step at which Gaussians grow or the size of photos changes; 0 if the settings do not limit it.
 
     A training that ended earlier would end with small photos, or before its last pruning.
     """
@@ -118,25 +125,25 @@ def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     return stretched(settings, Fraction(steps, settings.training.steps))
 
 
-def _moved(stage: Scheduled, fixed: int, left: float) -> Scheduled:
-    """Return a stage with the steps after `fixed` multiplied by `left`, if it starts after `fixed`."""
+def _stretch_rest(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
+    """Return a stage with the steps after `fixed` multiplied by `factor`, if it starts after `fixed`."""
     if stage.start <= fixed:
         return stage
-    every = max(1, math.floor((stage.every or 1) * left))
+    every = max(1, math.floor((stage.every or 1) * factor))
     start, stop = (
-        step if step is None else fixed + math.floor((step - fixed) * left) for step in (stage.start, stage.stop)
+        step if step is None else fixed + math.floor((step - fixed) * factor) for step in (stage.start, stage.stop)
     )
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
-def map_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[Kind], Kind]) -> PipelineFile:
+def map_trainings(settings: PipelineFile, kind: type[Kind], change: Callable[[Kind], Kind]) -> PipelineFile:
     """Return settings with each training of a kind replaced."""
-    stages = [changed(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
+    stages = [change(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 
 def stretched(value: Value, factor: float | Fraction) -> Value:
-    """Return settings for `factor` times as many steps; the `step_keys` of each class say what that changes."""
+    """Return settings for `factor` times as many steps; the `step_keys` of each class are scaled."""
     return _stretched(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
 
 
@@ -174,5 +181,5 @@ def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
 
 
 def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
-    """Return the points of a schedule; of two at one step, the later one stays."""
+    """Return the points of a schedule; if two fall on one step, the later one wins."""
     return [list(point) for point in {math.floor(step * axis.factor): value for step, value in points}.items()]

@@ -46,7 +46,7 @@ class Document:
         return self.lines.get(key_path, 1)
 
 
-class _NotPlain(Exception):
+class _NotAllowed(Exception):
     """A value that is not allowed in a file of settings, and its line."""
 
     def __init__(self, node: Any, complaint: str) -> None:
@@ -55,7 +55,7 @@ class _NotPlain(Exception):
 
 
 class _Bounded(Composer):
-    """Stops at the limits before it reads on, as the time to parse grows with the square of the depth."""
+    """Stops as soon as a limit is exceeded, because parsing time grows with the square of the depth."""
 
     def __init__(self, loader: Any = None) -> None:
         super().__init__(loader=loader)
@@ -67,7 +67,7 @@ class _Bounded(Composer):
         self._count += 1
         if self._depth > DEPTH_LIMIT or self._count > NODE_LIMIT:
             depth, count = "lists and maps are nested too deeply", f"more than {NODE_LIMIT} values"
-            raise _NotPlain(self.parser.peek_event(), depth if self._depth > DEPTH_LIMIT else count)
+            raise _NotAllowed(self.parser.peek_event(), depth if self._depth > DEPTH_LIMIT else count)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -79,7 +79,7 @@ def read_yaml(path: Path) -> Document:
 
 
 def read_pipeline(path: Path) -> str:
-    """Return the text of a pipeline; NAME_7k is made from NAME.yaml with its key `short`.  Raises ConfigError."""
+    """Return the text of a pipeline; NAME_7k is made from NAME.yaml and its key `short`.  Raises ConfigError."""
     file = origin(path)
     text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
     return text if file == path else _short(text, path, file)
@@ -94,7 +94,7 @@ def _short(text: str, path: Path, file: Path) -> str:
         raise ConfigError(f"{file}: expected a map 'short', with values of {path.name}; add one, or run {file.name}")
     root = YAML(typ="safe", pure=True).compose(text)
     key, short = next(pair for pair in root.value if pair[0].value == "short")
-    root.value.remove((key, short))  # its own keys cannot be set
+    root.value.remove((key, short))  # the keys inside it cannot be set
     above = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
     values = {key_path.value: text[value.start_mark.index : value.end_mark.index] for key_path, value in short.value}
     edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
@@ -110,21 +110,21 @@ def _short(text: str, path: Path, file: Path) -> str:
 
 def _node(root: Node, key_path: str) -> Node | None:
     """Return the value of a key path, as --set writes it; None if there is none."""
-    first, *others = key_path.split(".")
-    if not others:
-        return _inside(root).get(first)
+    first, *names = key_path.split(".")
+    if not names:
+        return _children(root).get(first)
     level = [root]
-    while level and not (named := [_inside(node)[first] for node in level if first in _inside(node)]):
-        level = [inner for node in level for inner in _inside(node).values()]
-    found = named[0] if level and len(named) == 1 else None
-    for name in others:
-        around, found = found, _inside(found).get(name)
-        if isinstance(around, SequenceNode) and len(_inside(found)) == 1:  # a stage
-            (found,) = _inside(found).values()
-    return found
+    while level and not (matches := [_children(node)[first] for node in level if first in _children(node)]):
+        level = [inner for node in level for inner in _children(node).values()]
+    result = matches[0] if level and len(matches) == 1 else None
+    for name in names:
+        parent, result = result, _children(result).get(name)
+        if isinstance(parent, SequenceNode) and len(_children(result)) == 1:  # a stage
+            (result,) = _children(result).values()
+    return result
 
 
-def _inside(node: Node | None) -> dict[str, Node]:
+def _children(node: Node | None) -> dict[str, Node]:
     """Return the values of a map by key, or the items of a list by index."""
     if isinstance(node, MappingNode):
         return {str(key.value): value for key, value in node.value}
@@ -132,7 +132,7 @@ def _inside(node: Node | None) -> dict[str, Node]:
 
 
 def parse_value(text: str) -> Any:
-    """Read one value as it would be in a file: a number, true, false, null, a [list], a {map} or text.
+    """Parse a value in the syntax of a file: a number, true, false, null, a [list], a {map} or text.
 
     Raises ConfigError.
     """
@@ -156,7 +156,7 @@ def _parse(text: str, name: str) -> Document:
     try:
         root = yaml.compose(text)
         return _Reader(yaml).document(root)
-    except _NotPlain as error:
+    except _NotAllowed as error:
         line, complaint = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
@@ -172,20 +172,20 @@ def _parse(text: str, name: str) -> Document:
 
 
 class _Reader:
-    """Makes plain data from the nodes of one document."""
+    """Converts the nodes of one document to plain data."""
 
     def __init__(self, yaml: YAML) -> None:
         self._scalars = yaml.constructor
-        self._left = NODE_LIMIT
+        self._remaining = NODE_LIMIT
         self._lines: dict[KeyPath, int] = {}
 
     def document(self, root: Node | None) -> Document:
         return Document(None if root is None else self._plain(root, ()), self._lines)
 
     def _plain(self, node: Node, key_path: KeyPath) -> Any:
-        self._left -= 1
-        if self._left < 0:
-            raise _NotPlain(node, f"more than {NODE_LIMIT} values")
+        self._remaining -= 1
+        if self._remaining < 0:
+            raise _NotAllowed(node, f"more than {NODE_LIMIT} values")
         if isinstance(node, MappingNode) and node.tag == f"{CORE}map":
             return self._map(node, key_path)
         if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
@@ -196,7 +196,7 @@ class _Reader:
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
         tag = shorten(str(node.tag).replace(CORE, "!!"))
-        raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
+        raise _NotAllowed(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
     def _map(self, node: MappingNode, key_path: KeyPath) -> dict[str, Any]:
         data: dict[str, Any] = {}
@@ -207,26 +207,26 @@ class _Reader:
                 continue
             key = self._plain(key_node, key_path) if isinstance(key_node, ScalarNode) else None
             if not isinstance(key, str):
-                raise _NotPlain(
+                raise _NotAllowed(
                     key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
                 )
             if key in data:
-                raise _NotPlain(key_node, f"found duplicate key {quote(key)}")
+                raise _NotAllowed(key_node, f"duplicate key {quote(key)}")
             self._lines[*key_path, key] = key_node.start_mark.line + 1
             data[key] = self._plain(value, (*key_path, key))
-        for other in merged:
-            data = {**self._merge(other, key_path), **data}
+        for part in merged:
+            data = {**self._merge(part, key_path), **data}
         return data
 
     def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
-        """Return the map that `<<` names; lines of keys that the outer map has too stay those of the outer map."""
+        """Return the map that `<<` refers to; a key that the outer map has too keeps the line of the outer map."""
         if not isinstance(node, MappingNode):
-            raise _NotPlain(node, "expected a map after '<<'")
-        around, self._lines = self._lines, {}
+            raise _NotAllowed(node, "expected a map after '<<'")
+        outer, self._lines = self._lines, {}
         data: dict[str, Any] = self._plain(node, key_path)
-        self._lines, inside = around, self._lines
-        for inner, line in inside.items():
-            self._lines.setdefault(inner, line)
+        self._lines, inner = outer, self._lines
+        for inner_path, line in inner.items():
+            self._lines.setdefault(inner_path, line)
         return data
 
     def _scalar(self, node: ScalarNode) -> Any:
@@ -234,7 +234,7 @@ class _Reader:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
             kind = str(node.tag).removeprefix(CORE)
-            raise _NotPlain(node, f"{quote(node.value)} cannot be read as {kind}") from None
+            raise _NotAllowed(node, f"{quote(node.value)} cannot be read as {kind}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
-            raise _NotPlain(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
+            raise _NotAllowed(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
         return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)

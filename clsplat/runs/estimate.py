@@ -13,7 +13,7 @@ from pathlib import Path
 from clsplat.core.errors import DataError
 from clsplat.core.schedule import schedule_values
 from clsplat.opencl.device import Device
-from clsplat.pipeline.loading import Pipeline, adapted
+from clsplat.pipeline.loading import Pipeline, apply_adaptation
 from clsplat.prepare.cache import PlannedStep
 from clsplat.scene.images import image_size
 from clsplat.scene.quality import Measures
@@ -59,7 +59,7 @@ def estimate_time(
     """
     parts = list(_preparation_estimates(planned, len(names))) if names else []
     if (capture := _capture(pipeline, planned, names, run)) is not None:
-        settings = (adapted(pipeline, measures) if measures and run is None else pipeline).settings
+        settings = (apply_adaptation(pipeline, measures) if measures and run is None else pipeline).settings
         trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
         parts += [_training_estimate(training, *capture, device.info.units) for training in trainings]
     fields = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]

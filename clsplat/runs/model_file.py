@@ -126,7 +126,7 @@ class ModelSource:
 
     def scene(self, model: Model | FieldModel) -> Scene:
         """Read the scene as the training of the model did, at full image size."""
-        masked = self.settings.masked(read_scene(self.folder, self.settings.split))
+        masked = self.settings.apply_masks(read_scene(self.folder, self.settings.split))
         return masked.with_alpha(self.alpha or model.rendering.alpha)
 
 

@@ -16,8 +16,8 @@ from clsplat.core.progress import Listener, listening, log_level
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
-from clsplat.pipeline.input_files import contents
-from clsplat.pipeline.loading import Pipeline, adapted, prepared_folder
+from clsplat.pipeline.input_files import content_hashes
+from clsplat.pipeline.loading import Pipeline, apply_adaptation, prepared_folder
 from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, step_facts
 from clsplat.prepare.gather import list_photographs
@@ -56,7 +56,7 @@ class RunScene:
 
         Raises DataError, with their names, if photos or masks cannot be used.
         """
-        original, background = settings.applied(scene)
+        original, background = settings.apply(scene)
         downscaled = original.downscaled(*settings.downscales)
         LOG.info(
             "scene: %s, %d training%s and %d test views, %s px, %s background, extent %.3g",
@@ -201,7 +201,7 @@ def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
     with log_level(logging.ERROR):
-        return split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
+        return split.apply(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
 
 
 def undistorted_folder(out: Path) -> Path:
@@ -230,13 +230,13 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         seed=settings.seed,
         settings=settings,
         pipeline=pipeline.resolved(),
-        rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
+        rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.limits()),
         harmonics=settings.harmonics,
         photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,
         identity=scene.identity,
-        file_hashes=contents(pipeline),
+        file_hashes=content_hashes(pipeline),
     )
 
 
@@ -250,7 +250,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
-            pipeline = adapted(pipeline, measure_scene(run.scene, lambda: sky_fraction(run)))
+            pipeline = apply_adaptation(pipeline, measure_scene(run.scene, lambda: sky_fraction(run)))
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
         pipeline = _with_modules(pipeline, run)

@@ -119,7 +119,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         if reader.note:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
-        return split.applied(replace(reader.read(reader.folder, split.of_reader), path=path))
+        return split.apply(replace(reader.read(reader.folder, split.of_reader), path=path))
     if any(is_image(file) for file in path.iterdir()):
         above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"

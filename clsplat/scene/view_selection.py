@@ -225,7 +225,7 @@ class Split:
         """The holdout for a reader, which it applies if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
-    def applied(self, scene: Scene) -> Scene:
+    def apply(self, scene: Scene) -> Scene:
         """Return the scene, read with `of_reader`, with this split.
 
         Raises DataError for wrong names, or when one split takes all views.
@@ -288,7 +288,7 @@ class Split:
     def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
         """Return a scene with some of its training views moved to the validation views.
 
-        left_out: names of views that the scene leaves out.  Raises DataError as `applied` does.
+        left_out: names of views that the scene leaves out.  Raises DataError as `apply` does.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:

@@ -16,7 +16,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
 from clsplat.core.resources import __version__, list_sources
 from clsplat.pipeline.file import SceneSettings
-from clsplat.pipeline.input_files import content_of, contents, with_absolute_paths, with_content_hashes
+from clsplat.pipeline.input_files import content_hashes, hash_content, with_absolute_paths, with_content_hashes
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan
 from clsplat.scene.detect import read_scene
@@ -73,7 +73,7 @@ def _digest(parts: Iterable[str]) -> str:
 
 def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
     """Read a scene, and hash its files with `digest_of`; photos are not decoded.  Raises DataError."""
-    scene, _ = settings.applied(read_scene(settings.folder, settings.split))
+    scene, _ = settings.apply(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
     files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
     return scene, Identity.from_scene(scene, files)
@@ -143,7 +143,7 @@ class CellRun:
         spec = {"pipeline": with_content_hashes(absolute), "scene": scene, "code": code_digest(), "bits": bits}
         if pipeline.settings.prepare:
             spec["tools"] = tools_digest()
-        return cls(name, spec, absolute.text(), contents(absolute))
+        return cls(name, spec, absolute.text(), content_hashes(absolute))
 
     @classmethod
     def from_json(cls, text: str) -> "CellRun":
@@ -157,7 +157,7 @@ class CellRun:
     def require_files(self) -> None:
         """Raise DataError if an input file on this machine differs from the file hashed for the key."""
         for path, digest in self.files.items():
-            if content_of(Path(path)) != digest:
+            if hash_content(Path(path)) != digest:
                 raise DataError(
                     f"cell {self.name}: {path} differs from the file with which the sweep started; copy that file, "
                     "or run the sweep again"

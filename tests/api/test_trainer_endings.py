@@ -62,7 +62,9 @@ def test_trainer_overwrites_no_foreign_file(tiny_scene, tmp_path):
 def test_trainer_has_ended_after_an_error_inside_a_step(tiny_scene):
     trainer = clsplat.Trainer(tiny_scene, "smoke")
     trainer.add_loss(lambda image, photograph: (0.0, np.zeros(3)))
-    with pytest.raises(ValueError, match=r"the loss returned a gradient of shape \(3,\); expected that of the image, \(40, 40, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"the loss returned a gradient of shape \(3,\); expected that of the image, \(40, 40, 3\)"
+    ):
         trainer.run(2)
     with pytest.raises(ClsplatError, match="ended with an error; create another, with start='resume'"):
         trainer.run(2)

@@ -16,7 +16,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.resources import full_version
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.overrides import settable
+from clsplat.pipeline.overrides import list_keys
 from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.runs.state import RunState
 from clsplat.runs.status import run_status, status_text
@@ -159,7 +159,7 @@ def test_pipelines_lists_every_recipe_on_a_line():
 def test_pipelines_prints_keys_in_set_notation():
     lines = clsplat("pipelines", "splat_7k").stdout.splitlines()
     keys = [line.split("  ")[0] for line in lines[lines.index("Keys, as for --set:") + 1 :]]
-    assert keys == [key.text for key in settable(load("splat_7k").settings)]
+    assert keys == [key.text for key in list_keys(load("splat_7k").settings)]
     assert {"optimize.steps=7000", "optimize.losses.0.weight=0.8", "densify.every=100"} <= set(keys)
     found = manual("splat_7k")
     assert next(key for key in found["keys"] if key["key_path"] == "optimize.steps") == {

@@ -135,7 +135,7 @@ def test_bare_name_means_the_variant_with_defaults(loaded):
         ({"rules": "[{type: splitt}]"}, "no rule named 'splitt'; did you mean 'split'?"),
         ({"losses": "[disim]"}, "small.yaml:7: stages[1].optimize.losses[0]: no loss named 'disim'; did you mean "
          "'dssim'?"),
-        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, covariance_trace, dssim, "
+        ({"losses": "[xyz]"}, "no loss named 'xyz'; expected one of anisotropy, covariance_trace, dssim, "
          "inverse_depth, l1, l2"),
         ({"views": "{order: shufle}"}, "small.yaml:6: stages[1].optimize.views.order: no order named 'shufle'; did you "
          "mean 'shuffle'?"),

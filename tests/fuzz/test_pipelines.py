@@ -7,7 +7,7 @@ import pytest
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.pipeline.overrides import settable
+from clsplat.pipeline.overrides import list_keys
 from clsplat.runs.results import read_metrics
 from clsplat.training.records import Records
 from tests.fuzz.mutation import WORDS, damaged, fuzzed, one_of
@@ -69,7 +69,7 @@ def test_damaged_matrix_is_valid_or_refused(folder):
 
 
 def overrides() -> list[bytes]:
-    return [key.text.encode() for name in ("smoke", "micro_splatting") for key in settable(load(name).settings)]
+    return [key.text.encode() for name in ("smoke", "micro_splatting") for key in list_keys(load(name).settings)]
 
 
 @pytest.mark.parametrize("name", ["smoke", "micro_splatting"])
@@ -86,7 +86,7 @@ def test_damaged_setting_is_valid_or_refused(name):
 
 
 def test_any_string_value_is_valid_or_refused():
-    places = [key.key_path for key in settable(load("splat_7k").settings)]
+    places = [key.key_path for key in list_keys(load("splat_7k").settings)]
 
     @fuzzed(100, place=one_of(places), word=one_of([*WORDS, *YAML]))
     def reads(place, word):

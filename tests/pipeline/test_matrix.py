@@ -119,7 +119,7 @@ REFUSED = {
         SMALL.replace("[4, 6]", "[4, 30k]"),
         r"x.yaml:5: matrix.set.optimize.steps\[1\]: .*expected a whole number, got '30k'",
     ),
-    "twice": (SMALL.replace("[4, 6]", "[4, 4]"), r"x.yaml:2: matrix: the same value twice in \[4, 4\]"),
+    "twice": (SMALL.replace("[4, 6]", "[4, 4]"), r"x.yaml:2: matrix: duplicate value in \[4, 4\]"),
     "unknown pipeline": (
         "name: s\nmatrix:\n  pipelines: [smoke,\n    smokee]\n",
         r"x.yaml:4: matrix.pipelines\[1\]: no pipeline named 'smokee'; did you mean 'smoke'",

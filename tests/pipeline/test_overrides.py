@@ -4,14 +4,14 @@ import pytest
 
 from clsplat.core.errors import ConfigError, OverrideError
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.overrides import settable
+from clsplat.pipeline.overrides import list_keys
 from tests.support.pipelines import KINDS
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_every_listed_key_can_be_set_to_its_listed_value(name):
     pipeline = load(name)
-    keys = settable(pipeline.settings)
+    keys = list_keys(pipeline.settings)
     assert len({key.key_path for key in keys}) == len(keys)
     listed = {**pipeline.resolved(), "adapt": None}  # which keeps keys that are set
     together = [key.text for key in keys]
@@ -21,11 +21,11 @@ def test_every_listed_key_can_be_set_to_its_listed_value(name):
 
 def test_listed_keys_have_an_effect():
     before = load("micro_splatting_v2")
-    places = {key.key_path: key for key in settable(before.settings)}
+    places = {key.key_path: key for key in list_keys(before.settings)}
     assert {"seed", "scene.downscale", "init.opacity", "optimize.steps", "raise_sh.every"} <= set(places)
     assert "densify.every" not in places, "there are three of them"
     changed = load("micro_splatting_v2", ["optimize.during.2.every=7"])
-    assert {key.key_path for key in settable(changed.settings) if key.value != places[key.key_path].value} == {
+    assert {key.key_path for key in list_keys(changed.settings) if key.value != places[key.key_path].value} == {
         "optimize.during.2.every"
     }
 

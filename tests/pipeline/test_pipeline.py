@@ -367,11 +367,11 @@ REFUSED = {
     "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
     "wrong order": (
         replaced("  - init\n", ""),
-        r"stages\[0\] optimize needs 'model', which no earlier stage makes \(init makes it\)",
+        r"stages\[0\] optimize needs 'model', which no earlier stage makes \(made by init\)",
     ),
     "statistics that a cleanup has dropped": (
         replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup removes \(optimize makes it again\)",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup removes \(made again by optimize\)",
     ),
     "statistics of a model that was replaced": (
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
@@ -382,7 +382,7 @@ REFUSED = {
         r"stages\[4\] report needs 'metrics', which stages\[3\] init removes",
     ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
-    "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
+    "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: duplicate key"),
     "two keys in a stage": (
         replaced("  - evaluate", "  - evaluate: {}\n    export: {}"),
         r"stages\[2\]: expected '- stage'",

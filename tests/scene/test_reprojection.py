@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.pipeline.loading import adapted, load
+from clsplat.pipeline.loading import apply_adaptation, load
 from clsplat.prepare.inspect.findings import POSES, POSES_ERROR, Inspection
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.describe import describe
@@ -97,14 +97,14 @@ def test_nonnumeric_positions_in_text_are_ignored(tmp_path):
 
 @pytest.mark.parametrize(("error", "learned"), [(0.4, False), (0.99, False), (1.0, True), (3.0, True)])
 def test_photos_recipe_optimizes_poses_from_one_pixel(error, learned):
-    chosen = adapted(load("photos"), Measures(60, error))
+    chosen = apply_adaptation(load("photos"), Measures(60, error))
     training = chosen.settings.optimize
     exposure = Exposure(when="auto", **({} if learned else {"min_spread": 0.2}))
     assert training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
     if not learned:
         assert training.model_copy(update={"modules": []}) == load("fast").settings.training
     assert f"cameras fit the points to {error:g} px: " in chosen.decisions[-1].reason
-    without = adapted(load("photos"), Measures(60)).settings.optimize
+    without = apply_adaptation(load("photos"), Measures(60)).settings.optimize
     assert [one.type for one in without.modules] == ["exposure"]
 
 
@@ -120,7 +120,7 @@ def test_inspect_recommends_a_setting(tmp_path, rng, length, level):
 
 def test_inspect_and_the_photos_recipe_agree():
     for error, learned in ((POSES_ERROR - 0.01, None), (POSES_ERROR, {"start": 500})):
-        (found,) = [one for one in adapted(load("photos"), Measures(9, error)).decisions if one.key in POSES]
+        (found,) = [one for one in apply_adaptation(load("photos"), Measures(9, error)).decisions if one.key in POSES]
         assert found.value == learned
     assert POSES == "optimize.modules.camera_optimizer={start: 500}"
 
@@ -148,7 +148,7 @@ def test_pipeline_with_poses_and_sky_is_refused():
             load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
     asked = load("photos", ["model.background=envmap"])  # which may learn poses
     with pytest.raises(ConfigError, match=r"adapt: photos: .*cannot be learned together with poses.*; --set of one"):
-        adapted(asked, Measures(60, 1.0))
+        apply_adaptation(asked, Measures(60, 1.0))
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_every_nth_view_from_an_offset_is_for_testing(folder):
 )
 def test_split_changes_only_the_views(folder, split):
     scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
-    found = Split(**split).applied(scene)
+    found = Split(**split).apply(scene)
     assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
     assert {view.name for view in found.views} <= {view.name for view in scene.views}
 

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline import matrix
-from clsplat.pipeline.input_files import content_of, contents
+from clsplat.pipeline.input_files import contents, hash_content
 from clsplat.pipeline.loading import load
 from clsplat.stages.video import Video
 from clsplat.sweeps import cell as fingerprint
@@ -47,14 +47,14 @@ def test_key_includes_the_content_of_a_folders_model(few_steps, tiny_scene, tmp_
 
 
 def test_unreadable_input_is_reported(few_steps, tiny_scene, tmp_path, monkeypatch):
-    assert content_of(tmp_path / ("m" * 300)) == ""
+    assert hash_content(tmp_path / ("m" * 300)) == ""
 
     def refuse(path):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("clsplat.pipeline.input_files.model_path", refuse)
     with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); check its permissions"):
-        content_of(few_steps)
+        hash_content(few_steps)
     assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
 
 
@@ -104,7 +104,7 @@ def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, t
 
 def test_file_that_changes_while_a_cell_runs_fails_it(store, options, tmp_path):
     file = write(tmp_path / "m.ply", "as it was")
-    cell = replace(CELL, files={str(file): content_of(file)})
+    cell = replace(CELL, files={str(file): hash_content(file)})
     changes = f"import pathlib; pathlib.Path({str(file)!r}).write_text('another')"
     outcome = run_cell(cell, store, command(changes), options)
     assert (outcome.state, outcome.exit_code) == ("failed", 3)

@@ -235,9 +235,12 @@ def test_invalid_execution_is_refused_with_its_line(tmp_path, text, words):
         ("store: ''", "store: expected the path of a folder, got ''"),
         (
             "engine: local, tls: {ca: a, cert: b, key: c}",
-            "tls has no effect with engine local: it is for engine tls://",
+            "tls has no effect with engine local: it applies only to engine tls://",
         ),
-        ("engine: local, insecure: true", "insecure has no effect with engine local: it is for engine dask://"),
+        (
+            "engine: local, insecure: true",
+            "insecure has no effect with engine local: it applies only to engine dask://",
+        ),
         (
             "engine: dask://127.0.0.1:1, devices: [a]",
             "devices has no effect with engine dask://127.0.0.1:1: the workers",
