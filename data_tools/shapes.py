@@ -95,16 +95,16 @@ class Shape:
         raise NotImplementedError
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Where rays, given in the shape's own axes, are inside."""
+        """Return where rays, in local coordinates, are inside."""
         raise NotImplementedError
 
     def local_normal(self, points: Array) -> Array:
-        """Outward normals of surface points, both in the shape's own axes."""
+        """Return the outward normals of surface points, both in local coordinates."""
         raise NotImplementedError
 
     @cached_property
     def axes(self) -> Array:
-        """World to own axes, [3, 3]."""
+        """The rotation from world to local coordinates, [3, 3]."""
         (cy, sy), (ct, st) = ((np.cos(a), np.sin(a)) for a in np.radians((self.yaw, self.tilt)))
         yaw, tilt = np.array([[cy, sy, 0], [-sy, cy, 0], [0, 0, 1]]), np.array([[1, 0, 0], [0, ct, st], [0, -st, ct]])
         return np.asarray(tilt @ yaw)

@@ -100,7 +100,7 @@ class ViewSettings(Settings):
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""
 
-    def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
+    def resolve(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
         """Return settings whose resolution is a schedule.  photographs: of training, each [height, width, 3]."""
         if not isinstance(self.resolution, DetailDivisor):
             return self
@@ -109,11 +109,9 @@ class ViewSettings(Settings):
         return self.model_copy(update={"resolution": resolution})
 
     def divisor(self, step: int) -> float:
-        """Return the downscale factor at a global step.  Raises ConfigError if `settled` was not called."""
+        """Return the downscale factor at a global step.  Raises ConfigError if `resolve` was not called."""
         if isinstance(self.resolution, DetailDivisor):
-            raise ConfigError(
-                "a resolution that follows detail needs photographs; use the settings that `settled` returns"
-            )
+            raise ConfigError("a resolution that follows detail needs photographs; call `resolve` first")
         return at_step(self.resolution, step)
 
     @property

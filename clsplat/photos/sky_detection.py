@@ -13,16 +13,16 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import up_direction
 
-SIDE = 160  # px of the longer side, at which photographs are looked at
-APART = 4  # px there, from the nearest point: 20 px of a photograph of 800
-BRIGHT = 0.6  # of the mean of the channels
-BLUE = 0.03  # by how much blue is above red
-DARKEST_BLUE = 0.3
-EVEN = 0.04  # standard deviation of the brightness in a square of 3 px
-UPPER = 1 / 3
-COUNTED = 1 / 3  # of the pixels of that third, at least, are what a share is of: masks may leave few
-SKYWARD = 0.75  # of such pixels are above the horizon: with fewer, they are a wall, or what an object lies on
-BEYOND = 2  # texels about those that photographs show as sky: its edge was left out, with what is near points
+SIDE = 160  # px, the longer side of the reduced photographs
+MIN_DISTANCE = 4  # px there, to the nearest point: 20 px of a photograph of 800
+MIN_BRIGHTNESS = 0.6  # mean of the channels
+MIN_BLUE_MINUS_RED = 0.03
+MIN_BLUE = 0.3
+MAX_DEVIATION = 0.04  # standard deviation of the brightness in a square of 3 px
+UPPER = 1 / 3  # fraction of a photograph's height
+MIN_COUNTED = 1 / 3  # of the upper third: the fraction of sky is of at least this many pixels, as masks may leave few
+MIN_SKYWARD = 0.75  # fraction of the sky pixels above the horizon; with fewer, they are a wall or a table
+GROWTH = 2  # texels around observed sky that count as sky, since pixels near points were left out
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
@@ -33,28 +33,27 @@ class SkyEvidence:
 
     view: View
     image: Image  # small, [height, width, 3]
-    mask: Mask  # pixels that show the sky, [height, width]
-    counted: Mask  # pixels that masks do not leave out, [height, width]
+    mask: Mask  # sky pixels, [height, width]
+    counted: Mask  # unmasked pixels, [height, width]
     up: NDArray[np.float64]  # in the scene, [3]
 
     @property
     def share(self) -> float:
-        """Fraction of the unmasked pixels in its upper third that show the sky; 0 if most of it is not above the
-        horizon, as for a wall."""
-        if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < SKYWARD:
+        """The fraction of sky among the unmasked pixels of the upper third; 0 if most of it is below the horizon."""
+        if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < MIN_SKYWARD:
             return 0.0
         rows = slice(max(1, round(len(self.mask) * UPPER)))
-        return float(self.mask[rows].sum() / max(self.counted[rows].sum(), COUNTED * self.counted[rows].size))
+        return float(self.mask[rows].sum() / max(self.counted[rows].sum(), MIN_COUNTED * self.counted[rows].size))
 
     @property
     def upper(self) -> Image:
-        """The pixels of its upper third that count, [K, 3]."""
+        """The unmasked pixels of the upper third, [K, 3]."""
         rows = slice(max(1, len(self.image) // 3))
         return np.asarray(self.image[rows][self.counted[rows]])
 
     @property
     def directions(self) -> NDArray[np.float64]:
-        """Directions through its pixels in the scene, [height, width, 3], of any length."""
+        """The ray directions of the pixels in the scene, [height, width, 3], not normalized."""
         height, width = self.mask.shape
         camera, turn = self.view.camera, self.view.world_to_camera[:, :3].astype(np.float64)
         x = ((np.arange(width) + 0.5) * camera.width / width - camera.cx) / camera.fx
@@ -63,7 +62,7 @@ class SkyEvidence:
 
 
 def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[SkyEvidence]:
-    """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
+    """Yield the sky pixels of photographs, [height, width, 3], among unmasked pixels, [height, width]; None: all."""
     up = up_direction(scene.split("train"))
     for view, image, counted in views:
         small = _small(image)
@@ -72,14 +71,14 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
         yield SkyEvidence(view, small, mask, counts, up)
 
 
-def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
-    """Return the first colors of a map of directions, [side * side, 3], and its texels that are sky, [side * side].
+def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
+    """Return the initial colors of an environment map, [side * side, 3], and which texels are sky, [side * side].
 
-    A texel is sky where a photograph shows it so, or one near it, or where none shows it at all.  It has the mean
-    color of its pixels; the others have that of all pixels of sky.  None where no photograph shows any.
+    A texel is sky if a photograph shows sky in or near it, or if no photograph shows it.  Its color is the mean of its
+    sky pixels, or else that of all sky pixels.  Returns None if no photograph shows sky.
     """
     colors, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
-    for photo in seen:
+    for photo in photos:
         position = texel_positions(photo.directions, side)
         first = np.floor(position).astype(np.int64)
         texels, weight = bilinear_texels(first[..., 0], first[..., 1], side), bilinear_weights(position - first)
@@ -93,7 +92,7 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
     if not of_sky.any():
         return None
     free = of_sky > 0
-    for _ in range(BEYOND):
+    for _ in range(GROWTH):
         free = np.asarray(free[neighbor_texels(side)].any(axis=1))
     mean = colors.sum(axis=0) / of_sky.sum()
     filled = np.where(of_sky[:, None] > 0, colors / np.maximum(of_sky, 1e-9)[:, None], mean)
@@ -101,16 +100,16 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
 
 
 def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
-    """Return which pixels of a small photograph show the sky, [height, width], of those that count.
+    """Return which unmasked pixels of a reduced photograph show the sky, [height, width].
 
-    points: [K, 2] px.  Below pixels that do not count, from the upper edge on, the sky begins where they end.
+    points: [K, 2] px.  Below masked pixels at the upper edge, the sky begins where they end.
     """
     values = image.astype(np.float32) / 255
     brightness = values.mean(axis=2)
     mean = _blurred(brightness, counted)
     spread = np.sqrt(np.maximum(_blurred(brightness**2, counted) - mean**2, 0))
-    blue = (values[..., 2] > values[..., 0] + BLUE) & (values[..., 2] > DARKEST_BLUE)
-    sky = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
+    blue = (values[..., 2] > values[..., 0] + MIN_BLUE_MINUS_RED) & (values[..., 2] > MIN_BLUE)
+    sky = ((brightness > MIN_BRIGHTNESS) | blue) & (spread < MAX_DEVIATION) & _apart(points, brightness.shape)
     joined = (sky & counted) | np.logical_and.accumulate(~counted, axis=0)
     _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
     return np.asarray(sky & counted & np.isin(parts, parts[0][joined[0]]))
@@ -130,7 +129,7 @@ def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
     column, row = np.floor(points).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
     free[row[inside], column[inside]] = 0
-    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > APART)
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > MIN_DISTANCE)
 
 
 def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:

@@ -104,9 +104,9 @@ def _neighbors(i: int, views: Sequence[View]) -> list[int]:
 def _best_planes(
     i: int, views: Sequence[View], images: Sequence[Floats], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
-    """Return the plane of each pixel, [H, W], on which the better half of the neighbors differs least from it.
+    """Return the plane of each pixel, [H, W], with the smallest difference to the better half of the neighbors.
 
-    0 where no plane is clearly the best: in uniform areas, and where no neighbor shows the surface.
+    It is 0 where no plane is clearly the best: in uniform areas, and where no neighbor shows the surface.
     """
     view, image = views[i], images[i]
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)

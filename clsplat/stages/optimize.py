@@ -288,7 +288,7 @@ class Optimize(ValidatedTraining):
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; yields ViewGradients unless a step is skipped, valid until the next step."""
         self.begin_to_keep(run)
-        views = self.views.settled(run.training_images)
+        views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count

@@ -85,12 +85,12 @@ def test_settings_that_follow_detail_are_resolved_before_use():
         views.divisor(1)
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, 32:] = 255
-    settled = views.settled(lambda: [image])
-    assert settled.divisor(1) > 1
-    assert settled.divisor(1000) == 1
-    full = settled.full_size(1000)
-    assert settled.divisor(full) == 1 < settled.divisor(full - 1)
-    assert settled.settled(lambda: []) is settled
+    resolved = views.resolve(lambda: [image])
+    assert resolved.divisor(1) > 1
+    assert resolved.divisor(1000) == 1
+    full = resolved.full_size(1000)
+    assert resolved.divisor(full) == 1 < resolved.divisor(full - 1)
+    assert resolved.resolve(lambda: []) is resolved
 
 
 def test_rate_of_the_means_is_constant_up_to_the_full_size():
