@@ -165,7 +165,7 @@ def _nearest(word: str, known: list[str]) -> str:
     matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if matches:
         return f"; did you mean '{matches[0]}'?"
-    return f"; expected one of {', '.join(sorted(known))}" if known else "; remove it, no key is allowed here"
+    return f"; expected one of {', '.join(sorted(known))}" if known else "; remove it: no keys are allowed here"
 
 
 def _kind(annotation: Any) -> str:

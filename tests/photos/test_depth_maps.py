@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.photos.depths import MAX_PIXELS, MIN_POINTS, DepthMaps, PointDepths, fit_scale_and_offset
-from clsplat.pipeline.input_files import contents
+from clsplat.pipeline.input_files import content_hashes
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from tests.support.outdoor_scene import HEIGHT, WIDTH, Yard
@@ -113,10 +113,10 @@ def test_training_uses_depth_maps_and_detects_changes(yard, tmp_path):
     ]
     assert digest(runs[0].out) != digest(runs[1].out)
     asked = load("smoke", [f"scene.path='{scene}'", f"optimize.losses={losses % folder}"])
-    before = contents(asked)
+    before = content_hashes(asked)
     assert list(before) == [str(tmp_path / "maps")]
     write_map(tmp_path / "maps" / yard.views[0].name, ground(yard, yard.views[0]), bits=8)
-    assert contents(asked) != before
+    assert content_hashes(asked) != before
     two = losses.replace("%s}]", f"{folder}}}, {{type: inverse_depth}}]")
     with pytest.raises(ConfigError, match="is listed with two folders; keep only one"):
         train(scene, tmp_path / "c", *TWO_DOZEN, f"optimize.losses={two}")

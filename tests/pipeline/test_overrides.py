@@ -68,7 +68,7 @@ REFUSED = {
     "densify.budget={gaussians: 1}": "expected a 'type', the name of the budget",
     "densify.budget.gaussians=40000": "expected a 'type', the name of the budget",
     "densify.budget={type: parabol}": "no budget named 'parabol'; did you mean 'parabola'?",
-    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; remove it, as there are no other keys",
+    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; remove it: no keys are allowed here",
     "stages=3": "expected a list, got 3",
 }
 

@@ -109,7 +109,7 @@ def as_cell(asked, state, device, start):
         (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train on"),
         (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected"),
         (as_cell, "scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene"),
-        (run_pipeline, "scene.masks=masks", "masks do not fit photos that are still to be undistorted"),
+        (run_pipeline, "scene.masks=masks", "masks do not fit photos before they are undistorted"),
         (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is a test view"),
     ],
 )

@@ -147,7 +147,7 @@ def test_pipeline_with_poses_and_sky_is_refused():
         with pytest.raises(ConfigError, match="'random_background' cannot be combined with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
     asked = load("photos", ["model.background=envmap"])  # which may learn poses
-    with pytest.raises(ConfigError, match=r"adapt: photos: .*cannot be learned together with poses.*; --set of one"):
+    with pytest.raises(ConfigError, match=r"adapt: photos: .*cannot be learned together with poses.*; overrid"):
         apply_adaptation(asked, Measures(60, 1.0))
 
 

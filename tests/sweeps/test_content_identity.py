@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline import matrix
-from clsplat.pipeline.input_files import contents, hash_content
+from clsplat.pipeline.input_files import content_hashes, hash_content
 from clsplat.pipeline.loading import load
 from clsplat.stages.video import Video
 from clsplat.sweeps import cell as fingerprint
@@ -55,7 +55,7 @@ def test_unreadable_input_is_reported(few_steps, tiny_scene, tmp_path, monkeypat
     monkeypatch.setattr("clsplat.pipeline.input_files.model_path", refuse)
     with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); check its permissions"):
         hash_content(few_steps)
-    assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
+    assert content_hashes(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
 
 
 def test_list_of_names_is_read_from_the_dataset_folder(tiny_scene, tmp_path, monkeypatch):
