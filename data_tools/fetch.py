@@ -48,7 +48,7 @@ SOURCES = {
 def named(name: str) -> WebArchive:
     """Return a known source.  Raises ConfigError."""
     if name not in SOURCES:
-        raise ConfigError(f"no data set named '{name}'; there are {', '.join(SOURCES)}, or give --url")
+        raise ConfigError(f"no data set is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
     return SOURCES[name]
 
 

@@ -82,7 +82,7 @@ def open_regular(path: Path, limit: int | None = None) -> BufferedReader:
     except ValueError as error:  # a NUL in the name, or text that cannot be encoded
         raise OSError(errno.EINVAL, "not a valid file name") from error
     if not stat.S_ISREG(state.st_mode):
-        raise OSError(errno.EINVAL, f"it is {KINDS.get(stat.S_IFMT(state.st_mode), 'not a open_regular file')}")
+        raise OSError(errno.EINVAL, f"it is {KINDS.get(stat.S_IFMT(state.st_mode), 'not a regular file')}")
     if limit is not None and state.st_size > limit:
         raise OSError(errno.EFBIG, f"it has {state.st_size} bytes, more than {limit}")
     return path.open("rb")

@@ -239,7 +239,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     """
     for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in choices:
-            raise ConfigError(f"no {name} {quote(value)}; there are {', '.join(choices)}")
+            raise ConfigError(f"{name}: expected one of {', '.join(choices)}, got {quote(value)}")
     scene = scene.in_world()
     views = check_cameras(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(posed.view.lens is not None for posed in views):

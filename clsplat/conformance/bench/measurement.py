@@ -133,7 +133,7 @@ def measure(
 ) -> Measurement:
     """Time a training step on fixed scenes, and on a model with a view of its scene.  Raises ClsplatError."""
     if unknown := [name for name in scenes if name not in SIZES]:
-        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
+        raise ConfigError(f"--scenes: expected names from {', '.join(SIZES)}, got '{unknown[0]}'")
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
     settings = load(pipeline).settings
