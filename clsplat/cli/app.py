@@ -14,7 +14,7 @@ from clsplat.core import terminal
 from clsplat.core.errors import ConfigError, MemoryLimitError
 from clsplat.core.machine import process_limit
 from clsplat.core.resources import full_version
-from clsplat.core.signals import stop_with_input
+from clsplat.core.signals import stop_when_stdin_closes
 from clsplat.pipeline.files import shipped
 
 SYNONYMS = {
@@ -148,7 +148,7 @@ def common(
             f"{MIN_ADDRESS_SPACE >> 20}: raise it"
         )
     if attended:
-        stop_with_input()
+        stop_when_stdin_closes()
     context.obj = Common(device)
     if context.invoked_subcommand is not None:
         arguments.load_plugins()

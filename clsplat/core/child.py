@@ -1,4 +1,4 @@
-"""Run a module in a child process, for code of others that may crash or hang."""
+"""Run a module in a child process, for third-party code that may crash or hang."""
 
 import os
 import signal
@@ -17,23 +17,23 @@ class ChildResult:
 
     @property
     def crash(self) -> str | None:
-        """Which signal or time limit ended it, as a verb phrase; None if it exited."""
+        """How it crashed or hung, as a verb phrase such as "crashes with SIGSEGV"; None if it exited."""
         if self.code is None:
             return "hangs"
         return None if self.code in range(256) else f"crashes with {signal_name(self.code)}"
 
 
 def run_module(
-    module: str, *words: str, seconds: float, stdin: bytes = b"", variables: Mapping[str, str] | None = None
+    module: str, *arguments: str, seconds: float, stdin: bytes = b"", variables: Mapping[str, str] | None = None
 ) -> ChildResult:
     """Run a module with arguments, standard input, and additional environment variables, for at most `seconds`."""
-    command = [sys.executable, "-P", "-m", module, *words]  # -P: import nothing from the working folder
+    command = [sys.executable, "-P", "-m", module, *arguments]  # -P: import nothing from the working folder
     environment = {**os.environ, **(variables or {})}
     try:
-        done = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
+        completed = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
     except subprocess.TimeoutExpired as error:
         return ChildResult(None, _text(error.stdout, error.stderr))
-    return ChildResult(done.returncode, _text(done.stdout, done.stderr))
+    return ChildResult(completed.returncode, _text(completed.stdout, completed.stderr))
 
 
 def signal_name(code: int) -> str:

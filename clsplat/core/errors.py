@@ -16,7 +16,7 @@ from itertools import islice
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
 NAMES_SHOWN = 8  # names of a list in a message
-PLUGIN_MARK = "__clsplat_plugin__"  # the name of the plug-in, a variable of its module
+PLUGIN_MARK = "__clsplat_plugin__"  # the variable of a plug-in's module that contains its name
 
 
 class ClsplatError(Exception):
@@ -112,9 +112,8 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, ImportError) and "failed to map segment" in str(error):
         reason = "too little memory or address space (`ulimit -v`), or a file system mounted with `noexec`"
         return MemoryLimitError(f"{one_line(error)}: {reason}")
-    if (
-        isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-    ):  # for outputs, write_error has already handled it
+    # an input: write_error has already converted the errors of outputs
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return DataError(f"{error.filename}: cannot be read ({error.strerror}); expected the path of a file or folder")
     if isinstance(error, OSError) and error.strerror:
         name = error.filename or "the output"
@@ -138,7 +137,7 @@ def one_line(error: BaseException | str) -> str:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Return the first names of a list and the number of the others, for a message."""
+    """Join the first names of a list and the number of further ones, for a message."""
     more = f", and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more
 
@@ -149,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None) -> str:
-    """Format the size of a trained model: its Gaussians, or the parameters of a field."""
+    """Format the size of a trained model: the number of Gaussians, or of the parameters of a field."""
     return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
 
 

@@ -17,12 +17,12 @@ from clsplat.core.machine import is_alive
 from clsplat.core.reading import read_json
 
 LOG = logging.getLogger("clsplat")
-# the temporary files of a killed process: .NAME.PROCESS-NUMBER.partial
+# names of temporary files: .NAME.PROCESS-NUMBER.partial
 PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial(\.\w+)?")
 NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 SYSTEM = os.name
 _number = itertools.count()
-_open: set[str] = set()  # names of temporary files that this process is writing
+_open: set[str] = set()  # names of the temporary files that this process is writing
 
 
 @contextmanager
@@ -42,11 +42,11 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
     """Yield a temporary path next to `path`, and rename it to `path` as `open_atomic` does.
 
-    This is for libraries that open files themselves and look at the suffix.  The caller syncs the file.
+    For libraries that open files themselves and choose the format by the suffix.  The caller syncs the file.
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
-    temporary = _temporary(path, suffix)
+    temporary = _temporary_path(path, suffix)
     try:
         if path.exists() and not path.is_file():  # os.replace would replace a device too
             raise OutputError(f"{path}: cannot be written (it is not a file); use another name")
@@ -86,7 +86,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
     Hidden folders left by killed processes are removed first.
     Raises OutputError before the block when the folder cannot be created.
     """
-    temporary = _temporary(folder)
+    temporary = _temporary_path(folder)
     try:
         with raising_output_error(folder):
             make_folder(folder.parent)
@@ -102,9 +102,8 @@ def require_free(folder: Path) -> None:
     """Raise ConfigError if anything other than an empty folder exists at the path of a new one."""
     with raising_output_error(folder):
         is_free = not path_exists(folder) or (folder.is_dir() and not any(folder.iterdir()))
-    if (
-        not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder)
-    ):  # os.replace cannot replace these
+    # os.replace cannot replace links and mount points
+    if not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder):
         raise ConfigError(f"{folder}: already exists; give a new folder")
 
 
@@ -117,7 +116,7 @@ def raising_output_error(path: Path) -> Iterator[None]:
         raise write_error(path, error) from error
 
 
-def _temporary(path: Path, suffix: str = "") -> Path:
+def _temporary_path(path: Path, suffix: str = "") -> Path:
     """Return a hidden name next to `path` and register it as being written by this process."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
     _open.add(temporary.name)
@@ -177,11 +176,11 @@ def sync_folder(folder: Path) -> None:
 
 def _sync(path: Path, flags: int) -> None:
     try:
-        number = os.open(path, flags)
+        descriptor = os.open(path, flags)
         try:
-            os.fsync(number)
+            os.fsync(descriptor)
         finally:
-            os.close(number)
+            os.close(descriptor)
     except OSError as error:
         if error.errno not in NO_SYNC:
             raise
@@ -215,7 +214,7 @@ def _is_abandoned(name: str) -> bool:
 
 
 def path_exists(path: Path) -> bool:
-    """Return whether a path exists, broken links included.  Raises OutputError when that cannot be found out."""
+    """Return whether a path exists, broken links included.  Raises OutputError if that cannot be determined."""
     with raising_output_error(path):
         return path.exists() or path.is_symlink()
 
@@ -231,7 +230,7 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-# File names: which ones every system supports, and which ones in a run folder no pipeline may choose.
+# File names: which are portable, and which are reserved in a run folder.
 
 # The files that a run or a matrix writes in its folder.
 PIPELINE = "pipeline.yaml"
@@ -262,7 +261,7 @@ MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON, STORE})
 END_STATES = ("done", "failed", "interrupted")  # states in status.json
 HEARTBEAT_TIMEOUT = 60  # seconds without a heartbeat in status.json after which a run may have ended
 MAX_NAME_BYTES = 200  # systems allow 255, and temporary names are longer
-_DEVICE_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # on Windows
+_WINDOWS_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of devices
 
 
 def invalid_name_reason(name: str) -> str | None:
@@ -275,7 +274,7 @@ def invalid_name_reason(name: str) -> str | None:
         return f"a name of {size} bytes is too long; the limit is {MAX_NAME_BYTES}"
     if any(letter < " " or letter in '<>:"|?*\x7f' for letter in name):
         return f"{name!r} contains a character that not every system allows"
-    if _DEVICE_NAMES.fullmatch(name.rstrip(" .")) or re.search(r"~\d", name) or name != name.rstrip(" ."):
+    if _WINDOWS_NAMES.fullmatch(name.rstrip(" .")) or re.search(r"~\d", name) or name != name.rstrip(" ."):
         return f"'{name}' has a special meaning on Windows"
     return None
 
@@ -313,12 +312,12 @@ def check_not_run_file(path: Path) -> None:
     """Raise ConfigError if a command would overwrite a file of a run."""
     folders = path.absolute().parents
     run = next((folder for folder in folders if any((folder / n).is_file() for n in (CHECKSUMS, STATUS))), None)
-    if run and path_exists(path) and _belongs_to(run, path):
+    if run and path_exists(path) and _is_run_file(run, path):
         raise ConfigError(f"{path}: is a file of a run; use another name")
 
 
-def _belongs_to(run: Path, path: Path) -> bool:
-    """Return whether a run wrote a file in its folder; files not in a finished run's checksums belong to the user."""
+def _is_run_file(run: Path, path: Path) -> bool:
+    """Return whether a file in a run's folder belongs to the run; the checksums of a finished run list its files."""
     name = path.absolute().relative_to(run).as_posix()
     try:
         listed = read_json(run / CHECKSUMS)

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # samples; more than the 7 functions of a band need, and, with their opposites, all products
+DIRECTIONS = 64  # samples: enough for the 7 functions of a band and, with their opposites, for all products
 BAND_0 = 0.28209479177387814
-ROWS = 4096  # Gaussians at once, to limit temporary memory
+ROWS = 4096  # Gaussians per block, to limit temporary memory
 Floats = NDArray[np.float64]
-DIGITS = 6  # of means; further ones differ between processors
+DIGITS = 6  # decimals of means; later ones differ between processors
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -31,8 +31,8 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
 def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of Y(d), [K], over a distribution of directions d.
 
-    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of functions of the bands 1 to 3 span each
-    function; those of a single band do not, and the result is then 0.
+    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  The products of the functions of bands 1 to 3 span
+    every function; those of band 1 alone do not, and the result is then 0.
     """
     count, half = len(form), _directions()
     values = basis(np.concatenate([half, -half]))[:, :count]
@@ -59,9 +59,7 @@ def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> N
         if first + size > coefficients:
             break
         band = slice(first, first + size)
-        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[
-            0
-        ]  # expresses the old functions by the new ones
+        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]  # old functions in terms of the new
         result[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
         first += size
     return result.reshape(count, 3 * coefficients)
@@ -70,7 +68,7 @@ def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> N
 def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Floats]) -> Floats:
     """Return the coefficients, [N, K, 3], whose colors are closest to `curve` of the colors over all directions.
 
-    Without bands above 0, they are exact.
+    With band 0 only, the result is exact.
     """
     half = _directions()
     values = basis(np.concatenate([half, -half]))[:, : coefficients.shape[1] - 1]

@@ -1,6 +1,6 @@
 """Lock folders, so that only one process at a time uses a folder.
 
-The system releases the lock when its owner exits for any reason, so no stale lock remains.  The file `run.lock` names
+The system releases the lock when its owner exits for any reason, so no lock becomes stale.  The file `run.lock` names
 the owner.  On a file system without locks, the process that creates this file owns the folder; a file whose process
 has exited on this host is taken over.  Where locks are local to each machine, as on some NFS and sshfs mounts, a run on
 another machine is detected by its heartbeat.
@@ -54,8 +54,8 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     Raises OutputError if the heartbeat in the run's status next to the file is recent.
     """
     owner = read_owner(file)
-    named, this = Owner.from_record(owner), Owner.current()
-    if named is None or (named.boot == this.boot if owner.get("boot") and this.boot else named.host == this.host):
+    other, this = Owner.from_record(owner), Owner.current()
+    if other is None or (other.boot == this.boot if owner.get("boot") and this.boot else other.host == this.host):
         return {}
     beat = _heartbeat(path)
     if beat is not None and (age := time.time() - beat) < HEARTBEAT_TIMEOUT:
@@ -67,7 +67,7 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
 
 
 def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Wait for the next heartbeat, and return as `require_stale_heartbeat` if none comes in time.
+    """Wait for the next heartbeat, and return what `require_stale_heartbeat` does if none comes in time.
 
     Only a change of the heartbeat counts, not its time: the clocks of two machines may differ.
     """
@@ -95,7 +95,7 @@ def _heartbeat(path: Path) -> float | None:
 
 
 def lost_lock_message(path: Path, folder: Path) -> str:
-    """Return the message about a lock whose file was removed or replaced."""
+    """Return the message about a lock file that was removed or replaced."""
     try:
         owner = read_json(path, limit=LOCK_OFFSET)
         by = f", and process {owner['process']} on {owner['host']} holds it now"
@@ -123,8 +123,8 @@ def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
 
 LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # error codes for a lock that another process holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-_held: set[Path] = set()  # locked, or being locked, by this process
-_reserving = threading.Lock()
+_held: set[Path] = set()  # lock files that this process holds or is locking
+_held_lock = threading.Lock()
 
 
 @contextmanager
@@ -134,21 +134,21 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
     Yields a function that raises OutputError if that file was removed or replaced, so that another process may use the
     folder.  Raises OutputError, with process and host, if another process holds the lock.
     """
-    path = _path(folder, path or folder / LOCK)
-    with _reserved(path, folder):
+    path = _resolve(folder, path or folder / LOCK)
+    with _reserve(path, folder):
         with raising_output_error(path):
-            file = _locked(path, folder)
+            file = _acquire(path, folder)
 
         def require_held() -> None:
             with suppress(OSError):  # an unreadable folder: the next write reports that
-                if not file.closed and not _is_at(file, path):
+                if not file.closed and not _is_still_at(file, path):
                     raise OutputError(lost_lock_message(path, folder))
 
         try:
             yield require_held
         finally:
             with suppress(OSError):  # Windows cannot remove an open file
-                if _is_at(file, path):
+                if _is_still_at(file, path):
                     path.unlink()
             file.close()
             with suppress(OSError):
@@ -157,9 +157,9 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
 
 
 @contextmanager
-def _reserved(path: Path, folder: Path) -> Iterator[None]:
-    """Keep other threads of this process away.  Raises OutputError."""
-    with _reserving:
+def _reserve(path: Path, folder: Path) -> Iterator[None]:
+    """Reserve a lock file for this thread during the block.  Raises OutputError if another thread holds it."""
+    with _held_lock:
         _require_not_held(path, folder)
         _held.add(path)
     try:
@@ -173,7 +173,7 @@ def check_free(folder: Path) -> bool:
 
     Returns False if `lock_folder` would wait for the heartbeat of a run on another machine.
     """
-    path = _path(folder, folder / LOCK)
+    path = _resolve(folder, folder / LOCK)
     with raising_output_error(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
         try:
             if not _system_lock(file):
@@ -190,7 +190,7 @@ def check_free(folder: Path) -> bool:
     return True
 
 
-def _path(folder: Path, file: Path) -> Path:
+def _resolve(folder: Path, file: Path) -> Path:
     """Return the canonical path of a lock file.  Raises OutputError if this process holds it."""
     path = file.parent.resolve() / file.name
     _require_not_held(path, folder)
@@ -206,14 +206,14 @@ def _require_not_held(path: Path, folder: Path) -> None:
         )
 
 
-def _locked(path: Path, folder: Path) -> io.FileIO:
-    """Open and lock a lock file, and write this process into it.  Raises OutputError and OSError."""
+def _acquire(path: Path, folder: Path) -> io.FileIO:
+    """Open and lock a lock file, and write this process into it.  Raises OutputError, OSError."""
     while True:
-        file, is_new = _opened(path)
+        file, is_new = _open_lock_file(path)
         if file is None:
             continue
         try:
-            if _is_ours(file, is_new, path, folder):
+            if _take_ownership(file, is_new, path, folder):
                 file.seek(0)
                 file.truncate()
                 file.write(owner_record().encode())
@@ -224,8 +224,8 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
         file.close()
 
 
-def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
-    """Open a lock file and return whether this process created it; None if its owner is just removing it."""
+def _open_lock_file(path: Path) -> tuple[io.FileIO | None, bool]:
+    """Open a lock file; return it, or None if its owner is removing it, and whether this process created it."""
     with suppress(FileExistsError):
         return path.open("x+b", buffering=0), True
     with suppress(FileNotFoundError):
@@ -233,12 +233,12 @@ def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
     return None, False
 
 
-def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
+def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
     """Lock the file; return False if it is no longer at its path.  Without locks, the creator of the file owns it."""
     try:
         if not _system_lock(file):
             raise OutputError(in_use_message(folder, read_owner(file)))
-        if not _is_at(file, path):
+        if not _is_still_at(file, path):
             return False
         if not is_new and (owner := wait_for_stale_heartbeat(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
@@ -261,7 +261,7 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
 def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Return the owner on a file system without locks.  Raises OutputError unless that process has exited."""
     owner = read_owner(file)
-    if not _has_ended(Owner.from_record(owner)):
+    if not _has_exited(Owner.from_record(owner)):
         raise OutputError(
             f"{in_use_message(folder, owner)}; this file system does not support locks: "
             f"if that process has exited, remove {path}"
@@ -274,7 +274,7 @@ def _remove(file: io.FileIO, path: Path) -> None:
     aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # cleaned up later if this process is killed
     with suppress(FileNotFoundError):
         os.replace(path, aside)
-        if _is_at(file, aside):
+        if _is_still_at(file, aside):
             aside.unlink()
         else:
             with suppress(FileExistsError):  # a third process has created one
@@ -303,7 +303,7 @@ def _system_lock(file: io.FileIO) -> bool:
     return True
 
 
-def _is_at(file: io.FileIO, path: Path) -> bool:
+def _is_still_at(file: io.FileIO, path: Path) -> bool:
     """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
@@ -311,7 +311,6 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _has_ended(owner: Owner | None) -> bool:
-    return owner is not None and (
-        owner == Owner.current() or owner.has_ended
-    )  # a lock of this process was ruled out before
+def _has_exited(owner: Owner | None) -> bool:
+    # an owner equal to this process is an earlier process with the same ID: `_resolve` rules out locks held here
+    return owner is not None and (owner == Owner.current() or owner.has_ended)

@@ -23,7 +23,7 @@ from clsplat.core.errors import DataError, OutputError
 from clsplat.core.reading import read_text
 
 LOG = logging.getLogger("clsplat")
-LIBRARIES = ("pyopencl", "pytools", "pocl")  # they keep caches next to ours and fail if they cannot
+LIBRARIES = ("pyopencl", "pytools", "pocl")  # libraries that fail if they cannot write their caches
 MIN_SPACE = 16 << 20  # bytes; the built kernels of a device take a few MB
 
 
@@ -31,9 +31,9 @@ MIN_SPACE = 16 << 20  # bytes; the built kernels of a device take a few MB
 def cache_folder() -> Path:
     """Return the cache folder of clsplat, which exists, is writable, and belongs to the user.
 
-    If the user's cache folders are not writable, as in a container without a home, all caches, those of the libraries
-    included, move to the temporary folder, with a warning.  Raises OutputError if that is not writable either.
-    So they do if little space is free, since compilers abort the process when a built kernel does not fit.
+    If the user's cache folders are not writable, as in a container without a home, or have little free space, all
+    caches, including those of the libraries, move to the temporary folder, with a warning: compilers abort the process
+    when a built kernel does not fit.  Raises OutputError if the temporary folder is not writable either.
     """
     try:
         folders = [Path(platformdirs.user_cache_dir(name, name)) for name in ("clsplat", *LIBRARIES)]
@@ -41,18 +41,18 @@ def cache_folder() -> Path:
         fault = "there is no home folder"
     else:
         folders += user_cache_folders()
-        fault = next(filter(None, (_fault(folder) or space_fault(folder) for folder in folders)), "")
+        fault = next(filter(None, (_write_fault(folder) or space_fault(folder) for folder in folders)), "")
         if not fault:
             return folders[0]
-    moved = _temporary()
-    LOG.warning("%s; caches are in %s instead; set XDG_CACHE_HOME to a permanent folder", fault, moved)
-    os.environ["XDG_CACHE_HOME"] = str(moved)  # all libraries and child processes read it
+    base = _temporary_cache_folder()
+    LOG.warning("%s; caches are in %s instead; set XDG_CACHE_HOME to a permanent folder", fault, base)
+    os.environ["XDG_CACHE_HOME"] = str(base)  # all libraries and child processes read it
     if user_cache_folders():
-        os.environ["POCL_CACHE_DIR"] = str(moved / "pocl")
-    ours = moved / "clsplat"
-    if fault := _fault(ours):
+        os.environ["POCL_CACHE_DIR"] = str(base / "pocl")
+    folder = base / "clsplat"
+    if fault := _write_fault(folder):
         raise OutputError(f"{fault}; free space, or set TMPDIR to a writable folder")
-    return ours
+    return folder
 
 
 def user_cache_folders() -> list[Path]:
@@ -60,7 +60,7 @@ def user_cache_folders() -> list[Path]:
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 
 
-def _fault(folder: Path) -> str:
+def _write_fault(folder: Path) -> str:
     """Create a folder and try to write in it; return why that fails, or ''."""
     if not folder.is_absolute():  # if HOME is relative
         return f"{folder}: is not an absolute path"
@@ -75,14 +75,14 @@ def _fault(folder: Path) -> str:
 
 def space_fault(folder: Path) -> str:
     """Return why built kernels may not fit in a folder, or ''."""
-    with suppress(OSError, AttributeError):  # the system does not say
+    with suppress(OSError, AttributeError):  # the free space is unknown
         if (free := shutil.disk_usage(folder).free) < MIN_SPACE:
             return f"{folder}: has only {free >> 10} KiB of free space, too little for built kernels"
     return ""
 
 
-def _temporary() -> Path:
-    """Return a private folder below the temporary one, the same for all processes of a user if possible.
+def _temporary_cache_folder() -> Path:
+    """Return a private folder in the temporary folder, the same for all processes of a user if possible.
 
     Raises OutputError if there is no temporary folder.
     """
@@ -91,7 +91,7 @@ def _temporary() -> Path:
         folder = base / f"clsplat-{os.getuid()}" if hasattr(os, "getuid") else base / "clsplat-caches"
         if not folder.is_symlink() and not folder.exists():
             folder.mkdir(mode=0o700, exist_ok=True)
-        if _private(folder):
+        if _is_private(folder):
             return folder
         folder = Path(tempfile.mkdtemp(prefix="clsplat-"))
     except OSError as error:
@@ -102,7 +102,7 @@ def _temporary() -> Path:
     return folder
 
 
-def _private(folder: Path) -> bool:
+def _is_private(folder: Path) -> bool:
     """Return whether only this user can read and write a folder; True on systems without user IDs."""
     if not hasattr(os, "getuid"):  # on Windows the temporary folder belongs to the user
         return True
@@ -110,18 +110,18 @@ def _private(folder: Path) -> bool:
     return stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077
 
 
-# CPU cores: which ones a process may use, and how to pin another process to some of them.
+# CPU cores: which ones a process may use, and pinning a process to some of them.
 
 THREAD_VARIABLES = (  # environment variables that set the number of threads of a runtime
     "POCL_MAX_PTHREAD_COUNT",  # PoCL before 4
     "POCL_CPU_MAX_CU_COUNT",  # PoCL from 4 on
-    "CL_CONFIG_CPU_TBB_NUM_WORKERS",  # Intel's
+    "CL_CONFIG_CPU_TBB_NUM_WORKERS",  # Intel's runtime
 )
 Cores = Sequence[int]  # core numbers of the system
 
 
 def usable_cores() -> tuple[int, ...]:
-    """Return the cores that this process may use, or all cores if the system does not say."""
+    """Return the cores that this process may use, or all cores if the system does not report them."""
     if hasattr(os, "sched_getaffinity"):
         return tuple(sorted(os.sched_getaffinity(0)))
     return tuple(range(os.cpu_count() or 1))
@@ -132,8 +132,8 @@ def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
 
     Leftover cores stay unused, so that all processes have the same number.
     """
-    each = len(cores) // processes
-    return [tuple(cores[number * each : (number + 1) * each]) for number in range(processes)]
+    count = len(cores) // processes
+    return [tuple(cores[number * count : (number + 1) * count]) for number in range(processes)]
 
 
 def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -148,9 +148,9 @@ def pin_to_cores(cores: Cores, process: int = 0) -> None:
             os.sched_setaffinity(process, cores)
 
 
-# Processes: their identity across hosts and containers, and whether they are alive.
+# Processes: their identity across hosts and containers, and whether they are running.
 
-FIRST_PID_NAMESPACE = "pid:[4026531836]"  # of the host, outside containers: PROC_PID_INIT_INO in Linux
+FIRST_PID_NAMESPACE = "pid:[4026531836]"  # that of the host, outside containers: PROC_PID_INIT_INO in Linux
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # Windows constants
 
@@ -161,17 +161,17 @@ class Owner:
 
     process: int
     host: str  # name of the machine or container
-    pid_namespace: str | None  # on Linux, such as 'pid:[4026531836]'; each container has another
-    boot: str | None  # on Linux: changes with each boot, and is the same in all containers of a machine
+    pid_namespace: str | None  # on Linux, such as 'pid:[4026531836]'; each container has its own
+    boot: str | None  # boot ID on Linux, the same in all containers of a machine
 
     @classmethod
     def current(cls) -> "Owner":
         """Return this process."""
-        return cls(os.getpid(), platform.node(), _pid_namespace(), _boot())
+        return cls(os.getpid(), platform.node(), _pid_namespace(), _boot_id())
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any]) -> "Owner | None":
-        """Return the process that a file names, or None.  Missing values, in older files, default to those here."""
+        """Return the process that a file names, or None.  Values that older files lack are those of this process."""
         process, this = values.get("process"), cls.current()
         if type(process) is not int or process <= 0:
             return None
@@ -190,7 +190,7 @@ class Owner:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is known to have exited; for a process elsewhere that is not known.
+        """Whether it is known to have exited; False for most processes on other hosts or in other containers.
 
         A process of an earlier boot has exited if it ran outside containers: containers on two machines may share a
         name.
@@ -198,20 +198,22 @@ class Owner:
         if self.is_local:
             return not is_alive(self.process)
         return (
-            replace(self, boot=_boot()).is_local and self.pid_namespace == FIRST_PID_NAMESPACE and _boot() is not None
+            replace(self, boot=_boot_id()).is_local
+            and self.pid_namespace == FIRST_PID_NAMESPACE
+            and _boot_id() is not None
         )
 
 
 def _pid_namespace() -> str | None:
-    """Return the PID namespace, or None if the system does not say."""
+    """Return the PID namespace, or None if unknown."""
     try:
         return os.readlink("/proc/self/ns/pid")
     except (OSError, AttributeError):
         return None
 
 
-def _boot() -> str | None:
-    """Return the boot ID, or None if the system does not say."""
+def _boot_id() -> str | None:
+    """Return the boot ID, or None if unknown."""
     try:
         return read_text(BOOT_ID).strip() or None
     except DataError:
@@ -219,7 +221,7 @@ def _boot() -> str | None:
 
 
 def is_alive(process: int) -> bool:
-    """Return whether a process of this machine is running; True if the system does not say.
+    """Return whether a process of this machine is running; True if unknown.
 
     A process ID may have been reused by another process.
     """
@@ -240,9 +242,9 @@ def _is_alive_on_windows(kernel: Any, process: int) -> bool:
     if not handle:
         return bool(ctypes.get_last_error() == ACCESS_DENIED)  # type: ignore[attr-defined,unused-ignore]
     code = ctypes.c_ulong()
-    known = kernel.GetExitCodeProcess(ctypes.c_void_p(handle), ctypes.byref(code))
+    succeeded = kernel.GetExitCodeProcess(ctypes.c_void_p(handle), ctypes.byref(code))
     kernel.CloseHandle(ctypes.c_void_p(handle))
-    return not known or code.value == STILL_ACTIVE
+    return not succeeded or code.value == STILL_ACTIVE
 
 
 # Free memory.
@@ -267,7 +269,7 @@ def available_memory() -> int | None:
     with suppress(OSError, ValueError):
         lines = Path("/proc/meminfo").read_text("utf-8").splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    with suppress(OSError, ValueError):  # no container, or no limit ("max")
+    with suppress(OSError, ValueError):  # not in a container, or no limit ("max")
         limits.append(
             int((CONTAINER / "memory.max").read_text("utf-8")) - int((CONTAINER / "memory.current").read_text("utf-8"))
         )

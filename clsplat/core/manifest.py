@@ -1,4 +1,4 @@
-"""Record which files in a folder a tool has written and from what, to resume calls and to keep the files of users."""
+"""Record which files of a folder a tool wrote and from which sources, to resume calls and to keep users' files."""
 
 import hashlib
 import json
@@ -15,8 +15,8 @@ class Manifest:
     """The record of a folder: one line per written file, with a hash of its sources.
 
     A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
-    written.  So a file that exists is complete and made from the sources in its last line.  Temporary files of killed
-    calls are removed.
+    written.  So every file that exists is complete and was made from the sources in its last line.  Temporary files of
+    killed calls are removed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -30,14 +30,14 @@ class Manifest:
                 continue  # incomplete, after a crash
 
     def lists(self, path: Path) -> bool:
-        """Return whether a tool has written this file, or was about to."""
+        """Return whether a tool wrote this file, or was about to write it."""
         return self._name(path) in self._sources
 
     def needs_writing(self, path: Path, source: str, *companions: Path) -> bool:
         """Return whether a file must be written: it is missing, or was made from other sources.
 
         If so, remove it and its `companions`, which the caller writes before it, and record its new source.  A file
-        that no tool has written is never replaced.  Raises OutputError.
+        that no tool wrote is never replaced.  Raises OutputError.
         """
         name, exists = self._name(path), path.is_file()
         if exists and self._sources.get(name, source) == source:
@@ -55,7 +55,7 @@ class Manifest:
         return True
 
     def require_listed(self, path: Path) -> None:
-        """Raise DataError if a file exists that no tool has written."""
+        """Raise DataError if a file exists that no tool wrote."""
         if path.is_file() and not self.lists(path):
             raise DataError(f"{path}: exists and was not made from this scene; use another folder, or remove the file")
 

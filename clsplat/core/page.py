@@ -1,7 +1,7 @@
 """Write HTML pages that open offline: one file with its style, charts, and images inside.
 
-Templates, styles, and scripts are in `templates/`.  Templates escape every value except charts of
-`clsplat.viewer.charts` and the package's own scripts and styles.
+Templates, styles, and scripts are in `templates/`.  Templates escape every value except the charts of
+`clsplat.viewer.charts` and the scripts and styles of the package.
 """
 
 import base64
@@ -38,7 +38,7 @@ def render(template: str, **values: Any) -> str:
 
 
 def require_complete(path: Path) -> None:
-    """Raise DataError if the file of a page cannot be read or is truncated."""
+    """Raise DataError if a page cannot be read or is truncated."""
     if not read_file(path).rstrip().endswith(b"</html>"):
         raise DataError(f"{path}: is truncated; make the page again")
 
@@ -70,10 +70,10 @@ def _safe(text: str) -> Markup:
 
 def duration_text(seconds: float) -> str:
     """Format a duration: `1 h 2 min`, `3 min 4 s`, `5 s`."""
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds = divmod(round(seconds), 60)
     if minutes >= 60:
         return f"{minutes // 60} h {minutes % 60} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
 
 
 def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:

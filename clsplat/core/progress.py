@@ -1,4 +1,4 @@
-"""Report the progress of work on the host: a log line every few seconds, and calls of listeners."""
+"""Report the progress of work on the host, with a log line every few seconds and calls to listeners."""
 
 import contextvars
 import logging
@@ -15,8 +15,8 @@ from clsplat.core.errors import Interrupted
 LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
 INTERVAL = 5.0  # seconds between log lines
-FIRST_POLL, SLOWEST_POLL = 0.5, 5.0  # seconds between two polls, at first and at most
-MAX_POLLS = 40  # of the elapsed time, for a poll may start a process
+MIN_POLL_INTERVAL, MAX_POLL_INTERVAL = 0.5, 5.0  # seconds
+MAX_POLLS = 40  # longer intervals keep polls below this number, since a poll may start a process
 
 
 class Listener(Protocol):
@@ -31,13 +31,13 @@ _level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of log li
 
 @contextmanager
 def log_level(level: int) -> Iterator[None]:
-    """Drop log messages of the block below a level, because the caller reports the same in its own words."""
-    before = LOG.level
+    """Drop log messages of the block below a level, because the caller reports the same."""
+    previous = LOG.level
     LOG.setLevel(level)
     try:
         yield
     finally:
-        LOG.setLevel(before)
+        LOG.setLevel(previous)
 
 
 @contextmanager
@@ -61,15 +61,15 @@ def captured_log(level: int) -> Iterator[list[str]]:
 def listening(listener: Listener) -> Iterator[None]:
     """Call `listener`, and the listeners of enclosing blocks, for each step of the work in this block.
 
-    It is called from the thread of the block, or from that of `polled`.
+    It is called from the thread of the block or from the thread of `polled`.
     """
     outer = _listener.get()
 
-    def both(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+    def call_both(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
         for call in filter(None, (outer, listener)):
             call(label, done, total, seconds_left=seconds_left)
 
-    token = _listener.set(both)
+    token = _listener.set(call_both)
     try:
         yield
     finally:
@@ -78,7 +78,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def counts_as_debug() -> Iterator[None]:
-    """Log the counts of the block as debug lines, because something else shows them."""
+    """Log the counts of the block at debug level, because something else shows them."""
     token = _level.set(logging.DEBUG)
     try:
         yield
@@ -92,7 +92,7 @@ class Count:
     def __init__(self, label: str, total: int, is_even: bool = True) -> None:
         """is_even: whether items take about the same time, so that the time left can be estimated."""
         self.label, self.total, self.done, self.is_even = label, total, 0, is_even
-        self._start: tuple[float, int] | None = None  # time, and items that an earlier call had done
+        self._start: tuple[float, int] | None = None  # time, and number of items done before
         self._logged = time.monotonic()
         self.reach(0)
 
@@ -135,7 +135,7 @@ def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
 
     def watch() -> None:
         start = time.monotonic()
-        while not ended.wait(min(max(FIRST_POLL, (time.monotonic() - start) / MAX_POLLS), SLOWEST_POLL)):
+        while not ended.wait(min(max(MIN_POLL_INTERVAL, (time.monotonic() - start) / MAX_POLLS), MAX_POLL_INTERVAL)):
             done = poll()
             if done > count.done:
                 count.reach(min(done, count.total))
@@ -151,9 +151,9 @@ def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
 
 def clock(seconds: float) -> str:
     """Format a duration as h:mm:ss or m:ss."""
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 class Stopped(Interrupted):

@@ -30,11 +30,11 @@ def full_version() -> str:
     if ".dev" not in __version__:
         return __version__
     commit = _commit(PACKAGE.parent)
-    return f"{__version__}+g{commit}" if commit else f"{__version__}+d{_digest(_files_of_code())}"
+    return f"{__version__}+g{commit}" if commit else f"{__version__}+d{_digest(_list_code_files())}"
 
 
 def list_sources() -> list[str]:
-    """Return names and hashes of all Python files and kernels, which decide what the program computes."""
+    """Return names and hashes of all Python files and kernels, which determine the results."""
     tools = PACKAGE / "data_tools"  # in a wheel; a checkout has it next to the package
     python = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
     kernels = resource_dir("cl_kernels")
@@ -46,7 +46,7 @@ def list_sources() -> list[str]:
     ]
 
 
-def _files_of_code() -> list[str]:
+def _list_code_files() -> list[str]:
     """Return names and hashes of all files of the program, including pipelines, page templates, and data tools."""
     folders = [PACKAGE if name == "clsplat" else resource_dir(name) for name in CODE]
     return [
@@ -64,15 +64,15 @@ def _commit(root: Path) -> str:
     return _git(root, "rev-parse", "--short=7", "HEAD") or ""
 
 
-def _git(root: Path, *words: str) -> str | None:
+def _git(root: Path, *arguments: str) -> str | None:
     """Return the output of git, or None if it fails or is not installed."""
     try:
-        done = subprocess.run(
-            ["git", "--no-optional-locks", "-C", str(root), *words], capture_output=True, timeout=10, check=True
+        completed = subprocess.run(
+            ["git", "--no-optional-locks", "-C", str(root), *arguments], capture_output=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.decode("utf-8", "replace").strip()
+    return completed.stdout.decode("utf-8", "replace").strip()
 
 
 def _digest(lines: Sequence[str]) -> str:

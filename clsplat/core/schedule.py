@@ -23,25 +23,25 @@ from clsplat.core.settings import Settings, in_one_sentence
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step, value
 
 
-def _in_order(points: list[Point]) -> list[Point]:
+def _require_increasing_steps(points: list[Point]) -> list[Point]:
     steps = [step for step, _ in points]
     if not points or steps != sorted(set(steps)):
         raise ValueError("expected points [step, value] with increasing steps")
     return points
 
 
-def _between(points: list[Point], step: int, linear: bool) -> float:
-    (first, value), *rest = points
-    for until, following in rest:
-        if step <= first:
+def _interpolate(points: list[Point], step: int, linear: bool) -> float:
+    (start, value), *later = points
+    for end, end_value in later:
+        if step <= start:
             break
-        if step < until:
-            return value + (following - value) * (step - first) / (until - first) if linear else value
-        first, value = until, following
+        if step < end:
+            return value + (end_value - value) * (step - start) / (end - start) if linear else value
+        start, value = end, end_value
     return value
 
 
-PointList = Annotated[list[Point], AfterValidator(_in_order)]
+PointList = Annotated[list[Point], AfterValidator(_require_increasing_steps)]
 
 
 class Curve(Settings):
@@ -54,7 +54,7 @@ class Curve(Settings):
     @property
     @abstractmethod
     def values(self) -> list[float]:
-        """The values that bounds are checked on, including the smallest and the largest."""
+        """The values to check against bounds, including the smallest and the largest."""
 
     def divide(self, factor: float) -> "Curve":
         """Return the curve with its values divided by a factor.  Raises ConfigError if it does not support that."""
@@ -80,7 +80,7 @@ class Points(Curve):
     """Values between two points: `linear` interpolates, `steps` keeps the earlier value."""
 
     def at(self, step: int) -> float:
-        return _between(self.points, step, linear=self.between == "linear")
+        return _interpolate(self.points, step, linear=self.between == "linear")
 
     @property
     def values(self) -> list[float]:
@@ -105,8 +105,8 @@ class Decay(Curve):
     """Global step at which the decay starts."""
 
     def at(self, step: int) -> float:
-        share = min(max(step - self.start, 0) / self.over, 1.0)
-        return math.exp((1 - share) * math.log(self.initial) + share * math.log(self.final))
+        fraction = min(max(step - self.start, 0) / self.over, 1.0)
+        return math.exp((1 - fraction) * math.log(self.initial) + fraction * math.log(self.final))
 
     @property
     def values(self) -> list[float]:
@@ -117,7 +117,7 @@ class Decay(Curve):
 
 
 class Every(Curve):
-    """A value at every N-th step and 0 at the others, such as a learning rate of rare updates."""
+    """A value at every N-th step and 0 at the others, such as a learning rate for rare updates."""
 
     every: Annotated[int, Field(gt=0)]
     """Interval in steps."""
@@ -188,7 +188,7 @@ AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
 def at_step(schedule: Schedule, step: int) -> float:
     """Return the value of a schedule at a global step."""
     if isinstance(schedule, list):
-        return _between(schedule, step, linear=True)
+        return _interpolate(schedule, step, linear=True)
     return schedule.at(step) if isinstance(schedule, Curve) else schedule
 
 
@@ -226,5 +226,5 @@ def fire_steps(every: float, start: int, stop: int) -> list[int]:
 
 @lru_cache(maxsize=1024)
 def _ratio(every: float) -> tuple[int, int]:
-    """Return the interval as the exact ratio of its decimal notation, so that events that coincide keep coinciding."""
+    """Return the interval as an exact ratio of its decimal notation, so that coinciding events keep coinciding."""
     return Fraction(str(every)).as_integer_ratio()

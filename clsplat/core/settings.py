@@ -42,11 +42,13 @@ class Settings(BaseModel):
     training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the bits then change too
     step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
     keyed_by_type: ClassVar[bool] = False  # a list has each type at most once and is addressed by type
-    rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules that are divided by that scale, so that sums stay
-    family: ClassVar[str] = ""  # a name besides its type by which `conflicts` may refer to it
-    unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, with what to do
+    rate_keys: ClassVar[frozenset[str]] = (
+        frozenset()
+    )  # schedules that are divided by that scale, so that sums stay the same
+    family: ClassVar[str] = ""  # another name, next to its type, that `conflicts` may use
+    unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, each with advice
     conflicts: ClassVar[Mapping[str, str]] = {}
-    """Types or families that exclude this one, in the same stage or outside of stages: `why; what to do`."""
+    """Types or families that exclude this one, in the same stage or outside of stages: `reason; advice`."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
@@ -117,7 +119,7 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
     return {name: text for name, text in texts.items() if name in kind.model_fields}
 
 
-def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
+def variant_tag(kind: type[Settings]) -> tuple[str, str] | None:
     """Return the tag field of a variant and the variant's name, or None for a base class."""
     for tag in TAGS:
         if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
@@ -135,14 +137,14 @@ def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:
     """Return the variants of `base` by name.  Raises ConfigError when two have the same name."""
-    return dict(_named(base, tuple(Settings.defined)))
+    return dict(_variants_by_name(base, tuple(Settings.defined)))
 
 
 @functools.lru_cache(maxsize=256)
-def _named(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
+def _variants_by_name(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
     named: dict[str, type[Base]] = {}
     for kind in defined:
-        if not issubclass(kind, base) or (tag := tag_of(kind)) is None:
+        if not issubclass(kind, base) or (tag := variant_tag(kind)) is None:
             continue
         if tag[1] in named:
             classes = " and ".join(f"{other.__module__}.{other.__name__}" for other in (named[tag[1]], kind))
@@ -152,13 +154,13 @@ def _named(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str,
 
 
 def invalid_variant_reason(kind: type[Settings]) -> str | None:
-    """Return why a class that looks like a variant cannot be used in a pipeline file, or None."""
+    """Return why a class that resembles a variant cannot be used in a pipeline file, or None."""
     if kind.__subclasses__():
         return None
     if missing := sorted(getattr(kind, "__abstractmethods__", ())):
         return f"lacks {', '.join(missing)}"
     bases = [base for base in kind.__mro__[1:] if issubclass(base, Settings) and base is not Settings]
-    tags = [tag for base in bases for other in variants(base).values() if (tag := tag_of(other))]
+    tags = [tag for base in bases for other in variants(base).values() if (tag := variant_tag(other))]
     if not tags:
         return None
     field = kind.model_fields.get(tags[0][0])
@@ -182,7 +184,7 @@ class Variants:
     @property
     def tag(self) -> str:
         """The field that names the variants."""
-        return next((tag[0] for kind in variants(self.base).values() if (tag := tag_of(kind))), TAGS[-1])
+        return next((tag[0] for kind in variants(self.base).values() if (tag := variant_tag(kind))), TAGS[-1])
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         tag = self.tag
@@ -200,33 +202,33 @@ class Variants:
         return {"anyOf": [{"enum": names}, mapping]} if names else mapping
 
 
-def _readable(text: str) -> str:
+def _check_path(text: str) -> str:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
         raise ValueError("expected a path; it contains a character that file names cannot have")
     return text
 
 
 def in_one_sentence(expected: str) -> WrapValidator:
-    """Report errors of a field's notations as one sentence: the first custom message of a validator, or `expected`."""
+    """Report an error in any notation of a field as one sentence: a validator's first message, or `expected`."""
 
-    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
+    def validate_any(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
             return validate(value)
         except ValidationError as error:
             texts = [e["msg"].removeprefix("Value error, ") for e in error.errors() if e["type"] == "value_error"]
             raise ValueError(next((text for text in texts if not expected.startswith(text)), expected)) from None
 
-    return WrapValidator(validated)
+    return WrapValidator(validate_any)
 
 
-InputPath = Annotated[str, AfterValidator(_readable)]  # an input file or folder
+InputPath = Annotated[str, AfterValidator(_check_path)]  # an input file or folder
 
 
 def is_input_path(kind: type[Settings], key: str) -> bool:
     """Return whether a key is the path of an input file or folder."""
     field = kind.model_fields[key]
     return InputPath in (field.annotation, *typing.get_args(field.annotation)) or any(
-        isinstance(item, AfterValidator) and item.func is _readable for item in field.metadata
+        isinstance(item, AfterValidator) and item.func is _check_path for item in field.metadata
     )
 
 

@@ -13,9 +13,9 @@ from typing import Any, NoReturn, TextIO
 
 from clsplat.core.errors import OutputError
 
-NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or its window closes
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or a closed window
 GRACE = 60.0  # seconds to stop after stdin has closed, before the process exits
-IMPORT_SECONDS = 10.0  # at most; a plug-in's import may never end
+IMPORT_SECONDS = 10.0  # longest wait for an import; that of a plug-in may never end
 
 
 class _Received:
@@ -26,7 +26,7 @@ class _Received:
         self.number = 0  # of the last signal; 0: none
         self.since = 0.0  # time of the first signal
 
-    def take(self, number: int) -> None:
+    def record(self, number: int) -> None:
         self.since = self.since if self.number else time.monotonic()
         self.number = number
 
@@ -37,7 +37,7 @@ _received = _Received()
 def exit_on_signals() -> None:
     """Make signals exit the process with a message and exit code 130, except in `stopping_on_signals` blocks.
 
-    This is for startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
+    For startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
     some libraries catch every exception.
     """
     for number in _handlers():
@@ -50,12 +50,12 @@ def _exit(number: int, frame: Any) -> NoReturn:
     os._exit(130)
 
 
-def stop_with_input() -> None:
+def stop_when_stdin_closes() -> None:
     """Stop the process as SIGTERM does when stdin closes: the parent process exited or asked it to stop."""
-    threading.Thread(target=_watch_input, name="input", daemon=True).start()
+    threading.Thread(target=_watch_stdin, name="input", daemon=True).start()
 
 
-def _watch_input() -> None:
+def _watch_stdin() -> None:
     """Wait for the end of stdin with os.read: a pending buffered read would abort the interpreter at exit."""
     with suppress(OSError):
         while os.read(0, 4096):
@@ -80,7 +80,7 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
         return
 
     def handler(number: int, frame: Any) -> None:
-        _received.take(number)
+        _received.record(number)
         stop()
 
     before = _handlers()
@@ -90,8 +90,8 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
         yield
     finally:
-        for number, other in before.items():
-            signal.signal(number, other)
+        for number, previous in before.items():
+            signal.signal(number, previous)
         _received.blocks -= 1
         if not _received.blocks:
             _received.number = 0
@@ -125,7 +125,7 @@ def _signal_again(number: int) -> None:
     _thread.interrupt_main(signal.Signals(number))
 
 
-# stdout and stderr may be closed, full, or gone; writing to them never raises.
+# stdout and stderr may be closed, full, or missing; writing to them never raises.
 
 
 class Stream:
@@ -151,15 +151,15 @@ class Stream:
         return getattr(self._raw, name)
 
     def write(self, text: str) -> int:
-        """Write text; never raises for the state of the stream."""
-        self._do("write", text)
+        """Write text; never raises, even if the stream is closed or broken."""
+        self._call("write", text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream; never raises, even if the stream is closed or broken."""
-        self._do("flush")
+        """Flush the stream; never raises either."""
+        self._call("flush")
 
-    def _do(self, action: str, *arguments: str) -> None:
+    def _call(self, action: str, *arguments: str) -> None:
         stream = self._raw
         if self.fault is not None or stream is None:
             return
@@ -190,7 +190,7 @@ STDOUT, STDERR = Stream("stdout"), Stream("stderr")
 
 
 def install() -> None:
-    """Make printing never fail; closed descriptors are opened on the null device, so that no later file gets them."""
+    """Make printing never fail, and open closed descriptors on the null device, so that no later file gets them."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
@@ -204,13 +204,13 @@ def check_output() -> None:
     """Raise OutputError if stdout could not be written; a pipe closed by its reader is not an error."""
     STDOUT.flush()
     fault = STDOUT.fault
-    if fault is None or _closed_by_reader(fault):
+    if fault is None or _is_closed_by_reader(fault):
         return
     reason = getattr(fault, "strerror", None) or fault
     raise OutputError(f"stdout: cannot be written ({reason}); redirect it elsewhere, or free space")
 
 
-def _closed_by_reader(fault: OSError | ValueError) -> bool:
+def _is_closed_by_reader(fault: OSError | ValueError) -> bool:
     windows = sys.platform == "win32" and getattr(fault, "errno", None) == errno.EINVAL
     return isinstance(fault, BrokenPipeError) or windows
 
@@ -224,7 +224,7 @@ def _silence(stream: Any) -> None:
 
 
 def take_stdin() -> int:
-    """Return a private descriptor of stdin and give runtimes an empty one: on Windows, querying a pipe can block."""
+    """Return a private descriptor of stdin, and give runtimes an empty one: on Windows, querying a pipe can block."""
     pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)
     os.close(empty)
@@ -232,7 +232,7 @@ def take_stdin() -> int:
 
 
 def take_stdout() -> TextIO:
-    """Return a private stdout, and redirect everything that runtimes print there to stderr."""
+    """Return a private stdout, and redirect what OpenCL runtimes print there to stderr."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return out

@@ -24,7 +24,7 @@ from clsplat.core.resources import full_version
 LOG = logging.getLogger("clsplat")
 CONSOLE = Console(file=signals.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 ERRORS = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
-_bars: list[Live] = []  # visible now
+_bars: list[Live] = []  # currently visible
 
 
 class StatusSource(Protocol):
@@ -44,7 +44,7 @@ class _TerminalHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         warning = record.levelno >= logging.WARNING
         console = ERRORS if warning else self.console
-        if _bars and console.is_terminal:  # otherwise the line would be glued to the bar
+        if _bars and console.is_terminal:  # a line on another console would run into the bar
             console = CONSOLE
         console.print(("warning: " if warning else "") + record.getMessage(), markup=False)
 
@@ -59,7 +59,7 @@ def start_logging(debug: bool, console: Console = CONSOLE) -> None:
 
 
 def keep_stdout_for_json() -> None:
-    """Log to stderr from now on, so that stdout has only JSON."""
+    """Log to stderr from now on, so that stdout contains only JSON."""
     for handler in LOG.handlers:
         if isinstance(handler, _TerminalHandler):
             handler.console = ERRORS
@@ -137,11 +137,11 @@ def logging_to(path: Path) -> Iterator[None]:
 def progress_line(progress: TrainingProgress) -> str:
     """Format the progress at a step as one line."""
     p = progress
-    least = "" if p.growth_known else "at least "
+    prefix = "" if p.growth_known else "at least "
     count = "" if p.gaussians is None else f"gaussians {p.gaussians:,}  "
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  {count}"
-        f"{p.milliseconds:.1f} ms/step  {least}{clock(p.seconds_left)} left"
+        f"{p.milliseconds:.1f} ms/step  {prefix}{clock(p.seconds_left)} left"
     )
 
 
@@ -166,13 +166,13 @@ def progress_bar(status: StatusSource) -> Iterator[Callable[[TrainingProgress], 
         yield lambda progress: LOG.info(progress_line(progress))
         return
     bar = _RunBar(status)
-    with _drawn(bar):
+    with _draw(bar):
         yield bar.report
 
 
 @contextmanager
 def counts_on_terminal() -> Iterator[None]:
-    """Show the progress of counted work in the block if the output is a terminal; otherwise it is only logged."""
+    """Show the progress of counted work in the block if the output is a terminal; otherwise, only log it."""
     if not CONSOLE.is_terminal:
         yield
         return
@@ -183,7 +183,7 @@ def counts_on_terminal() -> Iterator[None]:
         left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
         bar.update(task, total=total, completed=done, description=f"{label}: {done} of {total}{left}", visible=True)
 
-    with _drawn(bar), listening(update):
+    with _draw(bar), listening(update):
         yield
 
 
@@ -202,17 +202,17 @@ class _RunBar:
 
     def __rich__(self) -> Progress:
         now = self.status.now
-        stage, amount, done, total = now.stage or "", now.progress, now.step or 0, now.steps
-        if amount is None:
+        stage, count, done, total = now.stage or "", now.progress, now.step or 0, now.steps
+        if count is None:
             self.bar.update(self.task, total=None, completed=0, description=stage)
-        elif amount.unit == "steps" and total:
-            self.bar.update(self.task, total=total, completed=done, description=self._training(done, total))
+        elif count.unit == "steps" and total:
+            self.bar.update(self.task, total=total, completed=done, description=self._training_text(done, total))
         else:
-            text = f"{stage}: {amount.done} of {amount.total} {amount.unit}"
-            self.bar.update(self.task, total=amount.total, completed=amount.done, description=text)
+            text = f"{stage}: {count.done} of {count.total} {count.unit}"
+            self.bar.update(self.task, total=count.total, completed=count.done, description=text)
         return self.bar
 
-    def _training(self, step: int, steps: int) -> str:
+    def _training_text(self, step: int, steps: int) -> str:
         time_now = time.monotonic()
         if self.last and self.last[1].steps == steps:
             since, report = self.last
@@ -230,7 +230,7 @@ def _new_bar() -> Progress:
 
 
 @contextmanager
-def _drawn(bar: "Progress | _RunBar") -> Iterator[None]:
+def _draw(bar: "Progress | _RunBar") -> Iterator[None]:
     """Draw a bar several times a second during the block; log lines appear above it."""
     with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_as_debug():
         _bars.append(live)

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-WIDE = 1 << 20  # columns, so that nothing is wrapped or cut, whatever the terminal's width
+WIDTH = 1 << 20  # characters, so that no line is wrapped, whatever the terminal's width
 
 
 def text_table(rows: Iterable[Sequence[str]], left: int = 0) -> str:
@@ -16,5 +16,5 @@ def text_table(rows: Iterable[Sequence[str]], left: int = 0) -> str:
         table.add_row(*map(Text, row))  # `Text` keeps brackets from being parsed as markup
     for column in table.columns[left:]:
         column.justify = "right"
-    lines = Console(width=WIDE, color_system=None).render_lines(table, pad=False)
+    lines = Console(width=WIDTH, color_system=None).render_lines(table, pad=False)
     return "\n".join("".join(segment.text for segment in line).rstrip() for line in lines)

@@ -227,7 +227,7 @@ def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
     """Also after a change of the folder."""
     first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
     start = {"now": "1"}
-    monkeypatch.setattr("clsplat.core.machine._boot", lambda: start["now"])
+    monkeypatch.setattr("clsplat.core.machine._boot_id", lambda: start["now"])
 
     def cut(file: Path) -> bool:
         """Return whether a new process finds a truncated kernel."""

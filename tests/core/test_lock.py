@@ -213,7 +213,7 @@ def test_killed_start_does_not_change_the_default_folder(tmp_path):
 
 def test_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
     """Without locks, it would look like a leftover of an earlier process with the same ID."""
-    locked, waiting, go_on = lock._locked, threading.Event(), threading.Event()
+    locked, waiting, go_on = lock._acquire, threading.Event(), threading.Event()
 
     def slow(path, folder):
         if threading.current_thread() is thread:
@@ -225,7 +225,7 @@ def test_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
         with lock.lock_folder(tmp_path):
             pass
 
-    monkeypatch.setattr(lock, "_locked", slow)
+    monkeypatch.setattr(lock, "_acquire", slow)
     thread = threading.Thread(target=hold)
     thread.start()
     try:

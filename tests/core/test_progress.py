@@ -75,7 +75,7 @@ def test_nested_listeners_all_hear(now):
 
 
 def test_uncounted_work_is_polled(monkeypatch):
-    monkeypatch.setattr(progress, "FIRST_POLL", 0.001)
+    monkeypatch.setattr(progress, "MIN_POLL_INTERVAL", 0.001)
     heard, seen = [], threading.Event()
 
     def listen(what, done, total, /, *, seconds_left):

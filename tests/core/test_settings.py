@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.settings import OneOf, Settings, descriptions, rebuild_models, tag_of, variants
+from clsplat.core.settings import OneOf, Settings, descriptions, rebuild_models, variant_tag, variants
 from clsplat.density.edit import Edit, Rule
 from clsplat.losses.base import ImageLoss, Loss, Penalty
 from clsplat.photos.sampling import Order, ShuffleOrder
@@ -56,8 +56,8 @@ def test_variants_are_the_subclasses_with_a_name():
     assert variants(Loss).keys() == images | penalties
     assert variants(Loss).keys() == variants(ImageLoss).keys() | variants(Penalty).keys()
     assert variants(Order)["shuffle"] is ShuffleOrder
-    assert tag_of(ShuffleOrder) == ("type", "shuffle")
-    assert tag_of(Order) is None, "a base is no variant"
+    assert variant_tag(ShuffleOrder) == ("type", "shuffle")
+    assert variant_tag(Order) is None, "a base is no variant"
     assert {"densify", "evaluate", "checkpoint"} <= variants(Scheduled).keys() < variants(Stage).keys()
 
 

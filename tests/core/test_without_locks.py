@@ -50,7 +50,7 @@ def test_missing_locks_warn_and_a_dead_owner_is_replaced(tmp_path, without_locks
 def test_owner_from_before_a_reboot_has_ended(tmp_path, without_locks, monkeypatch):
     """Its number is that of a living process by now."""
     monkeypatch.setattr(machine, "_pid_namespace", lambda: machine.FIRST_PID_NAMESPACE)
-    monkeypatch.setattr(machine, "_boot", lambda: "now")
+    monkeypatch.setattr(machine, "_boot_id", lambda: "now")
     owned_by(tmp_path, process=os.getppid(), boot="before")
     with lock.lock_folder(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["boot"] == "now"
@@ -70,7 +70,7 @@ def test_incomplete_lock_counts_as_held(tmp_path, without_locks):
 def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monkeypatch):
     """Two processes find the same dead owner; the slower one finds the file of the other in its place."""
     owned_by(tmp_path, process=NONE)
-    has_ended = lock._has_ended
+    has_ended = lock._has_exited
 
     def slow(owner):
         ended = has_ended(owner)
@@ -79,7 +79,7 @@ def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monk
             owned_by(tmp_path, process=os.getppid())
         return ended
 
-    monkeypatch.setattr(lock, "_has_ended", slow)
+    monkeypatch.setattr(lock, "_has_exited", slow)
     with pytest.raises(OutputError, match=f"in use by process {os.getppid()} on"), lock.lock_folder(tmp_path):
         pass
     assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getppid()

@@ -294,7 +294,7 @@ matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
 
 def test_counting_pairs_loses_none(mapped, tmp_path, monkeypatch):
     """A reader in pycolmap's own process would release the locks of its writes."""
-    monkeypatch.setattr(progress, "FIRST_POLL", 0.01)
+    monkeypatch.setattr(progress, "MIN_POLL_INTERVAL", 0.01)
     heard: set[int] = set()
     with listening(lambda what, done, total, seconds_left: heard.add(done)):
         match_features(mapped.parent / "features", tmp_path)
