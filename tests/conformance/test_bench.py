@@ -66,8 +66,15 @@ def test_case_has_no_edits_due_and_is_timed_after_warm_up(device):
     assert not timed.clock
     assert not timed.stages
     timed.step(record=True)
-    assert len(timed.clock) == 1
+    timed.repeat()
+    assert len(timed.clock) == len(timed.steps) == 1
     assert all(len(times) == 1 for times in timed.stages.values())
+
+
+def test_case_sorts_as_its_pipeline_does(device):
+    for sort in ("radix", "bitonic"):
+        timed = case(device, *SIZE, load("smoke", [f"rasterizer.sort={sort}"]).settings)
+        assert timed.trainer.rasterizer.tiler.sort == sort
 
 
 PEAKS = {"gflops": 60.0, "gexp": 3.0, "gbytes": 10.0}
@@ -138,6 +145,7 @@ def test_table_of_a_scene_has_a_row_for_each_stage():
         floors={"project": 0.5},
         host=1.0,
         step=22.0,
+        steps=20.0,
         densify=3.0,
         memory=2**24,
         planned=2**25,
@@ -149,5 +157,5 @@ def test_table_of_a_scene_has_a_row_for_each_stage():
         ["project", "1.20", "0.50", "2.40", "2.40", "0.50"],
         ["blend", "30.00"],
     ]
-    assert [line[0] for line in lines[4:]] == ["host", "step", "densify", "memory"]
+    assert [line[0] for line in lines[4:]] == ["host", "step", "steps", "densify", "memory"]
     assert table("A", result, None).splitlines()[1].split() == ["stage", "ms", "floor", "ratio"]

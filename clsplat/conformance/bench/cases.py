@@ -119,6 +119,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
 
 
 SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
+STEPS = 5  # without a wait between them
 WARM_UP_STEPS = 3  # compile kernels and grow buffers
 TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; at a rate of 0, harmonics are not updated
 
@@ -130,7 +131,8 @@ class BenchResult:
     work: Work
     stages: dict[str, float]
     floors: dict[str, float]
-    step: float  # on the clock
+    step: float  # on the clock, with a wait for the device after each step
+    steps: float  # of one of `STEPS` steps without a wait between them, as in a training
     densify: float
     host: float  # time of the step minus that of the device's stages
     memory: int  # bytes on the device, the peak
@@ -157,7 +159,7 @@ class BenchCase:
         rates: dict[str, Any] = dict.fromkeys(PARAMETERS, TINY_RATE)
         motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, TINY_RATE))
         self.trainer = StepTrainer(
-            Rasterizer(device, "radix"),
+            Rasterizer(device, settings.rasterizer.sort),
             model,
             Adam(gaussians),
             SplatStats(gaussians, optimize.statistics),
@@ -167,6 +169,7 @@ class BenchCase:
             rows=optimize.update,
         )
         self.clock: list[float] = []
+        self.steps: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)
         self.densify: list[float] = []
         self.frame: Frame | None = None
@@ -191,6 +194,15 @@ class BenchCase:
             for name, milliseconds in stage_milliseconds(self.device.timings).items():
                 self.stages[name].append(milliseconds)
 
+    def repeat(self) -> None:
+        """Do `STEPS` training steps without a wait between them; record the mean time."""
+        self.device.finish()
+        start = time.perf_counter()
+        for _ in range(STEPS):
+            self.trainer.step(self.photograph, 1)
+        self.device.finish()
+        self.steps.append(1e3 * (time.perf_counter() - start) / STEPS)
+
     def edit(self) -> None:
         """Do one density edit that rearranges all tables and changes nothing."""
         self.device.finish()
@@ -206,8 +218,10 @@ class BenchCase:
         stages = {name: statistics.median(times) for name, times in self.stages.items()}
         clock = statistics.median(self.clock)
         host = clock - sum(stages.values())
-        densify_ms, planned = statistics.median(self.densify[1:]), self._planned()
-        return BenchResult(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
+        steps, densify_ms = statistics.median(self.steps), statistics.median(self.densify[1:])
+        return BenchResult(
+            work, stages, floors(work, peaks), clock, steps, densify_ms, host, self.memory, self._planned()
+        )
 
     def _planned(self) -> int:
         camera = self.photograph.camera
@@ -235,6 +249,7 @@ def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[s
     for _ in range(repeats):
         for case in cases.values():
             case.step(record=True)
+            case.repeat()
     for case in cases.values():
         for _ in range(3):
             case.edit()

@@ -18,6 +18,7 @@ from clsplat.pipeline.loading import load
 
 EXPECTED = "the JSON of an earlier `clsplat bench --json`"
 UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
+WHOLE = {"host": "host", "step": "step", "steps without waits": "steps", "densify": "densify"}  # rows, and their keys
 MAX_PEAK_RATIO = 1.1  # largest ratio of two peaks for times to be comparable
 
 
@@ -31,6 +32,7 @@ class _Times(BaseModel):
     stages: dict[str, float]
     host: float
     step: float
+    steps: float = 0.0  # missing in old files
     densify: float
 
 
@@ -84,12 +86,9 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
     work, mib = result.work, 2**20
     counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
     rows = [(stage, ms, result.floors.get(stage)) for stage, ms in result.stages.items()]
-    rows += [
-        ("host", result.host, None),
-        ("step", result.step, sum(result.floors.values())),
-        ("densify", result.densify, None),
-    ]
-    was = {**earlier["stages"], **{key: earlier[key] for key in ("host", "step", "densify")}} if earlier else {}
+    whole = sum(result.floors.values())
+    rows += [(row, getattr(result, key), whole if "step" in row else None) for row, key in WHOLE.items()]
+    was = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in WHOLE.items()}} if earlier else {}
     cells = [["stage", "ms", "floor", "ratio", *(("was", "now/was") if earlier else ())]]
     for stage, ms, floor in rows:
         ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
