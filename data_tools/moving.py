@@ -87,7 +87,7 @@ def shapes_at(time: float) -> tuple[Shape, ...]:
 
 @dataclass(frozen=True)
 class Moving(SyntheticOptions):
-    """Options of the scene that moves: image size in pixels, training and test cameras, moments, seed of the points."""
+    """Options of the dynamic scene: image size in pixels, training and test cameras, moments, seed of the points."""
 
     size: int = 160
     train: int = 10

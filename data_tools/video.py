@@ -31,7 +31,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
 
     The format is PNG because a second lossy coding changes features and colors.  An interrupted call continues: frames
-    of the same video and settings stay unchanged.  times: also write times.json, of a scene that moves: the number of
+    of the same video and settings stay unchanged.  times: also write times.json, of a dynamic scene: the number of
     each frame in the video.
     Raises DataError when the video cannot be decoded, or has one frame, as a picture has, and when `out` holds other
     images, which would mix with frames.

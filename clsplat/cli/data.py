@@ -53,7 +53,7 @@ def synthetic(
     given = {"size": size, "train": train, "test": test, "times": times}
     found = {name: value for name, value in given.items() if value is not None}
     if times is not None and not moving:
-        raise ConfigError("--times is for a scene that moves; give --moving, too")
+        raise ConfigError("--times needs a dynamic scene; add --moving")
     print(write_dataset(out, Moving(seed=seed, **found) if moving else SyntheticOptions(seed=seed, **found)))
 
 
@@ -92,7 +92,7 @@ def video(
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
     times: Annotated[
-        bool, typer.Option("--times", help="Of a scene that moves: also times.json, when each frame was taken.")
+        bool, typer.Option("--times", help="For a dynamic scene: also write times.json, the time of each frame.")
     ] = False,
 ) -> None:
     """Take sharp frames of a video, with the same motion between them."""

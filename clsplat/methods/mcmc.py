@@ -72,7 +72,8 @@ def divide(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor on their scales (eqs. 8, 9).
 
-    Together they have the opacity of the original at its center and the same integral along a line.
+    Together they have the opacity of the original at its center and the same integral along a line.  The published code clips
+    opacities after it has computed the scales; here, the scales belong to the clipped opacities.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
     orders = range(1, MAX_COPIES + 1)
@@ -84,7 +85,8 @@ class AddNoise(Scheduled):
     """Add noise to the means, proportional to each Gaussian's covariance; opaque Gaussians do not move.
 
     The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n three standard normal numbers; it
-    vanishes 0.1 above that opacity.  Dividing by the extent makes the rate independent of the unit of length.
+    vanishes 0.1 above that opacity.  The published code multiplies by the extent; dividing by it makes the rate
+    independent of the unit of length.
     """
 
     stage: Literal["add_noise"] = "add_noise"
@@ -93,7 +95,7 @@ class AddNoise(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "opacity_below"})
 
     rate: NonNegative = 80.0
-    """Scale of the noise; published: 5e5 times the learning rate of the means."""
+    """Scale of the noise. Published: 5e5 times the learning rate of the means, times the squared extent."""
     opacity_below: Positive = 0.005
     """Opacity at which the noise is half as strong."""
 

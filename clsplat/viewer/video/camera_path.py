@@ -2,7 +2,7 @@
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
 camera_path  one entry per frame: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical),
-             aspect, render_time (0 to 1, in a scene that moves)
+             aspect, render_time (0 to 1, in a dynamic scene)
 """
 
 import logging
