@@ -72,8 +72,8 @@ def divide(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor on their scales (eqs. 8, 9).
 
-    Together they have the opacity of the original at its center and the same integral along a line.  The published code clips
-    opacities after it has computed the scales; here, the scales belong to the clipped opacities.
+    Together they have the opacity of the original at its center and the same integral along a line.  The published code
+    clips opacities after it has computed the scales; here, the scales belong to the clipped opacities.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
     orders = range(1, MAX_COPIES + 1)

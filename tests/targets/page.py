@@ -71,10 +71,10 @@ def _summary(table: Table, simt: Table) -> str:
     scalar = sorted({f"`{p.kernel}` on {p.target}" for p, of in simt.items() if of.counts.get("scalar spills")})
     group, local = max(of.group for of in simt.values()), max(of.local for of in simt.values())
     lines = [
-        f"All {len(kernels)} kernels compile for all {len(targets)} GPUs, in both schedules, but for the known faults",
+        f"All {len(kernels)} kernels compile for all {len(targets)} GPUs, in both schedules, except for known faults",
         "below. In *simt*, the schedule of GPUs, no vector register spills into memory, a group has at most",
         f"{group} items ({MAX_GROUP} are allowed) and {local} bytes of local memory ({MAX_LOCAL} are allowed).",
-        f"*wide*, which no GPU takes by itself, spills in {len(spilling)} of them." if spilling else "",
+        f"*wide*, which no GPU uses by default, spills in {len(spilling)} of them." if spilling else "",
         f"AMD's scalar registers overflow into vector registers in {', '.join(scalar)}." if scalar else "",
     ]
     return "\n".join(filter(None, lines))

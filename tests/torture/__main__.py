@@ -58,8 +58,8 @@ def killed(count: int, folder: Path) -> Row:
         print(f"\r{dict(tally)}", end="", flush=True)
     print()
     result = (
-        f"{tally['equal']} of {tally['finished']} runs ended with the undisturbed bits; "
-        f"{tally['in a write']} kills met a write"
+        f"{tally['equal']} of {tally['finished']} runs ended with the bits of an undisturbed run; "
+        f"{tally['in a write']} kills happened during a write"
     )
     holds = tally["equal"] == tally["finished"] > 0
     return Row(
@@ -113,13 +113,13 @@ def main() -> int:
     for what, (file, *only), share in READERS:
         count = max(1, int(share * options.inputs))
         rows.append(
-            tested(f"damaged {what}", "each read or refused in one sentence", count, f"tests/fuzz/{file}", *only)
+            tested(f"damaged {what}", "each read, or rejected in one sentence", count, f"tests/fuzz/{file}", *only)
         )
-    same = "nothing lost, and resumed to the same bits"
-    rows.append(tested("a write that fails, every one of a run", same, 1, "tests/runs/test_failing_writes.py"))
+    same = "nothing lost; resumed to the same bits"
+    rows.append(tested("a failing write, for each write of a run", same, 1, "tests/runs/test_failing_writes.py"))
     rows.append(
         tested(
-            "`kill -9` at each file, on either side of its rename",
+            "`kill -9` at each file, before and after its rename",
             same,
             1,
             "tests/torture/test_torture.py",
@@ -127,7 +127,7 @@ def main() -> int:
             "whichever_file",
         )
     )
-    table = "\n".join(["| what | cases | seen | time |", "|---|---|---|---|", *(row.text for row in rows)])
+    table = "\n".join(["| test | cases | result | time |", "|---|---|---|---|", *(row.text for row in rows)])
     print(table)
     if options.write:
         head, _, rest = PAGE.read_text().partition(BEGIN)
