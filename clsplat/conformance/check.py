@@ -27,7 +27,7 @@ class Deviation:
     label: str  # the values that were compared
     value: float
     bound: float
-    counts: bool = False  # whether `value` is a number of wrong values, else it is a difference
+    counts: bool = False  # whether `value` is a number of wrong values instead of a difference
 
     @property
     def passes(self) -> bool:
@@ -64,23 +64,23 @@ def by_element(
 
 
 def equal(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
-    """Count the values that are not exactly as expected."""
+    """Count the values that differ from `expected`."""
     return wrong(kernel, label, value != expected)
 
 
 def wrong(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
-    """Count the values of a mask that are True."""
+    """Count the True values of a mask."""
     return Deviation(kernel, label, float(np.count_nonzero(mask)), allowed, counts=True)
 
 
 def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
-    """Compare images, [C, H, W], and allow a few pixels in which a splat falls on the other side of a threshold.
+    """Compare images, [C, H, W]; in a few pixels, a splat may be on the other side of a threshold.
 
-    One splat more or less changes a pixel by up to 1/255 of its color, and colors reach 3.
+    One splat more or less changes a pixel by up to 1/255 of its color, and colors are at most 3.
     """
     difference = np.abs(value - expected).max(axis=0)
     yield Deviation(kernel, f"{label}: largest difference", float(difference.max()), 1.5e-2)
-    yield Deviation(kernel, f"{label}: share of pixels off by 2e-5", float(np.mean(~(difference <= 2e-5))), 2e-3)
+    yield Deviation(kernel, f"{label}: fraction of pixels off by 2e-5", float(np.mean(~(difference <= 2e-5))), 2e-3)
     yield Deviation(kernel, f"{label}: median difference", float(np.median(difference)), 1e-6)
 
 

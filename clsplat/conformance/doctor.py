@@ -30,7 +30,7 @@ REMEDY = f"update the device's driver or use another device (`clsplat devices` l
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether to use a device, and how."""
+    """Whether a device is usable, and how."""
 
     usable: bool
     text: str
@@ -59,14 +59,14 @@ def _judge_failures(
     if good and (default in good or default not in failures):
         return _judge_default(failures, others)
     if good:
-        why = f"with the {default} schedule, {failures[default][0]}"
-        return Verdict(True, f"use it with --set rasterizer.schedule={good[0]}: {why}", REMEDY)
+        reason = f"with the {default} schedule, {failures[default][0]}"
+        return Verdict(True, f"use it with --set rasterizer.schedule={good[0]}: {reason}", REMEDY)
     wrong = [result for result in schedules[default] if not result.passes]
     if all(_is_bitonic(result) for result in wrong):
         return Verdict(True, f"use it with --set rasterizer.sort=radix: {failures[default][0]}", REMEDY)
     first, more = failures[default][0], sum(map(len, failures.values())) - 1
-    rest = f"; {pluralize(more, 'more failure')}" if more else ""
-    return Verdict(False, f"do not use it: {first}{rest}", REMEDY)
+    others_text = f"; {pluralize(more, 'more failure')}" if more else ""
+    return Verdict(False, f"do not use it: {first}{others_text}", REMEDY)
 
 
 def _judge_default(failures: Mapping[str, list[str]], others: list[str]) -> Verdict:
@@ -89,12 +89,12 @@ GIB = 2**30
 
 @dataclass
 class DeviceReport:
-    """What `clsplat.doctor` returns."""
+    """The result of `clsplat.doctor`."""
 
     info: DeviceInfo
     default: str  # the default schedule
     schedules: dict[str, list[CheckResult]] = field(default_factory=dict)
-    once: list[CheckResult] = field(default_factory=list)  # memory and speed, with the default schedule
+    once: list[CheckResult] = field(default_factory=list)  # memory and speed, only with the default schedule
     seconds: float = 0.0
 
     @property
@@ -128,8 +128,8 @@ class DeviceReport:
             "verdict": {"usable": verdict.usable, "text": verdict.text, "advice": verdict.advice},
             "device": {**asdict(self.info), "schedule": self.default},
             "host": system(),
-            "schedules": {name: [_plain(result) for result in results] for name, results in self.schedules.items()},
-            "once": [_plain(result) for result in self.once],
+            "schedules": {name: [_to_plain(result) for result in results] for name, results in self.schedules.items()},
+            "once": [_to_plain(result) for result in self.once],
             "seconds": round(self.seconds, 1),
         }
 
@@ -138,9 +138,9 @@ class DeviceReport:
         verdict, lines = self.verdict, [f"device    {self.info.text}, driver {self.info.driver}"]
         for name, results in self.schedules.items():
             lines.append(f"{name:<9} {summary(results)}")
-            lines += _listed(self.failures[name])
+            lines += _failure_lines(self.failures[name])
         lines += [f"{name:<9} {text}" for name, text in (("memory", self.memory()), ("speed", self.speed())) if text]
-        lines += _listed(self.failures[""])
+        lines += _failure_lines(self.failures[""])
         lines.append(f"verdict   {verdict.text}")
         if verdict.advice:
             lines.append(f"advice    {verdict.advice}")
@@ -179,13 +179,13 @@ def summary(results: list[CheckResult]) -> str:
     return f"{len(results)} checks, {len(deviations)} comparisons: {outcome} ({seconds:.0f} s)"
 
 
-def _listed(failures: list[str]) -> list[str]:
+def _failure_lines(failures: list[str]) -> list[str]:
     more = len(failures) - MAX_FAILURES
     lines = [f"          {text}" for text in failures[:MAX_FAILURES]]
     return [*lines, f"          … and {more} more"] if more > 0 else lines
 
 
-def _plain(result: CheckResult) -> dict[str, Any]:
+def _to_plain(result: CheckResult) -> dict[str, Any]:
     deviations = [
         {
             **asdict(deviation),
@@ -226,9 +226,9 @@ def examine(device: str | Device | None = None) -> DeviceReport:
 
 
 def _is_due(schedule: str, report: DeviceReport) -> bool:
-    """Run simt everywhere, and wide where it is the default or where a CPU computes wrongly with simt.
+    """Return whether to check a schedule: simt always, wide where it is the default or a CPU fails with simt.
 
-    Elsewhere nobody would use wide, and some compilers need many minutes for its vectors.
+    Other devices have no use for wide, and some compilers take many minutes for its vectors.
     """
     if schedule == "simt" or report.default == "wide":
         return True
@@ -248,7 +248,7 @@ def progress(schedule: str, result: CheckResult) -> str:
 
 
 def check_html_path(out: Path) -> None:
-    """Raise ConfigError for a path that is no .html file or belongs to a run, OutputError if it cannot be written."""
+    """Raise ConfigError if a path is not an .html file or belongs to a run, OutputError if it cannot be written."""
     check_result_path(out, ".html")
     with raising_output_error(out):
         if out.is_dir():
@@ -259,7 +259,7 @@ def check_html_path(out: Path) -> None:
 
 
 def write_page(report: DeviceReport, out: Path) -> None:
-    """Write the page.  Raises OutputError when that fails."""
+    """Write the report as HTML.  Raises OutputError."""
     write_text(out, report_page(report))
 
 

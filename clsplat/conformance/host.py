@@ -1,4 +1,4 @@
-"""Describe the host: its system, and the environment variables that concern OpenCL."""
+"""Describe the host: its system, and the environment variables of OpenCL runtimes."""
 
 import os
 import platform
@@ -17,7 +17,7 @@ PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_
 
 
 def system() -> dict[str, Any]:
-    """Return what a bug report needs to know about the host; only variables that concern OpenCL."""
+    """Describe the host for a bug report, with only the environment variables of OpenCL runtimes."""
     return {
         "clsplat": full_version(),
         "system": platform.platform(),
@@ -31,7 +31,7 @@ def system() -> dict[str, Any]:
 
 
 def code_variables() -> dict[str, str]:
-    """Return the variables that may change what compilers and runtimes make of the same kernels."""
+    """Return the environment variables that may change how compilers and runtimes build kernels."""
     neutral = (*CACHES, *machine.THREAD_VARIABLES)
     return {name: value for name, value in _variables(CODE).items() if not name.startswith(neutral)}
 

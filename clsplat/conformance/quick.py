@@ -16,14 +16,14 @@ from clsplat.core.files import write_text
 from clsplat.core.machine import cache_folder
 from clsplat.core.resources import __version__, resource_dir
 from clsplat.opencl.device import BUILD_OPTIONS, Device, open_device
-from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
+from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_macros
 from clsplat.opencl.kernel_caches import kernel_cache_advice
 from clsplat.render.tiles import Sort, resolve_sort
 
 LOG = logging.getLogger("clsplat")
-TIMEOUT_S = 300  # longest silence of a check
+TIMEOUT_S = 300  # longest time without output from a check
 Resolved = Literal["wide", "simt"]
-SORTS = ("radix", "bitonic")  # each has its record
+SORTS = ("radix", "bitonic")  # each has a record
 
 
 def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
@@ -48,7 +48,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     sorts = SORTS if bitonic else SORTS[:1]
     if all(_record(info, schedule, name).exists() for name in sorts):
         return
-    from clsplat.conformance.checks import BITONIC, ESSENTIAL  # not at the top: a known device does not need them
+    from clsplat.conformance.checks import BITONIC, ESSENTIAL  # slow to import, and not needed for a verified device
 
     LOG.info("checking %s; this takes a few seconds, longer if it compiles slowly", info.name)
     for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], TIMEOUT_S):
@@ -57,8 +57,8 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
         if result.damaged_cache:
             raise DeviceError(f"{device.text}: {kernel_cache_advice()}")
         if not result.passes:
-            how = "cannot be trusted" if result.fault else "computes wrongly"
-            raise DeviceError(f"{device.text} {how}: {result.failures[0]}; run `clsplat doctor` for details")
+            verdict = "cannot be trusted" if result.fault else "computes wrongly"
+            raise DeviceError(f"{device.text} {verdict}: {result.failures[0]}; run `clsplat doctor` for details")
     remember(info, schedule, sorts)
 
 
@@ -77,26 +77,26 @@ def forget(info: DeviceInfo, schedule: Resolved) -> None:
 
 
 def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
-    """Return a file whose name depends on all that affects the result: checks, driver, kernels and build options."""
-    checks = (__version__, _hash_of_checks())
+    """Return a file whose name depends on all that affects the result: checks, driver, kernels, build options."""
+    checks = (__version__, _hash_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))
-    build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
+    build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_macros(info, schedule).items()), _hash_kernels())
     key = repr((checks, device, build, code_variables()))
     return cache_folder() / "conformance" / hashlib.sha256(key.encode()).hexdigest()[:16]
 
 
 @cache
-def _hash_of_kernels() -> str:
-    return _hash_of(resource_dir("cl_kernels").iterdir())
+def _hash_kernels() -> str:
+    return _hash_files(resource_dir("cl_kernels").iterdir())
 
 
 @cache
-def _hash_of_checks() -> str:
+def _hash_checks() -> str:
     here = Path(__file__).parent
-    return _hash_of(path for folder in ("checks", "reference") for path in (here / folder).glob("*.py"))
+    return _hash_files(path for folder in ("checks", "reference") for path in (here / folder).glob("*.py"))
 
 
-def _hash_of(files: Iterable[Path]) -> str:
+def _hash_files(files: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for path in sorted(files):
         digest.update(path.name.encode() + path.read_bytes())

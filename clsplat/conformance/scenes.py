@@ -1,4 +1,4 @@
-"""Make small random scenes for the kernels and the reference."""
+"""Generate small random scenes for the kernels and the reference."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.
 
 @dataclass(frozen=True)
 class Case:
-    """N Gaussians in front of one camera, in float32, so that kernels and reference use the same numbers."""
+    """N Gaussians in front of one camera, in float32, so that kernels and reference use the same values."""
 
     parameters: dict[str, NDArray[Any]]  # [N, components] float32
     view: View
@@ -73,18 +73,18 @@ class Case:
     def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
         splats = ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
         if self.dropout:
-            dropped = ref.dropped(**vars(self.dropout), count=len(splats.visible))
+            dropped = ref.drop_mask(**vars(self.dropout), count=len(splats.visible))
             for values in (values for values in vars(splats).values() if isinstance(values, np.ndarray)):
                 values[dropped] = 0
         return splats
 
 
 def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: Any) -> Case:
-    """Return Gaussians of a few pixels, spread over the view and slightly beyond it."""
+    """Return `count` Gaussians of a few pixels, spread over the view and slightly beyond it."""
     focal = 0.9 * width
     depth = rng.uniform(1.5, 6, count)
-    across = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
-    in_camera = np.stack([across[:, 0] * depth, across[:, 1] * depth, depth], axis=1)
+    offsets = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
+    in_camera = np.stack([offsets[:, 0] * depth, offsets[:, 1] * depth, depth], axis=1)
     rotation, translation = _orthogonal(EYE[:, :3]), EYE[:, 3]
     parameters = {
         "means": (in_camera - translation) @ rotation,
@@ -99,23 +99,23 @@ def random_case(rng: np.random.Generator, count: int, width: int = 40, height: i
     return replace(Case({k: v.astype(np.float32) for k, v in parameters.items()}, view), **changes)
 
 
-def with_world_filter(case: Case, rng: np.random.Generator) -> Case:
+def add_world_filter(case: Case, rng: np.random.Generator) -> Case:
     """Return the same Gaussians with a 3D filter of about half their size."""
     sizes = np.exp(case.parameters["log_scales"].mean(axis=1, keepdims=True))
     variance = (sizes * rng.uniform(0.2, 0.8, sizes.shape)) ** 2
     return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
 
 
-def needles(rng: np.random.Generator, count: int, aspect: float, **changes: Any) -> Case:
-    """Return Gaussians that are nearly parallel to the image, with this ratio of axes on the screen after filtering."""
+def needle_case(rng: np.random.Generator, count: int, aspect: float, **changes: Any) -> Case:
+    """Return Gaussians nearly parallel to the image, with `aspect` as the ratio of screen axes after filtering."""
     case = random_case(rng, count, **changes)
     pose, focal, p = case.view.world_to_camera, case.view.camera.fx, case.parameters
     depth = p["means"] @ pose[2, :3] + pose[2, 3]
-    short = np.exp(rng.normal(-0.7, 0.1, (count, 3)))  # px
-    short[:, 0] = aspect * np.sqrt(short[:, 1] ** 2 + case.variance)
-    turns = Rotation.from_euler("zyx", rng.uniform([-np.pi, -0.2, -0.2], [np.pi, 0.2, 0.2], (count, 3)))
-    p["quats"][:] = (Rotation.from_matrix(pose[:, :3].T) * turns).as_quat(scalar_first=True)
-    p["log_scales"][:] = np.log(short / focal * depth[:, None])
+    sizes = np.exp(rng.normal(-0.7, 0.1, (count, 3)))  # px
+    sizes[:, 0] = aspect * np.sqrt(sizes[:, 1] ** 2 + case.variance)
+    rotations = Rotation.from_euler("zyx", rng.uniform([-np.pi, -0.2, -0.2], [np.pi, 0.2, 0.2], (count, 3)))
+    p["quats"][:] = (Rotation.from_matrix(pose[:, :3].T) * rotations).as_quat(scalar_first=True)
+    p["log_scales"][:] = np.log(sizes / focal * depth[:, None])
     return case
 
 
@@ -146,7 +146,7 @@ def safe_case(
 Floats = NDArray[Any]
 
 
-def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
+def sums_to_gradients(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
     """Convert sums over pixels, [N, PIXEL_SUMS], to dL/d(mean2d), [N, 2], and dL/d(conic), [N, 3].
 
     See cl_kernels/splat.h and pixel_box.h.  The sums of culled splats are 0.
@@ -158,18 +158,18 @@ def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
     return mean2d, np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
 
 
-def sums_of_gradients(splats: Splats, gradients: ref.SplatGradients) -> Floats:
-    """Convert gradients of splats to sums over pixels, [N, PIXEL_SUMS]: the inverse of gradients_of_sums."""
+def gradients_to_sums(splats: Splats, gradients: ref.SplatGradients) -> Floats:
+    """Convert gradients of splats to sums over pixels, [N, PIXEL_SUMS]: the inverse of sums_to_gradients."""
     shape, mean2d = gradients.conic, gradients.mean2d
     a, b, c = np.where(splats.visible[:, None], splats.conic, [1.0, 0.0, 1.0]).T
     if splats.pixel_box:
         swapped = a > c
         yy, k = np.where(swapped, a, c), b / np.where(swapped, a, c)
         t2 = (a * c - b * b) / yy
-        by_t2, by_xy, by_yy = np.where(swapped, shape[:, ::-1].T, shape.T)
-        by_k = yy * (by_xy + 2 * k * by_t2)
-        by_s = 2 * (yy * (by_yy - k * k * by_t2) + k * by_k)
-        position, second = mean2d, np.stack([by_k, by_s, 2 * t2 * by_t2], axis=1)
+        grad_t2, grad_xy, grad_yy = np.where(swapped, shape[:, ::-1].T, shape.T)
+        grad_k = yy * (grad_xy + 2 * k * grad_t2)
+        grad_s = 2 * (yy * (grad_yy - k * k * grad_t2) + k * grad_k)
+        position, second = mean2d, np.stack([grad_k, grad_s, 2 * t2 * grad_t2], axis=1)
     else:
         u, v = mean2d.T
         position = np.stack([b * v - c * u, b * u - a * v], axis=1) / (a * c - b * b)[:, None]
@@ -190,10 +190,10 @@ def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
         if swapped:
             xx, yy = yy, xx
         k, t2 = xy / yy, xx - xy * xy / yy
-        by_k, by_s, by_t = m[n]
-        by_t2 = by_t / (2 * t2)
-        by_yy = -by_k * k / yy + by_s / (2 * yy) + by_t2 * k * k
-        gradient[n] = by_t2, by_k / yy - 2 * k * by_t2, by_yy
+        grad_k, grad_s, grad_t = m[n]
+        grad_t2 = grad_t / (2 * t2)
+        grad_yy = -grad_k * k / yy + grad_s / (2 * yy) + grad_t2 * k * k
+        gradient[n] = grad_t2, grad_k / yy - 2 * k * grad_t2, grad_yy
         if swapped:
             gradient[n] = gradient[n, ::-1]
     return gradient

@@ -18,8 +18,8 @@ from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import empty_kernel_caches
 
 WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: import nothing from the working folder
-TIMEOUT_S = 900  # longest silence of a check; a kernel interpreter needs minutes
-EXIT_TIMEOUT_S = 30  # from the end of the output to the exit of the process, which may write a core dump
+TIMEOUT_S = 900  # longest time without output from a check; a kernel interpreter needs minutes
+EXIT_TIMEOUT_S = 30  # between the end of the output and the exit, during which a core dump may be written
 
 
 @dataclass
@@ -35,7 +35,7 @@ class CheckResult:
     log: str = ""  # log of a failed build
     out_of_memory: bool = False  # whether the fault is a lack of memory
     hangs: bool = False  # whether the fault is a timeout or unreadable output
-    damaged_cache: bool = False  # whether it failed, and succeeded with empty caches of built kernels
+    damaged_cache: bool = False  # whether it failed, but succeeded with empty caches of built kernels
 
     @property
     def passes(self) -> bool:
@@ -53,20 +53,20 @@ def run_checks(
 ) -> Iterator[CheckResult]:
     """Run checks on a device with a schedule; yield each result when it is complete.
 
-    A check that is silent for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
-    built kernels, as long as that helps.
+    A check without output for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
+    built kernels, until that does not help.
     """
     remaining, retry = list(checks), True
     while remaining:
-        done = 0
+        finished = 0
         for result in _run_in_process(info, schedule, remaining, seconds):
             if retry and result.fault and not result.out_of_memory and not result.hangs:
-                repeated = _run_with_empty_caches(info, schedule, remaining[done], seconds)
+                repeated = _run_with_empty_caches(info, schedule, remaining[finished], seconds)
                 retry = repeated.fault is None
                 result = repeated if retry else result
-            done += 1
+            finished += 1
             yield result
-        remaining = remaining[done:]
+        remaining = remaining[finished:]
 
 
 def _run_with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> CheckResult:
@@ -94,7 +94,7 @@ def _run_in_process(
         assert process.stdin is not None  # the worker exits when it is closed
         assert process.stdout is not None
         lines: queue.Queue[str | None] = queue.Queue()
-        threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
+        threading.Thread(target=_forward_lines, args=(process.stdout, lines), daemon=True).start()
         try:
             for check in checks:
                 result = CheckResult(check.name, check.kernels)
@@ -135,7 +135,7 @@ def _read_result(result: CheckResult, lines: "queue.Queue[str | None]", seconds:
             return None
 
 
-def _pump(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
+def _forward_lines(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
     for line in stdout:
         lines.put(line)
     lines.put(None)
@@ -148,8 +148,8 @@ def _exit_reason(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
     except subprocess.TimeoutExpired:
         return "closes its output but does not exit"
     errors.seek(0)
-    written = [line.strip() for line in errors.read().splitlines() if line.strip()]
-    last = f" ({shorten(written[-1], 300)})" if written else ""
+    output_lines = [line.strip() for line in errors.read().splitlines() if line.strip()]
+    last = f" ({shorten(output_lines[-1], 300)})" if output_lines else ""
     if code < 0:
         return f"the runtime crashes with {signal_name(code)}{last}"
     return f"the process exits with code {code}{last}"

@@ -1,6 +1,6 @@
 """Run checks on a device, given by platform and device number, and print their results as lines of JSON.
 
-A runtime may abort the process; the parent then knows which check did not end.  The process exits when its parent
+A runtime may abort the process; the parent then knows which check was running.  The process exits when its parent
 closes stdin or exits.
 """
 
@@ -29,22 +29,22 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
     threading.Thread(target=_exit_with_parent, args=(take_stdin(),), daemon=True).start()
     out = take_stdout()
     info = next(info for info in list_devices() if info.index == (platform, number))
-    opened = cache(lambda: Device(info, schedule))
+    open_once = cache(lambda: Device(info, schedule))
     for name in names:
         started = time.perf_counter()
-        _run(out, BY_NAME[name], opened)
+        _run(out, BY_NAME[name], open_once)
         _print(out, end=name, seconds=round(time.perf_counter() - started, 3))
 
 
-def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
+def _run(out: TextIO, check: Check, open_once: Callable[[], Device]) -> None:
     try:
-        for result in check.deviations(opened()):
+        for result in check.deviations(open_once()):
             if isinstance(result, Note):
                 _print(out, note=asdict(result))
             else:
                 _print(out, deviation=asdict(result))
     except Exception as error:  # a failure of the device; the other checks continue
-        fault = one_line(error) if isinstance(error, ClsplatError) else f"{_source_of(error)}: {one_line(error)}"
+        fault = one_line(error) if isinstance(error, ClsplatError) else f"{_fault_source(error)}: {one_line(error)}"
         log = str(error.__cause__)[:MAX_LOG] if isinstance(error, KernelError) and error.__cause__ else ""
         _print(
             out,
@@ -54,14 +54,14 @@ def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
         )
 
 
-def _source_of(error: Exception) -> str:
+def _fault_source(error: Exception) -> str:
     if type(error).__module__.startswith("pyopencl"):
         return "the OpenCL runtime refuses a call"
     return f"the check raises {type(error).__name__}, which may be a bug in clsplat"
 
 
 def _exit_with_parent(pipe: int) -> None:
-    """Exit, whatever this process does, when the parent closes its end of a pipe or exits."""
+    """Exit at once when the parent closes its end of a pipe or exits."""
     while os.read(pipe, 1024):
         pass
     os._exit(1)

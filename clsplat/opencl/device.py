@@ -1,4 +1,4 @@
-"""Open an OpenCL device, and use its context, queue, memory and programs.
+"""Open an OpenCL device with its context, queue, memory and programs.
 
 Only this package imports pyopencl.
 """
@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike, NDArray
 from clsplat.core.errors import ConfigError, DeviceError, KernelError, MemoryLimitError
 from clsplat.core.resources import resource_dir
 from clsplat.opencl import runtimes
-from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
+from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_macros
 from clsplat.opencl.kernel_caches import kernel_caches, remove_cut_kernels
 
 runtimes.prepare()
@@ -101,7 +101,7 @@ class Array:
         """Copy to the host; waits for the device.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
-            with self.device.refusals("a copy to the host"):
+            with self.device.raising_errors("a copy to the host"):
                 cl.enqueue_copy(self.device.queue, host, self.buffer)
         return host
 
@@ -112,11 +112,11 @@ class Array:
         DeviceError.
         """
         host = np.empty(self.shape, self.dtype)
-        with self.device.refusals("a copy to the host"):
+        with self.device.raising_errors("a copy to the host"):
             copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
 
         def wait() -> NDArray[Any]:
-            with self.device.refusals("a copy to the host"):
+            with self.device.raising_errors("a copy to the host"):
                 copy.wait()
             return host
 
@@ -125,7 +125,7 @@ class Array:
     def get_item(self, index: int) -> Any:
         """Copy one value of a one-dimensional array to the host.  Waits and raises as `get` does."""
         host = np.empty(1, self.dtype)
-        with self.device.refusals("a copy to the host"):
+        with self.device.raising_errors("a copy to the host"):
             cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
         return host[0]
 
@@ -135,21 +135,21 @@ class Array:
         if host.shape != self.shape:
             raise ValueError(f"cannot copy {host.shape} into {self.shape}")
         if host.size:
-            with self.device.refusals("a copy to the device"):
+            with self.device.raising_errors("a copy to the device"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
 
     def fill(self, value: float) -> None:
         """Set every value of an array of floats or 32-bit integers."""
         word = int(np.array(value, self.dtype).view(np.uint32))
         words = Array(self.device, self.buffer, self.shape, np.dtype(np.uint32))
-        lines = -(-self.nbytes // 64)  # a number of words would overflow 32 bits from 16 GiB
+        lines = -(-self.nbytes // 64)  # counts of words would overflow 32 bits from 16 GiB on
         self.device.program("fill.cl").fill_words(items=lines, values=words, word=word, lines=lines)
 
 
 class Device:
     """An open OpenCL device: one context, in-order commands, and programs that are built once.
 
-    A `with` block waits at its end for all work.  Memory is released with the arrays, and the device with the last
+    At its end, a `with` block waits for all work.  Memory is released with the arrays, and the device with the last
     object that uses it.
 
     `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  Without it, the device is
@@ -163,17 +163,17 @@ class Device:
         platform, number = info.index
         self.info = info
         remove_cut_kernels()
-        timed = cl.command_queue_properties.PROFILING_ENABLE
-        with self.refusals("opening it"):
+        flags = cl.command_queue_properties.PROFILING_ENABLE
+        with self.raising_errors("opening it"):
             self.context = create_context(platforms()[platform].get_devices()[number])
-            self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
-        self._sampling = False  # whether the timed queue is in use: it costs host time
+            self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=flags)}
+        self._sampling = False  # whether the profiling queue is in use, which costs host time
         self.schedule = resolve_schedule(info, schedule)
-        self.tuning = tuning_of(info, self.schedule)
+        self.tuning = tuning_macros(info, self.schedule)
         self.timings = Timings(info.name)
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
-        self.lock = threading.Lock()  # for what threads share: the programs, and the arguments of their kernels
+        self.lock = threading.Lock()  # protects what threads share: programs, and the arguments of their kernels
         self._programs: dict[tuple[Any, ...], Program] = {}
         if self.schedule == "simt":
             self._fit_groups()
@@ -204,7 +204,7 @@ class Device:
 
     @property
     def queue(self) -> Any:
-        """The command queue; the timed one while `timings` samples.  At a switch the device waits, not the host."""
+        """The command queue, which profiles while `timings` samples; at a switch, the device waits, not the host."""
         sampling = self.timings.sampling
         if sampling != self._sampling:
             before = cl.enqueue_marker(self._queues[self._sampling])
@@ -214,7 +214,7 @@ class Device:
         return self._queues[sampling]
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Allocate an array with undefined values.  Raises MemoryLimitError with the sizes."""
+        """Allocate an array with undefined values.  Raises MemoryLimitError, with the size."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         size = _round_up_to_lines(math.prod(shape) * kind.itemsize)
@@ -232,10 +232,10 @@ class Device:
             ) from error
         self.allocated += size
         self.peak = max(self.peak, self.allocated)
-        weakref.finalize(buffer, self._released, size)
+        weakref.finalize(buffer, self._record_release, size)
         return Array(self, buffer, shape, kind)
 
-    def _released(self, size: int) -> None:
+    def _record_release(self, size: int) -> None:
         self.allocated -= size
 
     def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
@@ -263,10 +263,10 @@ class Device:
 
     def finish(self) -> None:
         """Wait for all enqueued work.  Raises MemoryLimitError, DeviceError."""
-        with self.refusals("work in progress"):
+        with self.raising_errors("work in progress"):
             self.queue.finish()
 
-    def refusals(self, action: str) -> AbstractContextManager[None]:
+    def raising_errors(self, action: str) -> AbstractContextManager[None]:
         """Convert errors of the runtime in a block that does `action` (see `raising_device_errors`)."""
         return raising_device_errors(action, self.info.name)
 
@@ -277,7 +277,7 @@ def create_context(device: Any) -> Any:
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
-    """Return a device that is already open, or open one by a part of its name; None: the one that `choose` chooses.
+    """Open a device by a part of its name, or return an open one; None: the device that `choose` chooses.
 
     Raises DeviceError if there is none, and ConfigError for an open device with another schedule.
     """
@@ -295,10 +295,10 @@ def _round_up_to_lines(size: int) -> int:
     return max(64, -(-size // 64) * 64)
 
 
-# Kernels by name: load a .cl file, build it, check arguments against its text, launch.
+# Kernels by name: load a .cl file, build it, check arguments against its source, launch.
 
 
-CACHE_ERRORS = (cl.Error, sqlite3.Error, UnpicklingError)  # of a damaged cache of the runtime or of pyopencl
+CACHE_ERRORS = (cl.Error, sqlite3.Error, UnpicklingError)  # raised if a cache of the runtime or pyopencl is damaged
 BUILD_OPTIONS = ("-cl-std=CL1.2",)
 
 _INCLUDE = re.compile(r'^#include "(\w+\.h)"')
@@ -317,9 +317,9 @@ _TYPES: dict[str, np.dtype[Any]] = {
 }
 
 
-def flatten(path: Path, seen: set[Path] | None = None) -> str:
-    """Return the source with each local header inlined once; #line keeps the lines in compiler messages right."""
-    seen = set() if seen is None else seen
+def flatten(path: Path, included: set[Path] | None = None) -> str:
+    """Return the source with each local header inlined once; #line directives keep line numbers in messages right."""
+    included = set() if included is None else included
     text = [f'#line 1 "{path.name}"']
     for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
         match = _INCLUDE.match(line)
@@ -329,16 +329,16 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
         header = path.parent / match[1]
         if not header.is_file():  # a plug-in's kernels may include the package's headers
             header = resource_dir("cl_kernels") / match[1]
-        if header not in seen:
-            seen.add(header)
-            text.append(flatten(header, seen))
+        if header not in included:
+            included.add(header)
+            text.append(flatten(header, included))
         text.append(f'#line {number + 1} "{path.name}"')
     return "\n".join(text)
 
 
 @cache
 def constants(file: str = "common.h") -> dict[str, float]:
-    """Return the numeric #defines of a kernel file, for use in Python."""
+    """Return the numeric #defines of a kernel file by name."""
     text = (resource_dir("cl_kernels") / file).read_text("utf-8")
     values = {}
     for name, value in _DEFINE.findall(text):
@@ -357,7 +357,7 @@ class Argument:
 
 
 def parse_kernels(source: str) -> dict[str, list[Argument]]:
-    """Return the parameters of each kernel in a source text.  Raises KernelError for declarations of another form."""
+    """Return the parameters of each kernel in a source text.  Raises KernelError for unsupported declarations."""
     kernels = {}
     for match in _KERNEL.finditer(_COMMENT.sub("", source)):
         kernels[match["name"]] = [_parse_argument(match["name"], a) for a in match["arguments"].split(",")]
@@ -378,12 +378,13 @@ def group_limit(kernel: Any, device: Any) -> int:
     return int(kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
 
 
-def understates_groups(info: DeviceInfo, most: int, together: int) -> bool:
-    """Return whether rusticl reports too small a limit: it returns the number of items that run together, but runs
-    larger groups.  Mesa 22.3.6 reports 32 for a kernel that requires 256.
+def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> bool:
+    """Return whether a runtime reports too small a limit, as rusticl does: the number of items that run together.
+
+    It runs larger groups: Mesa 22.3.6 reports 32 for a kernel that requires 256.
     https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
     """
-    return info.platform.startswith("rusticl") and most == together
+    return info.platform.startswith("rusticl") and limit == multiple
 
 
 def group_multiple(kernel: Any, device: Any) -> int:
@@ -398,12 +399,12 @@ class Kernel:
         self.label, self.arguments = label, arguments
         self._device, self._kernel = device, kernel
         self._kernel.set_scalar_arg_dtypes([None if a.pointer else a.dtype for a in arguments])
-        info, opened = cl.kernel_work_group_info, device.context.devices[0]
-        self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, opened))
-        items, most = math.prod(self.group), group_limit(kernel, opened)
-        if items > most and not understates_groups(device.info, most, group_multiple(kernel, opened)):
+        info, cl_device = cl.kernel_work_group_info, device.context.devices[0]
+        self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, cl_device))
+        items, limit = math.prod(self.group), group_limit(kernel, cl_device)
+        if items > limit and not underreports_group_limit(device.info, limit, group_multiple(kernel, cl_device)):
             raise KernelError(
-                f"{label} needs work-groups of {items} items, but {device.info.text} allows {most}; "
+                f"{label} needs work-groups of {items} items, but {device.info.text} allows {limit}; "
                 "use another device, rasterizer.schedule or rasterizer.sort"
             )
 
@@ -418,15 +419,15 @@ class Kernel:
             size = tuple(n * g for n, g in zip(size, local, strict=True))
         if 0 in size:
             return
-        arguments = self._checked(values)
-        with self._device.lock, self._device.refusals(self.label):  # the lock protects the arguments until enqueued
+        arguments = self._check(values)
+        with self._device.lock, self._device.raising_errors(self.label):  # arguments must not change until enqueued
             self._kernel.set_args(*arguments)
             event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
         self._device.timings.add(self.label, event)
 
-    def _checked(self, values: dict[str, Any]) -> list[Any]:
+    def _check(self, values: dict[str, Any]) -> list[Any]:
         if len(values) != len(self.arguments):
-            self._complain(values)
+            self._raise_argument_error(values)
         checked = []
         for argument in self.arguments:
             value = values.get(argument.name)
@@ -435,10 +436,10 @@ class Kernel:
             elif isinstance(value, Array) and (argument.dtype is None or value.dtype == argument.dtype):
                 checked.append(value.buffer)
             else:
-                self._complain(values)
+                self._raise_argument_error(values)
         return checked
 
-    def _complain(self, values: dict[str, Any]) -> NoReturn:
+    def _raise_argument_error(self, values: dict[str, Any]) -> NoReturn:
         expected = {a.name: a for a in self.arguments}
         missing, surplus = expected.keys() - values.keys(), values.keys() - expected.keys()
         wrong = [
@@ -452,7 +453,7 @@ class Kernel:
 
 
 class Program:
-    """One .cl file, built; its kernels are attributes."""
+    """A built .cl file, with its kernels as attributes."""
 
     options: ClassVar[tuple[str, ...]] = BUILD_OPTIONS  # tests add -Werror; users' drivers may warn
 
@@ -479,10 +480,10 @@ class Program:
                 f"kernels may be damaged: remove {kernel_caches()}"
             ) from error
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")
-        if unread := sorted({name for name in names if name} - self.kernels.keys()):
+        if unparsed := sorted({name for name in names if name} - self.kernels.keys()):
             raise KernelError(
-                f"{path}: cannot parse the declaration of {', '.join(unread)}; expected "
-                f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unread[0]}(' "
+                f"{path}: cannot parse the declaration of {', '.join(unparsed)}; expected "
+                f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unparsed[0]}(' "
                 "and parameters like '__global const float *restrict means' and 'const uint count'"
             )
 

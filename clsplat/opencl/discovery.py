@@ -1,6 +1,6 @@
 """Find the OpenCL devices of this machine and choose one.
 
-The device is chosen once and passed explicitly; no other device replaces it silently.
+The device is chosen once and passed explicitly; nothing silently falls back to another one.
 """
 
 import logging
@@ -18,7 +18,7 @@ runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 DEVICE_VARIABLE = "CLSPLAT_DEVICE"
-LOCAL_MEMORY = 32 << 10  # bytes that kernels may take for a work-group; OpenCL 1.2, full profile
+LOCAL_MEMORY = 32 << 10  # bytes that kernels may use per work-group; OpenCL 1.2, full profile
 LOG = logging.getLogger("clsplat")
 Schedule = Literal["auto", "wide", "simt"]
 
@@ -46,8 +46,8 @@ class DeviceInfo:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None if the device is large enough and runs a test kernel, else a sentence about the fault."""
-        needed = int(tuning_of(self, resolve_schedule(self, "auto"))["GROUP"])
+        """Return None if the device is large enough and runs a test kernel, else the fault as a sentence."""
+        needed = int(tuning_macros(self, resolve_schedule(self, "auto"))["GROUP"])
         if self.group < needed:
             return f"its work-groups have at most {self.group} items; {needed} are needed"
         if self.local_memory < LOCAL_MEMORY:
@@ -67,25 +67,25 @@ def list_devices() -> list[DeviceInfo]:
     infos = []
     for p, platform in enumerate(platforms()):
         devices: list[Any] = []
-        with _warning(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
+        with _warn_on_error(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
             devices = platform.get_devices()
         for d, device in enumerate(devices):
-            with _warning(f"OpenCL platform {p}: its device {d} cannot be queried"):
-                infos.append(_info(platform, device, (p, d)))
+            with _warn_on_error(f"OpenCL platform {p}: its device {d} cannot be queried"):
+                infos.append(_query(platform, device, (p, d)))
     return infos
 
 
 def platforms() -> list[Any]:
     """Return the platforms of the loader; an empty list if it finds no runtime.  Raises like `check_runtimes`."""
     runtimes.check_runtimes(f"{cl.VERSION_TEXT} {cl.__file__}")
-    with _warning("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
+    with _warn_on_error("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
     return []
 
 
 @contextmanager
-def _warning(message: str, expected_code: str = "") -> Iterator[None]:
-    """Log an OpenCL error in the block as a warning, unless it has the expected code."""
+def _warn_on_error(message: str, expected_code: str = "") -> Iterator[None]:
+    """Log an OpenCL error of the block as a warning, unless it has the expected code."""
     try:
         yield
     except cl.Error as error:
@@ -93,11 +93,11 @@ def _warning(message: str, expected_code: str = "") -> Iterator[None]:
             LOG.warning("%s (%s); its driver may need to be reinstalled", message, one_line(error))
 
 
-def _info(platform: Any, device: Any, index: tuple[int, int]) -> DeviceInfo:
+def _query(platform: Any, device: Any, index: tuple[int, int]) -> DeviceInfo:
     kinds = cl.device_type
     return DeviceInfo(
         name=device.name.strip(),
-        platform=f"{platform.name.strip()}, {_short(platform.version)}",
+        platform=f"{platform.name.strip()}, {_short_version(platform.version)}",
         kind="GPU" if device.type & kinds.GPU else "CPU" if device.type & kinds.CPU else "other",
         driver=device.driver_version.strip(),
         units=device.max_compute_units,
@@ -112,8 +112,8 @@ def _info(platform: Any, device: Any, index: tuple[int, int]) -> DeviceInfo:
     )
 
 
-def _short(version: str) -> str:
-    """'OpenCL 3.0 PoCL 3.1+debian  Linux, None+Asserts, ...' -> 'OpenCL 3.0 PoCL 3.1+debian'."""
+def _short_version(version: str) -> str:
+    """Shorten 'OpenCL 3.0 PoCL 3.1+debian  Linux, None+Asserts, ...' to 'OpenCL 3.0 PoCL 3.1+debian'."""
     return " ".join(version.split(",")[0].split()[:4])
 
 
@@ -129,7 +129,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     if not devices:
         raise runtimes.no_device_error("no OpenCL device was found", runtimes.no_device_advice())
     if device_name:
-        return _named(device_name, devices)
+        return _find_by_name(device_name, devices)
     faults = []
     for info in sorted(devices, key=_rank):
         fault = info.fault()
@@ -146,13 +146,13 @@ def choose(device_name: str | None = None) -> DeviceInfo:
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
     """Return the sort key: GPUs first, discrete before integrated ones, by units times clock; then CPUs, then others.
 
-    Units by themselves compare badly: some vendors count whole processors, others parts of them.
+    The number of units alone says little: some vendors count whole processors, others parts of them.
     """
     gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
 
 
-def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
+def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     numbered = re.fullmatch(r"(.*):([0-9]{1,4})", device_name, re.DOTALL)
     name, number = numbered.groups() if numbered else (device_name, "0")
     matching = [info for info in devices if info.matches(name)]
@@ -174,7 +174,7 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
     return schedule
 
 
-def tuning_of(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
+def tuning_macros(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
     """Return the macros that kernels are built with for a device; cl_kernels/common.h explains them."""
     if schedule == "wide":
         return {

@@ -1,4 +1,4 @@
-"""Find the kernels that pyopencl and PoCL keep built, and deal with damaged ones."""
+"""Find the built kernels that pyopencl and PoCL cache, and remove damaged ones."""
 
 import logging
 import os
@@ -21,19 +21,19 @@ from clsplat.core.reading import open_regular, read_text
 LOG = logging.getLogger("clsplat")
 SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes
 ELF, ELF_HEADER = b"\x7fELF", 64  # bytes, of the 64-bit format
-MIN_FILE_SIZE = 2 << 20  # bytes of the largest built kernel
-KERNEL_OF_POCL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")  # hash, kernel, group
+MIN_FILE_SIZE = 2 << 20  # bytes; the largest built kernel needs about this
+POCL_KERNEL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")  # hash, kernel, group
 
 
 def kernel_caches() -> str:
-    """Return the folders that keep built kernels, as text."""
+    """Return the folders of built kernels, as text."""
     *others, last = map(str, _kernel_folders())
     return f"{', '.join(others)} and {last}"
 
 
 def kernel_cache_advice() -> str:
-    """Return advice for a device that works only with empty kernel caches."""
-    if fault := _full_cache():
+    """Return advice for a device that only works with empty kernel caches."""
+    if fault := _full_cache_fault():
         return fault
     return f"its cache of built kernels is damaged: remove {kernel_caches()}"
 
@@ -45,11 +45,11 @@ def require_space() -> None:
         raise OutputError(
             f"`ulimit -f` limits files to {limit >> 10} KiB; built kernels need {MIN_FILE_SIZE >> 10} KiB: raise it"
         )
-    if fault := _full_cache():
+    if fault := _full_cache_fault():
         raise OutputError(fault)
 
 
-def _full_cache() -> str:
+def _full_cache_fault() -> str:
     faults = filter(None, map(space_fault, (cache_folder(), *user_cache_folders())))
     return next((f"{fault}; free some, or set XDG_CACHE_HOME to another folder" for fault in faults), "")
 
@@ -60,30 +60,30 @@ def remove_cut_kernels() -> None:
 
     This runs once per boot if the system has a boot ID, else once per process.
     """
-    now, before = f"{Owner.current().boot or ''}\n{kernel_caches()}", cache_folder() / "kernels_checked"
+    state, record = f"{Owner.current().boot or ''}\n{kernel_caches()}", cache_folder() / "kernels_checked"
     with suppress(DataError):
-        if not now.startswith("\n") and read_text(before) == now:
+        if not state.startswith("\n") and read_text(record) == state:
             return
     _, pytools, pocl = _kernel_folders()
-    cut = [file for file in _kernels_of_pocl(pocl) if _is_cut(file)]
-    cut += [file for file in pytools.glob("pdict-*pyopencl*.sqlite") if not _is_database(file)]
-    for file in cut:
+    files = [file for file in _pocl_kernels(pocl) if _is_truncated(file)]
+    files += [file for file in pytools.glob("pdict-*pyopencl*.sqlite") if not _is_database(file)]
+    for file in files:
         with suppress(OSError):
             file.unlink()
-    if cut:
-        LOG.warning("removed %d truncated files of built kernels (%s); they will be built again", len(cut), cut[0])
+    if files:
+        LOG.warning("removed %d truncated files of built kernels (%s); they will be built again", len(files), files[0])
     with suppress(OutputError):
-        write_text(before, now)
+        write_text(record, state)
 
 
-def _kernels_of_pocl(folder: Path) -> list[Path]:
-    """Return the kernels in a cache of PoCL, by their names: the folder may contain other files."""
+def _pocl_kernels(folder: Path) -> list[Path]:
+    """Return the kernels in a cache of PoCL, recognized by name: the folder may contain other files."""
     files = [(base, file) for base in (folder, folder / "kcache") for file in base.glob("[A-P][A-P]/*/*/*/*.so")]
-    return [file for base, file in files if KERNEL_OF_POCL.fullmatch(file.relative_to(base).as_posix())]
+    return [file for base, file in files if POCL_KERNEL.fullmatch(file.relative_to(base).as_posix())]
 
 
-def _is_cut(library: Path) -> bool:
-    """Return whether a library is empty, is no library, or ends before its section table, which linkers write last."""
+def _is_truncated(library: Path) -> bool:
+    """Return whether a library is empty, not a library, or ends before its section table, which linkers write last."""
     try:
         with open_regular(library) as file:
             head, size = file.read(ELF_HEADER), file.seek(0, os.SEEK_END)
@@ -99,13 +99,13 @@ def _is_cut(library: Path) -> bool:
 
 
 def _is_database(file: Path) -> bool:
-    """Return whether a file is a complete SQLite database, with all pages that its header counts, or empty."""
+    """Return whether a file is empty or a complete SQLite database, with all pages that its header counts."""
     with suppress(OSError), open_regular(file) as opened:
         head = opened.read(SQLITE_HEADER)
         if len(head) < SQLITE_HEADER or not head.startswith(SQLITE):
             return not head
-        page, changes, pages, counted_at = struct.unpack(">16xH6x2I60xI4x", head)
-        if changes != counted_at or any(file.with_name(f"{file.name}-{end}").exists() for end in ("journal", "wal")):
+        page, changes, pages, valid_for = struct.unpack(">16xH6x2I60xI4x", head)
+        if changes != valid_for or any(file.with_name(f"{file.name}-{end}").exists() for end in ("journal", "wal")):
             return True  # the page count is out of date, or another process is writing
         return bool(opened.seek(0, os.SEEK_END) >= pages * (65536 if page == 1 else page))
     return True

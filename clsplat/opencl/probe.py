@@ -24,21 +24,21 @@ void reverse(__global const float *restrict from, __global float *restrict to)
     to[get_global_id(0)] = part[7 - get_local_id(0)];
 }
 
-// A runtime that does not know the processor lacks the root and the conversions of whole vectors.
+// A runtime that does not know the processor lacks square roots and conversions of vectors.
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void whole_root(__global float *restrict squares)
+void vector_root(__global float *restrict squares)
 {
     vstore%(lanes)d(convert_float%(lanes)d(convert_int%(lanes)d(sqrt(vload%(lanes)d(0, squares)))), 0, squares);
 }
 """
 
-# Part of a warning of clang: kernels are compiled without the vectors that the device reports, unlike the runtime's
-# library.  PoCL 3.0 does so on newer processors, and its compiler may then run for minutes.
+# Part of a clang warning: kernels are compiled without the vectors that the device reports, unlike the runtime's
+# library.  This happens with PoCL 3.0 on newer processors, where its compiler may also run for minutes.
 WITHOUT_VECTORS = "changes the ABI"
 
 
 def main(platform: int, device: int) -> None:
-    """Double and reverse eight numbers on the device, and take the roots of a vector, or raise."""
+    """Double and reverse eight numbers on the device, and take the square roots of a vector; raise if that fails."""
     chosen = cl.get_platforms()[platform].get_devices()[device]
     context = cl.Context([chosen])
     queue = cl.CommandQueue(context)
@@ -57,15 +57,15 @@ def main(platform: int, device: int) -> None:
         raise SystemExit(f"error: the test kernel computed {result.tolist()}")
     numbers = np.arange(lanes, dtype=np.float32)
     squares = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=numbers**2)
-    cl.Kernel(program, "whole_root")(queue, (1,), (1,), squares)
+    cl.Kernel(program, "vector_root")(queue, (1,), (1,), squares)
     roots = np.empty_like(numbers)
     cl.enqueue_copy(queue, roots, squares)
     if not np.array_equal(roots, numbers):
-        raise SystemExit(f"error: the test kernel computed roots {roots.tolist()}")
+        raise SystemExit(f"error: the test kernel computed square roots {roots.tolist()}")
 
 
 def load_runtimes() -> None:
-    """Query all devices, between a line before and a line after."""
+    """Query all devices, and print a line before and after."""
     print(runtimes.LOADING, flush=True)
     with suppress(cl.Error):
         for platform in cl.get_platforms():

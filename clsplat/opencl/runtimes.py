@@ -30,7 +30,7 @@ INSTALL = (
     "your GPU's driver"
 )
 VARIABLES = ("POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # any of them may hide a runtime
-LOADER_VARIABLES = (*VARIABLES, "LD_LIBRARY_PATH", "LD_PRELOAD")  # they decide which libraries are loaded
+LOADER_VARIABLES = (*VARIABLES, "LD_LIBRARY_PATH", "LD_PRELOAD")  # these determine which libraries are loaded
 MIN_ADDRESS_SPACE = 1800 << 20  # bytes: with two cores, a run needs about this much
 LOADING_SECONDS = 60  # drivers of large servers may take ten
 LOADING, LOADED = "clsplat loads the runtimes", "clsplat has listed the devices"  # lines of the child process
@@ -65,25 +65,25 @@ def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitEr
 
 
 def no_device_advice() -> str:
-    """Return what to do if there is no device: correct the variables that the user has set, or install a runtime."""
-    named = _user_variables()
-    return f"{named} may hide the runtimes: correct or unset it; or {INSTALL}" if named else INSTALL
+    """Return what to do without a device: correct the variables that the user has set, or install a runtime."""
+    variables = _user_variables()
+    return f"{variables} may hide the runtimes: correct or unset it; or {INSTALL}" if variables else INSTALL
 
 
 def _user_variables() -> str:
-    """Return the variables that the user has set, with their values; '' without one."""
-    own = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # set by `prepare`
-    given = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, own[0]).startswith(own)}
-    return ", ".join(f"{name}={quote(value)}" for name, value in given.items())
+    """Return the variables that the user has set, with their values, as text; '' if there are none."""
+    ours = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # set by `prepare`
+    values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, ours[0]).startswith(ours)}
+    return ", ".join(f"{name}={quote(value)}" for name, value in values.items())
 
 
 @cache
 def check_runtimes(loader: str) -> None:
-    """Load all runtimes in a child process first, since a runtime may end the process that loads it.
+    """Load all runtimes in a child process first, since a runtime may crash the process that loads it.
 
-    A success is stored until the next boot, or until the runtimes change.  loader: the OpenCL loader and its version.
-    Raises DeviceError with the driver file that is to blame, MemoryLimitError, and OutputError
-    if built kernels do not fit.
+    A success is recorded until the next boot, or until the runtimes change.  loader: the OpenCL loader and its version.
+    Raises DeviceError with the faulty driver file, MemoryLimitError, and OutputError if built
+    kernels do not fit.
     """
     require_space()
     limit = process_limit("RLIMIT_AS")
@@ -105,9 +105,9 @@ def check_runtimes(loader: str) -> None:
 
 
 def _drivers() -> dict[Path, str]:
-    """Return the libraries of the runtimes, by what names them to the loader: an .icd file, or the library itself."""
-    place = Path(os.environ.get("OCL_ICD_VENDORS") or SYSTEM_DRIVERS)
-    files = sorted(place.glob("*.icd")) if place.is_dir() else [place]
+    """Return the libraries of the runtimes by the files that the loader reads: an .icd file, or the library itself."""
+    vendors = Path(os.environ.get("OCL_ICD_VENDORS") or SYSTEM_DRIVERS)
+    files = sorted(vendors.glob("*.icd")) if vendors.is_dir() else [vendors]
     drivers = {
         path: str(path)
         for path in (*files, *map(Path, filter(None, os.environ.get("OCL_ICD_FILENAMES", "").split(os.pathsep))))
@@ -120,22 +120,22 @@ def _drivers() -> dict[Path, str]:
 
 
 def _blame(drivers: Mapping[Path, str], fault: str) -> DeviceError:
-    """Return the error about the first driver that ends a process that loads no other."""
-    remedy = f"correct or unset {named}" if (named := _user_variables()) else OTHER_DRIVERS
+    """Return the error about the first driver that crashes a process in which it is the only one."""
+    remedy = f"correct or unset {variables}" if (variables := _user_variables()) else OTHER_DRIVERS
     for path, library in drivers.items():
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             write_text(Path(folder, "driver.icd"), f"{library}\n")
-            alone = _loading_fault({"OCL_ICD_VENDORS": folder, "OCL_ICD_FILENAMES": ""})
-        if alone is not None:
+            driver_fault = _loading_fault({"OCL_ICD_VENDORS": folder, "OCL_ICD_FILENAMES": ""})
+        if driver_fault is not None:
             file = SYSTEM_DRIVERS / path.name if path.is_relative_to(cache_folder()) else path
-            return DeviceError(f"{file}: the runtime {quote(library)} {alone}; {remedy}")
+            return DeviceError(f"{file}: the runtime {quote(library)} {driver_fault}; {remedy}")
     return DeviceError(f"an OpenCL runtime {fault}; {remedy}")
 
 
 def _loading_fault(variables: Mapping[str, str]) -> str | None:
-    """Return how a child process ends that loads all runtimes, as a verb phrase, or None if it lists the devices."""
+    """Load all runtimes in a child process; return how it fails, as a verb phrase, or None if it lists the devices."""
     result = run_module(PROBE_MODULE, seconds=LOADING_SECONDS, variables=variables)
-    if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not even begin
+    if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not start
         return None
     return f"{result.crash or 'ends the process'} when it is loaded"
 
@@ -143,8 +143,8 @@ def _loading_fault(variables: Mapping[str, str]) -> str | None:
 def _add_intel_runtime() -> None:
     """Register Intel's CPU runtime if pip installed it: its driver file contains a placeholder path.
 
-    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.  On
-    Windows, the loader takes the library in addition to the registry's, unless OCL_ICD_FILENAMES is set.
+    Unless OCL_ICD_VENDORS is set, write a folder of driver files with the system's drivers and Intel's.  On Windows,
+    unless OCL_ICD_FILENAMES is set, the loader uses the library in addition to those in the registry.
     """
     data = Path(sysconfig.get_path("data"))
     if (dll := data / "Library" / "bin" / "intelocl64.dll").exists():  # Windows
@@ -166,8 +166,8 @@ def _add_intel_runtime() -> None:
 def probe_fault(key: str, platform: int, device: int) -> str | None:
     """Return None if the device builds and runs a kernel, else a sentence with the fault and the remedy.
 
-    `key` identifies the runtime.  Only successes are stored, so that a runtime that was fixed is tested again.  A
-    device that fails is tested again with empty caches of built kernels.
+    `key` identifies the runtime.  Only successes are recorded, so that a repaired runtime is tested again.  A device
+    that fails is tested again with empty caches of built kernels.
     """
     content = PROBE.read_bytes() + key.encode()
     record = cache_folder() / "probes" / hashlib.sha256(content).hexdigest()[:16]

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.api import renderer as devices
 from clsplat.api.renderer import Renderer
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.core.errors import NumericError
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.opencl import device as program
@@ -45,7 +45,7 @@ def test_depth_of_a_single_gaussian_is_its_own(device, rng):
 
 @on_one_setting
 def test_depth_changes_neither_image_nor_alpha(device, rng):
-    case = with_world_filter(random_case(rng, 30, *SIZE, compensate=1.0), rng)
+    case = add_world_filter(random_case(rng, 30, *SIZE, compensate=1.0), rng)
     renderer = Renderer(model_of(case), device)
     without, with_depth = renderer.render(case.view), renderer.render(case.view, depth=True)
     np.testing.assert_array_equal(without.image, with_depth.image)

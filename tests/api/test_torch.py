@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.api.renderer import Renderer
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.motion import static_motion
 from tests.support.models import model_of
@@ -102,7 +102,7 @@ def test_second_derivative_is_refused(device, rng):
 
 
 def test_count_that_differs_from_the_world_filter_is_refused(device, rng):
-    case = with_world_filter(random_case(rng, 5, *SIZE), rng)
+    case = add_world_filter(random_case(rng, 5, *SIZE), rng)
     renderer = Renderer(model_of(case), device)
     clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)))
     with pytest.raises(ValueError, match="has a world filter of 5 Gaussians, the parameters have 3; expected as many"):

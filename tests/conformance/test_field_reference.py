@@ -55,7 +55,7 @@ def test_features_are_mean_sines_of_a_normal_distribution(rng):
         for function in (np.sin, np.cos)
         for degree in range(3)
     ]
-    np.testing.assert_allclose(nerf.encoded_frustums(mean, variance, 3)[0, 0], np.concatenate(expected), atol=1e-9)
+    np.testing.assert_allclose(nerf.encode_frustums(mean, variance, 3)[0, 0], np.concatenate(expected), atol=1e-9)
 
 
 def test_fine_edges_follow_the_weights():

@@ -18,17 +18,17 @@ from clsplat.conformance.doctor import examine
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DeviceError, MemoryLimitError
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import tuning_of
+from clsplat.opencl.discovery import tuning_macros
 from clsplat.render.tiles import resolve_sort
 from tests.support.doctor_worker import worker
 from tests.support.models import model_of
 
 OTHER_BUILDS = {
     "__version__": "0.0",
-    "_hash_of_checks": lambda: "other checks",
-    "_hash_of_kernels": lambda: "other sources",
+    "_hash_checks": lambda: "other checks",
+    "_hash_kernels": lambda: "other sources",
     "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
-    "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
+    "tuning_macros": lambda info, schedule: {**tuning_macros(info, schedule), "DIGIT_BITS": 6},
 }
 
 

@@ -671,13 +671,13 @@ def test_gradients_of_the_colors_of_a_photograph(rng):
     numbers, gradient = rng.normal(0, 0.2, 3), rng.normal(size=(3, 6, 7))
     image = rng.uniform(-0.2, 1.4, gradient.shape)
     matrix = np.column_stack([np.eye(3) + rng.normal(0, 0.2, (3, 3)), rng.normal(0, 0.1, 3)])
-    assert 0.1 < np.mean(ref.colored(image, matrix) == 1) < 0.7
-    grad_image, grad_matrix = ref.colored_backward(image, matrix, gradient)
+    assert 0.1 < np.mean(ref.apply_color_matrix(image, matrix) == 1) < 0.7
+    grad_image, grad_matrix = ref.color_matrix_backward(image, matrix, gradient)
     for analytic, array in ((grad_image, image), (grad_matrix, matrix)):
-        numeric = five_point(lambda: (gradient * ref.colored(image, matrix)).sum(), array)
+        numeric = five_point(lambda: (gradient * ref.apply_color_matrix(image, matrix)).sum(), array)
         assert relative_error(analytic, numeric) < FD_TOLERANCE
-    _, by_gains = ref.colored_backward(image, ref.gain_matrix(*numbers), gradient)
-    numeric = five_point(lambda: (gradient * ref.colored(image, ref.gain_matrix(*numbers))).sum(), numbers)
+    _, by_gains = ref.color_matrix_backward(image, ref.gain_matrix(*numbers), gradient)
+    numeric = five_point(lambda: (gradient * ref.apply_color_matrix(image, ref.gain_matrix(*numbers))).sum(), numbers)
     assert relative_error(ref.gain_gradient(*numbers, by_gains), numeric) < FD_TOLERANCE
 
 
@@ -686,10 +686,10 @@ def test_gradients_of_a_grid_of_colors(rng, nodes):
     """By the image, through the luminance too, by the grid, and of its smoothness; some pixels are cut."""
     gradient, grid = rng.normal(size=(3, 5, 6)), rng.normal(0, 0.2, (3, 4, *nodes))
     image = rng.uniform(-0.2, 1.3, gradient.shape)
-    assert 0.05 < np.mean(ref.gridded(image, grid) == 1) < 0.7
-    grad_image, grad_grid = ref.gridded_backward(image, grid, gradient)
+    assert 0.05 < np.mean(ref.apply_color_grid(image, grid) == 1) < 0.7
+    grad_image, grad_grid = ref.color_grid_backward(image, grid, gradient)
     for analytic, array in ((grad_image, image), (grad_grid, grid)):
-        numeric = five_point(lambda: (gradient * ref.gridded(image, grid)).sum(), array)
+        numeric = five_point(lambda: (gradient * ref.apply_color_grid(image, grid)).sum(), array)
         assert relative_error(analytic, numeric) < FD_TOLERANCE
     value, slope = ref.grid_smoothness(grid)
     assert value > 0
@@ -698,18 +698,18 @@ def test_gradients_of_a_grid_of_colors(rng, nodes):
 
 def test_grid_of_equal_matrices_is_constant_and_meets_its_nodes(rng):
     image, grid = rng.uniform(0, 1, (3, 6, 7)), rng.normal(0, 0.2, (3, 4, 1, 1, 1))
-    expected = ref.colored(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
-    np.testing.assert_allclose(ref.gridded(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
+    expected = ref.apply_color_matrix(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
+    np.testing.assert_allclose(ref.apply_color_grid(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
     gray = np.full((3, 1, 1), 1 / 3)  # the second of four levels, in the middle of the image
     grid = rng.normal(0, 0.2, (3, 4, 4, 3, 3))
     matrix = np.eye(3, 4) + grid[:, :, 1, 1, 1]
-    np.testing.assert_allclose(ref.gridded(gray, grid), ref.colored(gray, matrix))
+    np.testing.assert_allclose(ref.apply_color_grid(gray, grid), ref.apply_color_matrix(gray, matrix))
 
 
 def test_removing_the_grid_mean_keeps_local_differences(rng):
     vignette = np.zeros((4, 3, 4, 2, 3, 3))
     vignette[..., 1, 1] = 0.3  # in the middle of all photographs
-    found = ref.centered_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
+    found = ref.center_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
     np.testing.assert_allclose(found.mean(axis=(0, 4, 5)), 0, atol=1e-15)
     np.testing.assert_allclose(found[..., 1, 1] - found[..., 0, 0], 0.3)
 
@@ -736,7 +736,7 @@ def test_gradients_of_a_layer_before_an_image(rng):
     """By the image behind it, and of the loss of what it covers."""
     layer, image, gradient = rng.random((3, 6, 7)), rng.random((4, 6, 7)), rng.normal(size=(4, 6, 7))
     left = rng.random((6, 7))
-    numeric = five_point(lambda: (gradient * ref.laid_over(layer, left, image)).sum(), image)
+    numeric = five_point(lambda: (gradient * ref.overlay(layer, left, image)).sum(), image)
     assert relative_error(ref.gradient_behind(left, gradient), numeric) < FD_TOLERANCE
     numeric = five_point(lambda: ref.layer_cover(left, 0.3)[0], left)
     assert relative_error(ref.layer_cover(left, 0.3)[1], numeric) < FD_TOLERANCE
@@ -755,7 +755,7 @@ def test_pixels_show_the_sky_where_six_of_nine_match():
     sky = np.zeros((3, 5, 5))
     photograph = np.zeros((3, 5, 5))
     photograph[:, :2] = 1
-    assert ref.shows_sky(sky, photograph, 0.1).any(axis=1).tolist() == [False, False, True, True, True]
+    assert ref.sky_mask(sky, photograph, 0.1).any(axis=1).tolist() == [False, False, True, True, True]
 
 
 @pytest.mark.parametrize(("degree", "turns"), each_once([1, 2, 3], [False, True]))
@@ -768,10 +768,10 @@ def test_gradients_of_a_motion(rng, degree, turns):
     weights = [rng.normal(size=table.shape) for table in (means, quats, logit)]
 
     def value() -> float:
-        tables = ref.moved(motion, means, quats, logit, time, degree, turns)
+        tables = ref.move_gaussians(motion, means, quats, logit, time, degree, turns)
         return sum(float((weight * table).sum()) for weight, table in zip(weights, tables, strict=True))
 
-    grad_motion, grad_logit = ref.moved_backward(motion, logit, *weights, time, degree, turns)
+    grad_motion, grad_logit = ref.move_gaussians_backward(motion, logit, *weights, time, degree, turns)
     assert grad_motion.all()
     assert relative_error(grad_motion, five_point(value, motion)) < FD_TOLERANCE
     assert relative_error(grad_logit, five_point(value, logit)) < FD_TOLERANCE

@@ -40,7 +40,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/pipeline/files.py:shipped": "reads files of the package",
     "clsplat/viewer/page.py": "reads files of the package",
     "clsplat/runs/live/server.py": "reads files of the package",
-    "clsplat/conformance/quick.py:_hash_of": "reads files of the package",
+    "clsplat/conformance/quick.py:_hash_files": "reads files of the package",
     "clsplat/opencl/device.py": "reads kernels, of the package and of plug-ins: code that is trusted",
     "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
     "clsplat/core/machine.py:available_memory": "reads what the kernel tells, which has no size",

@@ -4,7 +4,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.checks.density import photograph_of
+from clsplat.conformance.checks.density import black_photograph
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.importance import contributions
 from clsplat.density.survey import RenderedView
@@ -21,7 +21,7 @@ def weights(rasterizer, model, photographs):
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)])
 def test_weights_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
-    found = weights(Rasterizer(device, "radix"), case.model(device), [photograph_of(device, case)])
+    found = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
     assert found.shape == (count,)
     np.testing.assert_allclose(found, ref.contribution(case.project(), width, height), rtol=1e-4, atol=1e-5)
 
@@ -31,7 +31,7 @@ def test_pixels_beyond_the_edge_do_not_count(device, rng):
     case = random_case(rng, 1, 1, 1)
     case.parameters["means"][:] = np.linalg.inv(np.vstack([case.view.world_to_camera, [0, 0, 0, 1]]))[:3] @ [0, 0, 3, 1]
     case.parameters["log_scales"][:], case.parameters["logit_opacity"][:] = np.log(50), 3
-    found = weights(Rasterizer(device, "radix"), case.model(device), [photograph_of(device, case)])
+    found = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
     np.testing.assert_allclose(found, 1 / (1 + np.exp(-3)), rtol=1e-3)
 
 
@@ -39,8 +39,8 @@ def test_masked_pixels_do_not_count(device, rng):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     mask = rng.random((31, 33)) < 0.5
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
-    halves = [weights(rasterizer, model, [photograph_of(device, case, part)]) for part in (mask, ~mask)]
-    whole = weights(rasterizer, model, [photograph_of(device, case)])
+    halves = [weights(rasterizer, model, [black_photograph(device, case, part)]) for part in (mask, ~mask)]
+    whole = weights(rasterizer, model, [black_photograph(device, case)])
     np.testing.assert_allclose(halves[0] + halves[1], whole, rtol=1e-5, atol=1e-6)
     assert (halves[0] < whole).any()
 
@@ -48,7 +48,7 @@ def test_masked_pixels_do_not_count(device, rng):
 @on_one_setting
 def test_sums_over_views_in_bands_have_the_same_bits(device, rng):
     case = random_case(rng, 60, 70, 50)
-    photographs = [photograph_of(device, case)] * 3
+    photographs = [black_photograph(device, case)] * 3
     whole = weights(Rasterizer(device, "radix"), case.model(device), photographs)
     bands = weights(Rasterizer(device, "radix", RenderLimits(60, 3)), case.model(device), photographs)
     np.testing.assert_array_equal(whole, bands)
@@ -61,7 +61,7 @@ def test_schedules_agree(device, rng):
     case = random_case(rng, 60, 70, 50)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     mine, theirs = (
-        weights(Rasterizer(one, "radix"), case.model(one), [photograph_of(one, case)]) for one in (device, other)
+        weights(Rasterizer(one, "radix"), case.model(one), [black_photograph(one, case)]) for one in (device, other)
     )
     np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
 
@@ -73,7 +73,7 @@ def test_nan_gaussian_is_invisible_and_occludes_nothing(device, rng, name):
     case.parameters[name][3] = np.nan
     without["logit_opacity"][3] = -80
     rasterizer = Rasterizer(device, "radix")
-    found = weights(rasterizer, case.model(device), [photograph_of(device, case)])
+    found = weights(rasterizer, case.model(device), [black_photograph(device, case)])
     case.parameters.update(without)
-    np.testing.assert_array_equal(found, weights(rasterizer, case.model(device), [photograph_of(device, case)]))
+    np.testing.assert_array_equal(found, weights(rasterizer, case.model(device), [black_photograph(device, case)]))
     assert found[3] == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SEEN, SplatStats
@@ -182,7 +182,7 @@ def test_opacity_is_capped(device, rng, count):
 
 def test_opacity_is_capped_after_the_world_filter(device, rng):
     """No filter leaves the limit itself, a strong one leaves everything as it is."""
-    case = with_world_filter(random_case(rng, 300), rng)
+    case = add_world_filter(random_case(rng, 300), rng)
     case.parameters["filter_variance"][:3] = np.array([[0], [1e6], [1e-30]])
     case.parameters["log_scales"][2] = -60  # underflows
     case.parameters["logit_opacity"][:3] = 4

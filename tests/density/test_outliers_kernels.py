@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.checks.density import photograph_of
+from clsplat.conformance.checks.density import black_photograph
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
 from clsplat.density.outliers import PruneFar, PruneWide, largest_on_screen
@@ -47,7 +47,10 @@ def test_empty_model_has_no_center(device, rng):
 def test_screen_sizes_count_only_views_that_show_the_gaussian(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
     mask = rng.random((height, width)) < 0.2
-    held = [photograph_of(device, case, mask), photograph_of(device, case, ~mask & (rng.random(mask.shape) < 0.3))]
+    held = [
+        black_photograph(device, case, mask),
+        black_photograph(device, case, ~mask & (rng.random(mask.shape) < 0.3)),
+    ]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0)
     splats, shown = case.project(), np.zeros(count, bool)

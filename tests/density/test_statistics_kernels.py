@@ -7,7 +7,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import relative_error
-from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
@@ -39,7 +39,7 @@ def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)])
 def test_absolute_gradients(device, rng, count, width, height):
-    case = with_world_filter(random_case(rng, count, width, height, variance=0.1, compensate=1.0), rng)
+    case = add_world_filter(random_case(rng, count, width, height, variance=0.1, compensate=1.0), rng)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     pixel_sums = pixel_sums_of(device, case, weights, ALL)
     assert relative_error(pixel_sums[:, ABS_X:], expected_abs(case, weights)) < 2e-3  # pixels at thresholds

@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.training import DROPOUT, check_dropout, check_hidden
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.deviations import assert_within_bounds
@@ -23,15 +23,15 @@ def test_step_drops_what_the_reference_draws(device, rng, count):
 
 
 def test_filters_and_dropout_multiply(device, rng):
-    case = with_world_filter(random_case(rng, 40, variance=0.1, compensate=1.0), rng)
+    case = add_world_filter(random_case(rng, 40, variance=0.1, compensate=1.0), rng)
     assert_within_bounds(check_dropout(device, replace(case, dropout=DROPOUT), rng, "the scene"))
 
 
 def test_dropped_fraction_equals_the_probability():
-    drawn = [ref.dropped(0.2, 7, step, 500).mean() for step in range(1, 41)]
+    drawn = [ref.drop_mask(0.2, 7, step, 500).mean() for step in range(1, 41)]
     assert abs(np.mean(drawn) - 0.2) < 0.01
     assert len(set(drawn)) > 10, "other steps draw others"
-    assert not ref.dropped(0.0, 7, 1, 500).any()
+    assert not ref.drop_mask(0.0, 7, 1, 500).any()
 
 
 @on_one_setting

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.reference import sh_basis
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.core.errors import OutputError
 from clsplat.core.harmonics import basis, rotate_sh
 from clsplat.gaussians.model import Model, Rendering, load
@@ -25,7 +25,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize(("degree", "filtered"), list(zip(WIDTHS, (False, True, True, False), strict=True)))
 def test_round_trip_gives_the_same_bytes(tmp_path, rng, degree, filtered):
     case = random_case(rng, 7)
-    model = model_of(with_world_filter(case, rng) if filtered else case, degree)
+    model = model_of(add_world_filter(case, rng) if filtered else case, degree)
     model = replace(model, rendering=Rendering(0.3, 0.1, 1.0, "white", "mask", {"version": "0"}))
     model.save(tmp_path / "a.ply")
     read = load(tmp_path / "a.ply")
@@ -55,7 +55,7 @@ def test_properties_are_activated_values(rng):
 
 
 def test_rows_are_selected_by_mask_slice_or_index(rng):
-    model = model_of(with_world_filter(random_case(rng, 9), rng), 1)
+    model = model_of(add_world_filter(random_case(rng, 9), rng), 1)
     mask = model.opacities > np.median(model.opacities)
     for chosen, rows in ((mask, np.flatnonzero(mask)), (slice(1, 8, 3), [1, 4, 7]), (4, [4]), ([5, 5], [5, 5])):
         some = model[chosen]
@@ -66,7 +66,7 @@ def test_rows_are_selected_by_mask_slice_or_index(rng):
 
 
 def test_model_shares_no_memory(rng):
-    given = with_world_filter(random_case(rng, 9), rng).parameters
+    given = add_world_filter(random_case(rng, 9), rng).parameters
     model = Model(**given)
     for other in (given, model[:4].tables(), model[:].tables(), model.transformed().tables(), model.baked().tables()):
         for name, table in other.items():
@@ -76,7 +76,7 @@ def test_model_shares_no_memory(rng):
 @on_one_setting
 @pytest.mark.parametrize("degree", WIDTHS)
 def test_moved_model_looks_the_same_to_a_moved_camera(device, rng, degree):
-    case = with_world_filter(random_case(rng, 40, compensate=1.0), rng)
+    case = add_world_filter(random_case(rng, 40, compensate=1.0), rng)
     model, scale, turn, shift = model_of(case, degree), 2.5, random_rotation(rng), rng.normal(size=3)
     pose = case.view.world_to_camera
     rotation = pose[:, :3] @ turn.T

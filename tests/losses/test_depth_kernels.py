@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import relative_error
-from clsplat.conformance.checks.blending import check_depth, gradients_of, inverse_depths, losses_of_depths
+from clsplat.conformance.checks.blending import check_depth, differentiate, inverse_depths, losses_of_depths
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.core.errors import ConfigError
 from clsplat.losses.depth import InverseDepth
@@ -39,7 +39,7 @@ def test_pixel_box_filter(device, rng):
 def test_schedules_agree(device, rng):
     case, weights = random_case(rng, 150, 50, 70), rng.normal(size=(4, 70, 50)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
-    for number, (one, two) in enumerate(zip(*(gradients_of(d, case, weights) for d in (device, other)), strict=True)):
+    for number, (one, two) in enumerate(zip(*(differentiate(d, case, weights) for d in (device, other)), strict=True)):
         assert relative_error(two, one) < 1e-5
         if number == 0:
             assert_schedules_agree(device, two, one)

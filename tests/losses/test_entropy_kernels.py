@@ -7,8 +7,8 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import GRADIENT, relative_error
-from clsplat.conformance.checks.blending import BACKGROUND, dim
-from clsplat.conformance.checks.images import comparison_of
+from clsplat.conformance.checks.blending import BACKGROUND, make_dim
+from clsplat.conformance.checks.images import make_comparison
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.core.errors import ConfigError
 from clsplat.losses.base import Comparison
@@ -104,7 +104,7 @@ def test_plane_and_gradient(device, rng, count, width, height):
 
 
 def test_long_tiles_dim_and_finished_pixels(device, rng):
-    for change in (dim, lambda p: (p["log_scales"].__iadd__(0.6), p["logit_opacity"].__iadd__(2))):
+    for change in (make_dim, lambda p: (p["log_scales"].__iadd__(0.6), p["logit_opacity"].__iadd__(2))):
         case = safe_case(rng, 300, 14, 14, 2e-6, change)
         expected = ref.weight_entropy(case.project(), 14, 14)
         np.testing.assert_allclose(entropy_of(device, case), expected, atol=1e-4)
@@ -140,7 +140,7 @@ def test_zero_entropy_weight_gives_the_sums_of_plain_steps(device, rng):
 def with_entropy(device: Device, rng, width: int, height: int) -> tuple[Comparison, np.ndarray]:
     """A comparison whose image has a fourth plane, and that plane; its gradient is 7 everywhere."""
     x = rng.uniform(0, 1, (4, height, width)).astype(np.float32)
-    comparison = comparison_of(device, x, x[:3])
+    comparison = make_comparison(device, x, x[:3])
     gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
     gradient.fill(7)
     return replace(comparison, gradient=gradient), x[3]
@@ -163,7 +163,7 @@ def test_loss_value_and_gradient(device, rng, width, height):
 def test_frame_without_the_plane_is_refused(device, rng):
     x = rng.uniform(0, 1, (3, 5, 5)).astype(np.float32)
     with pytest.raises(ConfigError, match="weight_entropy needs a frame with the content 'entropy'"):
-        WeightEntropy().add(comparison_of(device, x, x))
+        WeightEntropy().add(make_comparison(device, x, x))
 
 
 def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import LOSSES, camera_of, check_loss, comparison_of
+from clsplat.conformance.checks.images import LOSSES, check_loss, make_camera, make_comparison
 from clsplat.conformance.checks.images import image_pair as images
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
@@ -27,7 +27,7 @@ def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
 
 @on_one_setting
 def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
-    comparison = comparison_of(device, *images(rng, 5, 3))
+    comparison = make_comparison(device, *images(rng, 5, 3))
     tile = comparison.camera.tile
     large = replace(comparison.camera, width=2**15, height=2**14, tiles_x=2**15 // tile, tiles_y=2**14 // tile)
     with pytest.raises(DataError, match=r"32768x16384 pixels is too large for SSIM \(at most 477,218,588\)"):
@@ -38,7 +38,7 @@ def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
 @on_one_setting
 def test_losses_add_up(device, rng):
     x, y = images(rng, 50, 20)
-    comparison = comparison_of(device, x, y)
+    comparison = make_comparison(device, x, y)
     L1(weight=0.8).add(comparison)
     Dssim(weight=0.2).add(comparison)
     L2(weight=3.0).add(comparison)
@@ -51,7 +51,7 @@ def test_losses_add_up(device, rng):
 def test_equal_images_have_zero_loss(device, rng):
     x, _ = images(rng, 40, 30)
     for loss in (kind for kind in variants(ImageLoss).values() if kind.reads_photograph):
-        comparison = comparison_of(device, x, x)
+        comparison = make_comparison(device, x, x)
         assert loss().add(comparison).value() == pytest.approx(0, abs=1e-6)
         assert np.abs(gradient_of(comparison)).max() < 1e-7
 
@@ -59,7 +59,7 @@ def test_equal_images_have_zero_loss(device, rng):
 def test_flat_images(device):
     """Variances are zero: rounding must not make the gradient blow up."""
     x, y = np.full((3, 30, 40), 0.999, np.float32), np.full((3, 30, 40), 1.0, np.float32)
-    comparison = comparison_of(device, x, y)
+    comparison = make_comparison(device, x, y)
     Dssim().add(comparison)
     expected = ref.dssim(x.astype(np.float64), y.astype(np.float64))[1]
     assert np.abs(gradient_of(comparison) - expected).max() < 2e-7
@@ -68,7 +68,7 @@ def test_flat_images(device):
 @on_devices("width, height", SIZES[3:9])
 def test_pixels_are_unpacked_and_scaled(device, rng, width, height):
     pixels = rng.integers(0, 256, (4, height, width)).astype(np.uint8)
-    camera = camera_of(device, width, height)
+    camera = make_camera(device, width, height)
     workspace = Workspace(device)
     workspace.array("photograph", (4, camera.rows, camera.stride)).fill(9)
     for channels, factor in ((3, 1 / 255), (1, 1.0), (4, 0.5)):
@@ -88,13 +88,13 @@ def test_ssim_against_scikit_image(device, rng):
     _, full = metrics.structural_similarity(x, y, channel_axis=0, full=True, **options)
     oracle = ref.ssim_map(x.astype(np.float64), y.astype(np.float64))
     np.testing.assert_allclose(full[:, 5:-5, 5:-5], oracle[:, 5:-5, 5:-5], atol=1e-5)
-    _, sums = ssim_maps(comparison_of(device, x, y))
+    _, sums = ssim_maps(make_comparison(device, x, y))
     assert sums.get().sum(dtype=np.float64) / x.size == pytest.approx(oracle.mean(), rel=1e-5)
 
 
 @on_devices("width, height", SIZES[3:9])
 def test_mask_blackens_excluded_pixels(device, rng, width, height):
-    camera = camera_of(device, width, height)
+    camera = make_camera(device, width, height)
     colors = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
     mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
     photograph = Photograph(camera, device.upload(colors), device.upload(mask))
@@ -112,7 +112,7 @@ def test_mask_blackens_excluded_pixels(device, rng, width, height):
 
 @on_one_setting
 def test_photograph_without_a_mask_counts_everywhere(device, rng):
-    photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
+    photograph = Photograph(make_camera(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
     assert photograph.planes(Workspace(device)).mask is None
     assert photograph.counted() is None
     assert photograph.nbytes == 45

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import comparison_of, image_pair
+from clsplat.conformance.checks.images import image_pair, make_comparison
 from clsplat.conformance.scenes import random_case
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
@@ -29,7 +29,7 @@ def test_view_error_equals_the_loss(device, rng, width, height):
     """L1 itself, and twice L2: the gradient by the image times what is missing to the photograph."""
     x, y = image_pair(rng, width, height)
     for loss, value, factor in ((L1(weight=0.7), ref.l1, 1), (L2(weight=0.7), ref.l2, 2)):
-        comparison = comparison_of(device, x, y)
+        comparison = make_comparison(device, x, y)
         loss.add(comparison)
         expected = factor * 0.7 * value(x.astype(np.float64), y.astype(np.float64))[0]
         np.testing.assert_allclose(view_error(comparison).get(), [expected], rtol=1e-5)
@@ -38,7 +38,7 @@ def test_view_error_equals_the_loss(device, rng, width, height):
 @on_one_setting
 def test_equal_images_have_zero_error(device, rng):
     x, _ = image_pair(rng, 40, 30)
-    assert view_error(comparison_of(device, x, x)).get() == 0
+    assert view_error(make_comparison(device, x, x)).get() == 0
 
 
 def stats_of(device, count, exposure, losses, mask=None, views=1) -> SplatStats:
@@ -121,7 +121,7 @@ def test_gain_is_the_largest_change_over_all_directions(device, rng, count):
     frame = Rasterizer(device, "radix").forward(model, camera, device.zeros(3))
     gradient = rng.normal(size=(2, model.gaussians.capacity)).astype(np.float32)
     stats, black = SplatStats(model.gaussians, ["gain"]), np.zeros((3, 32, 48), np.float32)
-    stats.add(ViewGradients(frame, comparison_of(device, black, black), [], None), device.upload(gradient))
+    stats.add(ViewGradients(frame, make_comparison(device, black, black), [], None), device.upload(gradient))
     expected, angles = np.zeros(count), np.linspace(0, 2 * np.pi, 1000)
     splats = case.project()
     blended = frame.splats.get()[:count].any(axis=1)  # zero where no pixel of the image shows it

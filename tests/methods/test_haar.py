@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import camera_of, check_haar, planes_of
+from clsplat.conformance.checks.images import check_haar, make_camera, to_planes
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
@@ -38,10 +38,10 @@ def taps_of(scalars: dict[str, float]) -> np.ndarray:
 
 def apply_haar(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> np.ndarray:
     """The photograph [3, H, W] after the transform."""
-    camera = camera_of(device, image.shape[2], image.shape[1])
-    counted = None if mask is None else planes_of(device, camera, mask[None])
+    camera = make_camera(device, image.shape[2], image.shape[1])
+    counted = None if mask is None else to_planes(device, camera, mask[None])
     scalars = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
-    planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted)
+    planes = Planes(Workspace(device), camera, to_planes(device, camera, image), counted)
     return apply_filter(planes, scalars).colors.get()[:, : camera.height, : camera.width]
 
 
@@ -61,7 +61,7 @@ def test_reference_matches_the_closed_form(rng, share):
     for row, column in np.ndindex(2, 2):
         across, down = (-1) ** column * share, (-1) ** row * share
         expected[:, row::2, column::2] = m + across * h + down * v + across * down * g
-    np.testing.assert_allclose(ref.haar_filtered(image, share * np.array(HAAR)), expected, atol=1e-14)
+    np.testing.assert_allclose(ref.haar_filter(image, share * np.array(HAAR)), expected, atol=1e-14)
 
 
 @on_devices("masked", [False, True])
@@ -142,7 +142,7 @@ def test_gradient_is_the_sum_over_all_losses(device, rng, learn, masked):
 
     def total(scalars: dict[str, float]) -> float:
         taps = taps_of(scalars)
-        found = ref.haar_filtered(colors, taps, counted) * (1 if counted is None else counted)
+        found = ref.haar_filter(colors, taps, counted) * (1 if counted is None else counted)
         parts = ((0.8, ref.l1), (0.2, ref.dssim), (3.0, ref.l2))
         images = sum(weight * loss(image, found)[0] for weight, loss in parts)
         return images + 0.01 * 2 * ((taps - HAAR) ** 2).sum()

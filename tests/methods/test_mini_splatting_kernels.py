@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.checks.density import photograph_of
+from clsplat.conformance.checks.density import black_photograph
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
 from clsplat.density.importance import Weights, heaviest
@@ -24,7 +24,7 @@ def test_weights_match_the_reference(device, rng, count, width, height):
     """Two views that differ by their masks; the useful ones by adding weights one after another."""
     case = safe_case(rng, count, width, height, MARGIN)
     masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
-    held = [photograph_of(device, case, mask) for mask in masks]
+    held = [black_photograph(device, case, mask) for mask in masks]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     found = sampled_weights(Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0), 0.9)
     expected = [ref.contribution(case.project(), width, height, mask) for mask in masks]
@@ -43,7 +43,7 @@ def test_weights_match_the_reference(device, rng, count, width, height):
 @on_one_setting
 def test_views_are_sampled(device, rng):
     case = safe_case(rng, 17, 33, 31, MARGIN)
-    held = [photograph_of(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
+    held = [black_photograph(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(5), 3, 600)
     places = survey.sample_views(2)
@@ -60,7 +60,7 @@ def test_each_view_needs_its_heaviest_gaussians(device, rng, count, width, heigh
     case = safe_case(rng, count, width, height, MARGIN)
     case.parameters["means"][::7] += 100.0  # out of sight
     masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
-    held = [photograph_of(device, case, mask) for mask in masks]
+    held = [black_photograph(device, case, mask) for mask in masks]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0)
     for share in (0.0, 0.9, 1.0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.checks.appearance import check_color
-from clsplat.conformance.checks.images import camera_of, planes_of
+from clsplat.conformance.checks.images import make_camera, to_planes
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
@@ -33,8 +33,8 @@ def test_image_and_derivatives(device, rng, width, height):
 @on_one_setting
 def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
-    camera = camera_of(device, 33, 18)
-    found = transform_colors(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
+    camera = make_camera(device, 33, 18)
+    found = transform_colors(Workspace(device), camera, to_planes(device, camera, image), IDENTITY).get()
     assert (found[:, :18, :33] == np.minimum(image, 1)).all()
 
 

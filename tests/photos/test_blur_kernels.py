@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from clsplat.conformance.reference import blurred
-from clsplat.conformance.reference.images import averaged
+from clsplat.conformance.reference import blur
+from clsplat.conformance.reference.images import masked_mean
 from clsplat.core.schedule import at_step
 from clsplat.photos.transforms import Blur, MeanFilter
 from clsplat.pipeline.loading import load
@@ -22,7 +22,7 @@ def test_blur_matches_the_reference(device, rng, width, height, sigma, share):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     mask = None if share is None else rng.random((height, width)) < share
     found = colors_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
-    np.testing.assert_allclose(found, blurred(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(found, blur(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
 
 
 def test_pixel_without_counted_neighbors_is_unchanged(device, rng):
@@ -48,10 +48,10 @@ def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
 
 def test_zero_sigma_leaves_the_image(device, rng):
     image = rng.uniform(0, 1, (3, 5, 9)).astype(np.float32)
-    blur = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
-    np.testing.assert_array_equal(colors_of(blur.apply(planes_of(device, image), step=9)), image)
-    expected = blurred(image.astype(np.float64), 2.0)
-    np.testing.assert_allclose(colors_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
+    transform = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
+    np.testing.assert_array_equal(colors_of(transform.apply(planes_of(device, image), step=9)), image)
+    expected = blur(image.astype(np.float64), 2.0)
+    np.testing.assert_allclose(colors_of(transform.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
 
 
 @on_devices(
@@ -64,7 +64,7 @@ def test_mean_filter_matches_the_reference(device, rng, share, reach, masked):
     found = colors_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
     if reach == 0:
         np.testing.assert_array_equal(found, image)
-    np.testing.assert_allclose(found, averaged(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(found, masked_mean(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(("recipe", "end"), [("opti3dgs", 12000), ("opti3dgs_7k", 2800)])

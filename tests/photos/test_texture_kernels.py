@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from clsplat.conformance.checks.images import camera_of
+from clsplat.conformance.checks.images import make_camera
 from clsplat.conformance.scenes import random_case
 from clsplat.photos.photographs import Photograph, known_gradient, texture_quantile
 from clsplat.render.rasterizer import Rasterizer
@@ -23,7 +23,7 @@ def magnitude_of(image: np.ndarray) -> np.ndarray:
 
 @on_devices("width, height", SIZES)
 def test_image_gradient(device, rng, width, height):
-    camera = camera_of(device, width, height)
+    camera = make_camera(device, width, height)
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     planes[:, :height, :width] = image
@@ -47,7 +47,7 @@ def test_image_gradient(device, rng, width, height):
 @on_devices("width, height", SIZES)
 def test_masked_pixels_have_no_texture(device, rng, width, height):
     """Nor have its neighbors, and neither the texture nor its quantiles depend on what is hidden."""
-    camera, workspace = camera_of(device, width, height), Workspace(device)
+    camera, workspace = make_camera(device, width, height), Workspace(device)
     mask = rng.random((height, width)) < 0.9
     known = ndimage.minimum_filter(mask, 3, mode="nearest")
     found = []

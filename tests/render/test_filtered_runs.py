@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.conformance.reference import filtered
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.reference import apply_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case
 from clsplat.core.errors import Interrupted
 from clsplat.core.progress import Progress
 from clsplat.formats.ply import write_ply
@@ -162,13 +162,15 @@ def on_device(run: Run, opened: ModelFile):
 
 
 def test_baking_is_the_filter(rng):
-    case = with_world_filter(random_case(rng, 200), rng)
+    case = add_world_filter(random_case(rng, 200), rng)
     parameters = {name: table.copy() for name, table in case.parameters.items()}
     parameters["filter_variance"][0] = 0
     parameters["filter_variance"][1] = 1e30  # spreads the Gaussian out to nothing
     fused = Model(**parameters).baked().tables()
     double = {name: table.astype(np.float64) for name, table in parameters.items()}
-    scale, opacity = filtered(double["log_scales"], double["logit_opacity"][:, 0], double["filter_variance"][:, 0])
+    scale, opacity = apply_world_filter(
+        double["log_scales"], double["logit_opacity"][:, 0], double["filter_variance"][:, 0]
+    )
     np.testing.assert_allclose(np.exp(fused["log_scales"].astype(np.float64)), scale, rtol=2e-6)
     drawn = 1 / (1 + np.exp(-fused["logit_opacity"][:, 0].astype(np.float64)))
     np.testing.assert_allclose(drawn, opacity, rtol=1e-5, atol=1e-30)
@@ -185,7 +187,7 @@ def test_run_without_a_world_filter_writes_one_file(tiny_scene, tmp_path):
 
 def test_files_of_other_programs_with_a_filter_render_with_mip(tmp_path, rng, tiny_scene):
     """Mip-Splatting's own files have `filter_3D` and no comment; other trainers write the comment alone."""
-    case = with_world_filter(random_case(rng, 5), rng)
+    case = add_world_filter(random_case(rng, 5), rng)
     for keep_filter in (True, False):
         path = tmp_path / f"{keep_filter}.ply"
         names = [*PARAMETERS, *(["filter_variance"] if keep_filter else [])]

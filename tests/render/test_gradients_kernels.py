@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import GRADIENT, relative_error
-from clsplat.conformance.scenes import SHARP, Case, random_case, safe_case, with_world_filter
+from clsplat.conformance.scenes import SHARP, Case, add_world_filter, random_case, safe_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
 from tests.support.devices import on_devices, on_one_setting
@@ -82,7 +82,7 @@ def test_gradients(device, rng, count, width, height):
 
 @on_devices("variance, compensate", [(0.3, 1.0), (0.1, 1.0)])
 def test_gradients_with_filters(device, rng, variance, compensate):
-    case = with_world_filter(random_case(rng, 30, 32, 24), rng)
+    case = add_world_filter(random_case(rng, 30, 32, 24), rng)
     case = replace(case, variance=variance, compensate=compensate)
     weights = rng.normal(size=(3, 24, 32)).astype(np.float32)
     smooth = Device(device.info, device.schedule)

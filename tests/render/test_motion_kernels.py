@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, relative_error
-from clsplat.conformance.checks.motion import TIME, check_moment, motion, moving_case
+from clsplat.conformance.checks.motion import TIME, check_motion_at_time, motion, moving_case
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.formats.splats import MOTION, PARAMETERS, STATIC_LOG_DURATION, WIDTHS, motion_width
@@ -25,7 +25,7 @@ def test_motion_and_its_gradients(device, rng):
 
 @on_devices("count", [16, 63, 64, 129])
 def test_sizes_around_the_groups(device, rng, count):
-    assert_within_bounds(check_moment(device, rng, count, motion_width(2, True)))
+    assert_within_bounds(check_motion_at_time(device, rng, count, motion_width(2, True)))
 
 
 @on_one_setting
@@ -60,7 +60,9 @@ def test_image_gradients_reach_the_motion(device, rng):
     static = gradients_of(replace(model, gaussians=Gaussians(device, tables)))
     upstream = static["means"], static["quats"], static["logit_opacity"][:, 0]
     logit = p["logit_opacity"][:, 0].astype(np.float64)
-    grad_motion, grad_logit = ref.moved_backward(p[MOTION].astype(np.float64), logit, *upstream, TIME, *WIDTHS[width])
+    grad_motion, grad_logit = ref.move_gaussians_backward(
+        p[MOTION].astype(np.float64), logit, *upstream, TIME, *WIDTHS[width]
+    )
     found = gradients_of(model)
     for column in range(width):
         assert relative_error(found[MOTION][:, column], grad_motion[:, column]) < CONIC

@@ -8,9 +8,9 @@ import pytest
 from scipy.special import ndtr
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.blending import check_blend, check_sum, pixel_sums_of, render
-from clsplat.conformance.checks.pixel_box import BOX, SIZES, of_size
-from clsplat.conformance.checks.projection import check_record, not_drawable, splats_of
+from clsplat.conformance.checks.blending import check_blend, check_sum, render, sum_pixels
+from clsplat.conformance.checks.pixel_box import BOX, SIZES, sized_case
+from clsplat.conformance.checks.projection import check_record, project_records, undrawable_case
 from clsplat.conformance.reference.blending import box_derivatives, box_response
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
@@ -138,21 +138,21 @@ def assert_within_bounds(deviations) -> None:
 
 @on_devices("width, height, size", each_once([(16, 16), (17, 15), (33, 31), (5, 3)], SIZES))
 def test_edges_of_tiles(device, rng, width, height, size):
-    case = of_size(SIZES[size], rng, 20, width, height)
+    case = sized_case(SIZES[size], rng, 20, width, height)
     assert_within_bounds(check_blend(device, case, size))
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
-    assert_within_bounds(check_sum(case, pixel_sums_of(device, case, weights, 11), weights, size))
+    assert_within_bounds(check_sum(case, sum_pixels(device, case, weights, 11), weights, size))
 
 
 def test_degenerate_splats_are_not_drawn(device, rng):
-    case = replace(not_drawable(rng), **BOX)
-    records, keys, _ = splats_of(device, case)
+    case = replace(undrawable_case(rng), **BOX)
+    records, keys, _ = project_records(device, case)
     culled = [0, 1, 2, 3, 4, 5, 7, 8]
     assert (records[culled] == 0).all()
     assert (keys[culled] == 0xFFFFFFFF).all()
     frame = render(device, case)
     assert np.isfinite(frame.image.get()).all()
-    sums = pixel_sums_of(device, case, np.ones((3, 30, 40), np.float32), 15, texture=np.ones((30, 40), np.float32))
+    sums = sum_pixels(device, case, np.ones((3, 30, 40), np.float32), 15, texture=np.ones((30, 40), np.float32))
     assert np.isfinite(sums).all()
 
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance.checks.projection import (
-    beyond_the_clamp,
     check_gradient,
     check_hidden,
     check_pose,
     check_record,
-    not_drawable,
-    splats_of,
+    clamped_case,
+    project_records,
+    undrawable_case,
 )
-from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
 from clsplat.render.rasterizer import RECORD, Rasterizer, RenderLimits
@@ -34,7 +34,7 @@ def test_records_at_group_edges(device, rng, count):
 
 @on_devices("variance, compensate", [(0.3, 0.0)])
 def test_filters(device, rng, variance, compensate):
-    compare(device, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
+    compare(device, add_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
 
 
 @on_devices("count, views", each_once(COUNTS, [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1]))
@@ -74,15 +74,15 @@ def test_bands_omit_the_same_gaussians(device, rng):
 
 @on_one_setting
 def test_nothing_to_project(device, rng):
-    records, keys, _ = splats_of(device, random_case(rng, 0))
+    records, keys, _ = project_records(device, random_case(rng, 0))
     assert records.shape == (0, RECORD)
     assert keys.shape == (0,)
 
 
 @on_one_setting
 def test_degenerate_gaussians_are_culled(device, rng):
-    case = not_drawable(rng)
-    records, keys, radius = splats_of(device, case)
+    case = undrawable_case(rng)
+    records, keys, radius = project_records(device, case)
     for n in (0, 1, 2, 3, 4, 5, 7, 8):
         assert (records[n] == 0).all(), n
         assert keys[n] == 0xFFFFFFFF
@@ -108,12 +108,12 @@ def test_gradients_at_group_edges(device, rng, count):
 
 @on_devices("variance, compensate", [(0.3, 0.0)])
 def test_gradients_through_the_filters(device, rng, variance, compensate):
-    backward_case(device, rng, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
+    backward_case(device, rng, add_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
 
 
 @on_one_setting
 def test_gradients_where_the_ray_is_clamped(device, rng):
-    case = beyond_the_clamp(rng)
+    case = clamped_case(rng)
     in_camera = case.parameters["means"] @ case.camera().rotation.T + case.camera().translation
     limits = case.device_camera(device).array.get()[0]
     assert (np.abs(in_camera[:, 0] / in_camera[:, 2]) > limits["ray_x_max"]).any()

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.tiles import check_bitonic, check_radix, check_scan, tiler_of
+from clsplat.conformance.checks.tiles import check_bitonic, check_radix, check_scan, make_tiler
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DataError
 from clsplat.opencl import device as program
@@ -258,7 +258,7 @@ def test_scan_saturates_at_the_largest_number(device, before):
     values = np.ones(before + 4, np.uint32)
     values[[0, -2, -1]] = 2**31, 2**31 - 3, 5
     assert_within_bounds([check_scan(device, values)])
-    assert tiler_of(device).scan(device.upload(values), len(values), "test").get()[-1] == 2**32 - 1
+    assert make_tiler(device).scan(device.upload(values), len(values), "test").get()[-1] == 2**32 - 1
     assert_within_bounds([check_scan(device, np.array([2**31, 2**31, 5], np.uint32))])
 
 

@@ -12,7 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from clsplat.opencl.device import BUILD_OPTIONS, parse_kernels
-from clsplat.opencl.discovery import tuning_of
+from clsplat.opencl.discovery import tuning_macros
 from tests.targets import accepted, amd, figures, intel, nvidia, page
 from tests.targets.__main__ import VENDOR_OF, VENDORS, compile_all, compile_one, versions_of
 from tests.targets.builds import GPU, KERNELS, PASSED, Build, builds
@@ -71,7 +71,7 @@ def planted(folder: Path, source: str) -> Build:
 
 
 def test_builds_use_the_options_of_the_device():
-    wanted = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(tuning_of(GPU, "simt").items()))]
+    wanted = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(tuning_macros(GPU, "simt").items()))]
     assert [build.options for build in builds(["simt"], ["fill.cl"])] == [wanted]
     (wide,) = builds(["wide"], ["fill.cl"])
     assert "-DLANES=8" in wide.options

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from clsplat.conformance.checks.images import camera_of
+from clsplat.conformance.checks.images import make_camera
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import Comparison, Loss
@@ -17,7 +17,7 @@ from clsplat.training.trainer import StepTrainer
 
 def planes_of(device, image: np.ndarray, mask: np.ndarray | None = None) -> Planes:
     """image: [3, H, W]; mask: [H, W]."""
-    camera = camera_of(device, image.shape[2], image.shape[1])
+    camera = make_camera(device, image.shape[2], image.shape[1])
 
     def padded(values: np.ndarray) -> np.ndarray:
         planes = np.zeros((len(values), camera.rows, camera.stride), np.float32)

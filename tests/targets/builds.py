@@ -11,7 +11,7 @@ from clsplat.core.resources import resource_dir
 from clsplat.core.settings import variants
 from clsplat.density.statistics import Statistic
 from clsplat.opencl.device import BUILD_OPTIONS, flatten, parse_kernels
-from clsplat.opencl.discovery import DeviceInfo, tuning_of
+from clsplat.opencl.discovery import DeviceInfo, tuning_macros
 from clsplat.render.rasterizer import PIXEL_SUMS
 
 Schedule = Literal["simt", "wide"]
@@ -80,7 +80,7 @@ def _of_file(path: Path, schedule: Schedule) -> Iterator[Build]:
     seen: set[tuple[tuple[str, int | str], ...]] = set()
     for info in DEVICES[schedule]:
         for passed in [{}, *PASSED.get(path.name, [])]:
-            defines = {**tuning_of(info, schedule), **passed}
+            defines = {**tuning_macros(info, schedule), **passed}
             read = {name: value for name, value in sorted(defines.items()) if name in words}
             first = first or read
             if tuple(read.items()) not in seen:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.projection import not_drawable
-from clsplat.conformance.checks.training import behind_each_fifth, check_average, check_seen, check_step
-from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.conformance.checks.projection import undrawable_case
+from clsplat.conformance.checks.training import check_average, check_seen_rows, check_step, put_every_fifth_behind
+from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
@@ -87,7 +87,7 @@ def test_steps(device, rng, count):
 )
 def test_fused_update_equals_stored_gradients(device, rng, count, degree, sh_rest, rows):
     """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
-    case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
+    case = put_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
     weights = rng.normal(size=(3, 32, 48)).astype(np.float32)
     weights[:, 30:], weights[:, :, 40:] = 0, 0
     tables = []
@@ -176,7 +176,9 @@ def test_rate_of_the_means_decays():
 
 @on_devices("count", [0, 16, 63, 64, 150])
 def test_visible_rows(device, rng, count):
-    assert_within_bounds(check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians"))
+    assert_within_bounds(
+        check_seen_rows(device, rng, put_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
+    )
 
 
 @on_devices(
@@ -214,7 +216,7 @@ def test_gaussian_with_a_pixel_is_visible(device, rng):
 @on_devices("from_memory", [False, True])
 def test_degenerate_rows_keep_their_bits(device, rng, from_memory):
     """Behind the camera, huge, faint or not numbers."""
-    case = not_drawable(rng)
+    case = undrawable_case(rng)
     undrawn = case.model(device)
     seen = frame_of(device, case, undrawn).depth_key.get()[:40] != 0xFFFFFFFF
     before, after = updated(device, case, "seen", from_memory)
@@ -225,7 +227,7 @@ def test_degenerate_rows_keep_their_bits(device, rng, from_memory):
 
 @on_devices("vectors, rows", each_once([1, 2, 8, 1, 2, 8], ["all", "seen"]))
 def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows):
-    case = behind_each_fifth(random_case(rng, 150))
+    case = put_every_fifth_behind(random_case(rng, 150))
     case.parameters["means"][40:90] -= 20 * case.view.world_to_camera[2, :3]  # whole vectors
     expected = updated(device, case, rows)[1]
     for name, table in updated(device, case, rows, vectors=vectors)[1].items():

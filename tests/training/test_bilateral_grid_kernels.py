@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.appearance import check_grid, check_table, grids_of
-from clsplat.conformance.checks.images import camera_of, planes_of
+from clsplat.conformance.checks.appearance import check_grid, check_table, random_grids
+from clsplat.conformance.checks.images import make_camera, to_planes
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.image import L2
@@ -41,21 +41,21 @@ def test_smoothness_updates_and_mean(device, rng, nodes):
 @on_one_setting
 def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
-    camera, workspace = camera_of(device, 33, 18), Workspace(device)
+    camera, workspace = make_camera(device, 33, 18), Workspace(device)
     grids = GridState(BilateralGrid(), ("a",), device)
-    found = grids.transform(workspace, camera, planes_of(device, camera, image), 0)
+    found = grids.transform(workspace, camera, to_planes(device, camera, image), 0)
     assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
     assert not grids.smoothness(workspace, 0).get().any()
 
 
 def test_constant_luminance_reads_the_adjacent_levels(device):
     """Beyond black and white the outer ones; only the gradient through the luminance is cut there."""
-    camera, grids = camera_of(device, 20, 5), grids_of(device, np.random.default_rng(0), (2, 2, 3))
+    camera, grids = make_camera(device, 20, 5), random_grids(device, np.random.default_rng(0), (2, 2, 3))
     values = np.zeros((3, 3, 4, 3, 2, 2), np.float32)
     values[1, range(3), 3] = np.array([0.1, 0.3, 0.2], np.float32)[:, None, None]  # added at each level
     grids.load({}, {"values": values.reshape(grids.shape)})
     for gray, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
-        planes = planes_of(device, camera, np.full((3, 5, 20), gray, np.float32))
+        planes = to_planes(device, camera, np.full((3, 5, 20), gray, np.float32))
         found = grids.transform(Workspace(device), camera, planes, 1).get()[:, :5, :20]
         assert found == pytest.approx(gray + expected, abs=1e-6), gray
 
@@ -122,8 +122,8 @@ def test_single_cell_equals_the_affine_kind(device, rng):
     grids.load({}, {"values": values})
     affine = ExposureState(Exposure(model=Affine(weight=0)), ("a", "b"))
     affine.scalars.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
-    camera, workspace = camera_of(device, 33, 18), Workspace(device)
-    image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
+    camera, workspace = make_camera(device, 33, 18), Workspace(device)
+    image, gradient = (to_planes(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
     found = grids.transform(workspace, camera, image, 1).get()
     expected = transform_colors(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)

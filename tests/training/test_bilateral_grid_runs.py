@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from clsplat.api import commands
-from clsplat.conformance.checks.appearance import grids_of
-from clsplat.conformance.checks.images import camera_of, planes_of
+from clsplat.conformance.checks.appearance import random_grids
+from clsplat.conformance.checks.images import make_camera, to_planes
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import Decay, at_step
 from clsplat.opencl.device import Device
@@ -110,8 +110,8 @@ def test_checkpoints_contain_grids_moments_and_counts(with_grids):
 def bits(device: Device) -> str:
     """The SHA-256 of what two steps with a grid make of an image and of all grids."""
     rng, found = np.random.default_rng(3), hashlib.sha256()
-    one, workspace, camera = grids_of(device, rng, (5, 4, 3)), Workspace(device), camera_of(device, 100, 70)
-    planes = [planes_of(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
+    one, workspace, camera = random_grids(device, rng, (5, 4, 3)), Workspace(device), make_camera(device, 100, 70)
+    planes = [to_planes(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
     for step in (1, 2):
         image, _ = one.transform(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
         gradient, grad_grid = one.differentiate(workspace, camera, *planes, 1)

@@ -10,7 +10,7 @@ import pytest
 
 import clsplat
 from clsplat.conformance.checks.appearance import check_response
-from clsplat.conformance.reference.appearance import taken, taken_backward
+from clsplat.conformance.reference.appearance import apply_response, apply_response_backward
 from clsplat.core.errors import DataError
 from clsplat.core.resources import resource_dir
 from clsplat.data_tools.synthetic import write_dataset
@@ -34,18 +34,18 @@ def test_image_and_derivatives(device, rng, width, height):
 def test_reference_against_finite_differences(rng):
     image, gradient, step = *rng.uniform(-0.3, 1.5, (2, 3, 5, 6)), 1e-6
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
-    for array, found in zip((image, row), taken_backward(image, row, (2.5, 4.0), gradient), strict=True):
+    for array, found in zip((image, row), apply_response_backward(image, row, (2.5, 4.0), gradient), strict=True):
         for index in np.ndindex(array.shape):
             ends, value = [], array[index]
             for array[index] in (value + step, value - step):
-                ends.append((gradient * taken(image, row, (2.5, 4.0))).sum())
+                ends.append((gradient * apply_response(image, row, (2.5, 4.0))).sum())
             array[index] = value
             assert found[index] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-6)
 
 
 def test_curves_are_monotone_and_go_from_black_to_white(rng):
     image = np.broadcast_to(np.linspace(0, 1, 200), (3, 1, 200))
-    found = taken(image, np.concatenate([np.zeros(5), rng.normal(0, 2, 12)]), (0.0, 0.0))
+    found = apply_response(image, np.concatenate([np.zeros(5), rng.normal(0, 2, 12)]), (0.0, 0.0))
     assert (np.diff(found) > 0).all()
     np.testing.assert_allclose(found[..., [0, -1]], [[[0, 1]]] * 3, atol=1e-12)
 

@@ -48,7 +48,7 @@ def test_pose_derivatives_match_those_of_the_image(screen, outside):
     weights = rng.normal(0, 1, (3, camera.height, camera.width))
 
     def value(shift: np.ndarray, turn: np.ndarray, zoom: float = 0.0) -> float:
-        at = ref.moved_camera(camera, shift, turn, zoom)
+        at = ref.move_camera(camera, shift, turn, zoom)
         frame = ref.render(gaussians, at, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen)
         return float(np.sum(weights * frame.image))
 

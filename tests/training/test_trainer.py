@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.images import comparison_of
 from clsplat.conformance.checks.images import image_pair as images
+from clsplat.conformance.checks.images import make_comparison
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.conversion import from_points
@@ -168,7 +168,7 @@ def test_numpy_loss_matches_the_device_loss(any_device, rng, width, height):
     weight = [[0, 0.5], [10, 1.5]]
     found = []
     for loss in (L1(weight=weight), HostLoss(mean_difference, weight)):
-        comparison = comparison_of(any_device, x, y)
+        comparison = make_comparison(any_device, x, y)
         comparison.step = 5
         value = loss.add(comparison)
         found.append((value.value(), gradient_of(comparison)))
@@ -185,7 +185,7 @@ def test_numpy_loss_adds_to_others_in_any_order(any_device, rng, place):
     for loss in (L1(weight=0.7), HostLoss(mean_difference, 0.7)):
         losses: list[ImageLoss] = [Dssim(weight=0.2), L2(weight=3.0)]
         losses.insert(place, loss)
-        comparison = comparison_of(any_device, x, y)
+        comparison = make_comparison(any_device, x, y)
         values = [one.add(comparison).value() for one in losses]
         found.append((sum(values), gradient_of(comparison)))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-6)
@@ -216,7 +216,7 @@ def test_derivative_of_another_shape_is_refused(any_device, rng):
     x, y = images(rng, 5, 4)
     loss = HostLoss(lambda image, photograph: (0.0, np.zeros((3, 4, 5), np.float32)))
     with pytest.raises(ValueError, match=r"gradient of shape \(3, 4, 5\); expected that of the image, \(4, 5, 3\)"):
-        loss.add(comparison_of(any_device, x, y))
+        loss.add(make_comparison(any_device, x, y))
 
 
 @pytest.mark.parametrize("found", [None, 0.0, (0.0,), ("much", np.zeros((4, 5, 3))), (0.0, "much"), (0.0, None, 1)])
@@ -225,7 +225,7 @@ def test_loss_with_an_invalid_return_value_is_refused(any_device, rng, found):
         return found
 
     with pytest.raises(ValueError, match=r"^the loss '?(odd)?.* returned .*; expected ") as caught:
-        HostLoss(odd).add(comparison_of(any_device, *images(rng, 5, 4)))
+        HostLoss(odd).add(make_comparison(any_device, *images(rng, 5, 4)))
     assert "\n" not in str(caught.value)
 
 

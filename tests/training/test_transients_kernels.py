@@ -3,7 +3,7 @@
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import SCALES, camera_of, check_transient, planes_of
+from clsplat.conformance.checks.images import SCALES, check_transient, make_camera, to_planes
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import BINS, mask_transients, measure_residuals
 from tests.support.deviations import assert_within_bounds
@@ -22,17 +22,17 @@ def test_bin_starts_at_its_upper_bits(device):
     for values in (edges, np.nextafter(edges[1:], np.float32(0))):
         x = np.zeros((3, 1, len(values)), np.float32)
         x[1] = 3 * values  # the mean of the channels is exact
-        camera = camera_of(device, len(values), 1)
-        planes = planes_of(device, camera, x), planes_of(device, camera, np.zeros_like(x))
+        camera = make_camera(device, len(values), 1)
+        planes = to_planes(device, camera, x), to_planes(device, camera, np.zeros_like(x))
         numbers = measure_residuals(Workspace(device), camera, *planes, None)[1]()
-        np.testing.assert_array_equal(numbers, ref.residual_numbers(values.astype(np.float64)))
+        np.testing.assert_array_equal(numbers, ref.residual_histogram(values.astype(np.float64)))
 
 
 def test_nan_is_left_for_the_losses(device):
     x = np.zeros((3, 4, 5), np.float32)
     x[1, 2, 3] = np.nan
-    camera = camera_of(device, 5, 4)
-    planes = planes_of(device, camera, x), planes_of(device, camera, np.zeros_like(x))
+    camera = make_camera(device, 5, 4)
+    planes = to_planes(device, camera, x), to_planes(device, camera, np.zeros_like(x))
     workspace = Workspace(device)
     residuals, numbers = measure_residuals(workspace, camera, *planes, None)
     assert numbers().sum() == 20

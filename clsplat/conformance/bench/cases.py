@@ -1,4 +1,4 @@
-"""Time training steps of several scenes in turns, so that a slow moment of the machine affects all; take medians."""
+"""Time training steps of several scenes in turns, so that a slow period of the machine affects all; take medians."""
 
 import statistics
 import time
@@ -36,7 +36,7 @@ from clsplat.training.motion import MotionRates
 from clsplat.training.records import stage_milliseconds
 from clsplat.training.trainer import StepTrainer
 
-MIN_SECONDS = 2e-3  # shortest measurement: the first launch and the final wait take about 0.02 ms of it
+MIN_SECONDS = 2e-3  # shortest measurement, of which the first launch and the final wait take about 0.02 ms
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
             times *= 4
         return min([taken, *(time_launches(launch, times) for _ in range(repeats - 1))]) / times
 
-    piece, whole = max(lanes, 4), program.peak_copy.group[0]  # floats per item, and items per group
-    rounds = 40_000 if is_cpu else 4000  # long enough for the system to spread the threads
+    floats, copy_group = max(lanes, 4), program.peak_copy.group[0]  # per item, and items per group
+    rounds = 40_000 if is_cpu else 4000  # enough for the system to distribute the threads
     fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
     exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
-    length = min(64 << 20, device.info.allocation // 16 // 4) // (piece * whole) * (piece * whole)  # floats
+    length = min(64 << 20, device.info.allocation // 16 // 4) // (floats * copy_group) * (floats * copy_group)
     source, copied = device.zeros(length), device.zeros(length)
-    copy = seconds(lambda: program.peak_copy(items=length // piece, values=source, copied=copied))
+    copy = seconds(lambda: program.peak_copy(items=length // floats, values=source, copied=copied))
     work = items * lanes * rounds
     return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)
 
@@ -121,7 +121,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
 SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
 STEPS = 5  # without a wait between them
 WARM_UP_STEPS = 3  # compile kernels and grow buffers
-TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; at a rate of 0, harmonics are not updated
+TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; a rate of 0 would skip harmonics
 
 
 @dataclass
@@ -131,11 +131,11 @@ class BenchResult:
     work: Work
     stages: dict[str, float]
     floors: dict[str, float]
-    step: float  # on the clock, with a wait for the device after each step
+    step: float  # wall-clock time, with a wait for the device after each step
     steps: float  # of one of `STEPS` steps without a wait between them, as in a training
     densify: float
     host: float  # time of the step minus that of the device's stages
-    memory: int  # bytes on the device, the peak
+    memory: int  # bytes on the device, at peak
     planned: int  # bytes, from the memory plan of training
 
 
@@ -237,10 +237,10 @@ class BenchCase:
         offsets = lists.tile_offset.get()[: camera.tiles + 1]
         tiles = np.empty(lists.pairs, np.int64)
         tiles[lists.tile_pairs.get()[: lists.pairs]] = np.repeat(np.arange(camera.tiles), np.diff(offsets))
-        top = tiles // camera.tiles_x * camera.tile + 0.5
-        first = np.maximum(np.ceil(records[:, SPLAT_Y_MIN] - top), 0)
-        last = np.minimum(np.floor(records[:, SPLAT_Y_MAX] - top), camera.tile - 1)
-        rows = int(np.maximum(last - first + 1, 0).sum()) * camera.tile // 16
+        tile_top = tiles // camera.tiles_x * camera.tile + 0.5
+        first_row = np.maximum(np.ceil(records[:, SPLAT_Y_MIN] - tile_top), 0)
+        last_row = np.minimum(np.floor(records[:, SPLAT_Y_MAX] - tile_top), camera.tile - 1)
+        rows = int(np.maximum(last_row - first_row + 1, 0).sum()) * camera.tile // 16
         return Work(self.trainer.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
 
 
@@ -283,11 +283,11 @@ def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-NEAR = 0.2  # scene units, of the synthetic scene
+NEAR = 0.2  # scene units, near plane of the synthetic scenes
 
 
 def case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> BenchCase:
-    """Return a synthetic scene with a noise image as its photograph."""
+    """Return a benchmark of a synthetic scene, with noise as its photograph."""
     parameters, view = synthetic(width, height, count)
     camera = upload_camera(device, view)
     shape = (3, height, width)
@@ -296,7 +296,7 @@ def case(device: Device, width: int, height: int, count: int, settings: Pipeline
 
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
-    """Return a scene with a splat file, or with Gaussians from a point cloud, at the first training view."""
+    """Return a benchmark of a splat file, or of Gaussians from a point cloud, at the first training view."""
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
@@ -305,6 +305,6 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
 
 
 def with_near(settings: PipelineFile, near: float) -> PipelineFile:
-    """Return settings with this near plane, scene units, if theirs is `auto`."""
+    """Return the settings with this near plane, scene units, instead of `auto`."""
     model = settings.model.model_copy(update={"near": near})
     return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

@@ -55,10 +55,10 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
         actual = _Earlier.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: create it again") from error
+        key_path = ".".join(map(str, first["loc"])) or "the file"
+        raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED}: create it again") from error
     if actual.pipeline != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quote(actual.pipeline)}")
+        raise ConfigError(f"{path}: expected the pipeline '{name}', got {quote(actual.pipeline)}")
     return {key: value for key, value in data.items() if key != "against"}  # its own baseline
 
 
@@ -68,7 +68,7 @@ def peaks_text(peaks: dict[str, float]) -> str:
 
 
 def compare_conditions(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
-    """Return lines about what differs between the `data` of two measurements, other than times."""
+    """Return lines about differences between the `data` of two measurements, other than times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
     if earlier["device"] != now["device"]:
         lines.append(f"  on another device: {quote(earlier['device'])}")
@@ -86,14 +86,14 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
     work, mib = result.work, 2**20
     counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
     rows = [(stage, ms, result.floors.get(stage)) for stage, ms in result.stages.items()]
-    whole = sum(result.floors.values())
-    rows += [(row, getattr(result, key), whole if "step" in row else None) for row, key in WHOLE.items()]
-    was = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in WHOLE.items()}} if earlier else {}
+    total = sum(result.floors.values())
+    rows += [(row, getattr(result, key), total if "step" in row else None) for row, key in WHOLE.items()]
+    before = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in WHOLE.items()}} if earlier else {}
     cells = [["stage", "ms", "floor", "ratio", *(("was", "now/was") if earlier else ())]]
     for stage, ms, floor in rows:
         ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
-        compared = (f"{was[stage]:.2f}", f"{ms / was[stage]:.2f}") if was.get(stage, 0) > 0 else ()
-        cells.append([stage, f"{ms:.2f}", *ratio, *compared])
+        comparison = (f"{before[stage]:.2f}", f"{ms / before[stage]:.2f}") if before.get(stage, 0) > 0 else ()
+        cells.append([stage, f"{ms:.2f}", *ratio, *comparison])
     memory = f"memory {result.memory / mib:,.0f} MiB at peak; training plans {result.planned / mib:,.0f} MiB"
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
 
@@ -115,8 +115,8 @@ class Measurement:
     def text(self, earlier: dict[str, Any]) -> str:
         """Return tables of the times, next to the `data` of an earlier measurement unless that is empty."""
         head = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
-        was = earlier.get("scenes", {})
-        tables = [table(name, result, was.get(name)) for name, result in self.results.items()]
+        earlier_scenes = earlier.get("scenes", {})
+        tables = [table(name, result, earlier_scenes.get(name)) for name, result in self.results.items()]
         return "\n".join([*head, *(compare_conditions(self.data(), earlier) if earlier else ()), *tables])
 
 

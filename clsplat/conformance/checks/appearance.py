@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import SUM, Checks, Results, by_element, equal
-from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
+from clsplat.conformance.checks.images import SIZES, make_camera, outside, to_planes
 from clsplat.conformance.reference import appearance
-from clsplat.conformance.reference.appearance import changed_by_grid
+from clsplat.conformance.reference.appearance import unclamped_grid_colors
 from clsplat.opencl.device import Device
 from clsplat.photos.appearance import IDENTITY, LUMINANCE
 from clsplat.render.camera import CAMERA
@@ -32,14 +32,14 @@ CASES = (  # width, height, nodes
 )
 
 
-def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
+def random_grids(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
     """Return random grids of three photographs."""
     grids = GridState(BilateralGrid(grid_shape=list(nodes), weight=weight), ("a", "b", "c"), device)
     grids.load({}, {"values": rng.normal(0, 0.2, grids.shape).astype(np.float32)})
     return grids
 
 
-def of_photograph(grids: GridState, values: NDArray[Any]) -> NDArray[Any]:
+def photograph_grid(grids: GridState, values: NDArray[Any]) -> NDArray[Any]:
     """Reshape the values of one photograph's grid to [3, 4, nz, ny, nx], float64."""
     return values.reshape(3, 4, *grids.shape[2:]).astype(np.float64)
 
@@ -52,7 +52,7 @@ def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: 
     level = luminance * (grid.shape[2] - 1)
     near = np.abs(level - np.rint(level)) < MARGIN
     near |= (np.abs(luminance) < MARGIN) | (np.abs(luminance - 1) < MARGIN)
-    near |= (np.abs(changed_by_grid(exact, grid) - 1) < MARGIN).any(axis=0)
+    near |= (np.abs(unclamped_grid_colors(exact, grid) - 1) < MARGIN).any(axis=0)
     image[:, near] = 0.1 / max(grid.shape[2] - 1, 1)
     return image
 
@@ -62,60 +62,58 @@ def check_grid(
 ) -> Results:
     """Compare an image, its gradient, and the gradient of the grid."""
     label = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
-    grids = grids_of(device, rng, nodes)
-    grid = of_photograph(grids, grids.tables()["values"][1])
+    grids = random_grids(device, rng, nodes)
+    grid = photograph_grid(grids, grids.tables()["values"][1])
     image = image_for(rng, grid, width, height, channels)
     gradient = rng.normal(size=image.shape).astype(np.float32)
-    camera, workspace = camera_of(device, width, height), Workspace(device)
+    camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
-    planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
+    planes, uploaded = to_planes(device, camera, image), to_planes(device, camera, gradient)
     exact = image[:3].astype(np.float64)
-    actual = grids.transform(workspace, camera, planes, 1).get()
-    expected = ref.gridded(exact, grid)
-    yield by_element("color_grid_forward", f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal("color_grid_forward", f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
-    passed, by_grid = grids.differentiate(workspace, camera, planes, uploaded, 1)
-    by_image, expected = ref.gridded_backward(exact, grid, gradient[:3].astype(np.float64))
-    largest = max(float(np.abs(by_image).max()), 1.0)
-    grad_image, grad_grid = passed.get(), by_grid.get()
-    yield by_element(
-        "color_grid_backward", f"gradient, {label}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
-    )
-    yield equal("color_grid_backward", f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
+    colors = grids.transform(workspace, camera, planes, 1).get()
+    expected = ref.apply_color_grid(exact, grid)
+    yield by_element("color_grid_forward", f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal("color_grid_forward", f"pixels outside the image, {label}", outside(camera, colors[:3]), 0.0)
+    gradients = grids.differentiate(workspace, camera, planes, uploaded, 1)
+    grad_image, grad_grid = (array.get() for array in gradients)
+    expected_image, expected_grid = ref.color_grid_backward(exact, grid, gradient[:3].astype(np.float64))
+    largest = max(float(np.abs(expected_image).max()), 1.0)
+    actual, kernel = grad_image[:3, :height, :width], "color_grid_backward"
+    yield by_element(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=largest)
+    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
-        yield by_element(
-            kernel, f"gradient by the grid, {label}", of_photograph(grids, grad_grid), expected, SUM, floor=floor
-        )
+        actual = photograph_grid(grids, grad_grid)
+        yield by_element(kernel, f"gradient by the grid, {label}", actual, expected_grid, SUM, floor=floor)
     if channels > 3:
-        yield equal("color_grid_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield equal("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
         yield equal("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
     """Compare the smoothness of a grid and three updates of it, which leave the other grids unchanged."""
     label, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
-    grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
+    grids, workspace = random_grids(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
     moment1, moment2 = np.zeros((2, row_length(nodes)))
     grids.rate = rate = 0.01
     for step in range(1, 4):
         terms = grids.smoothness(workspace, 1)
         grad_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
-        smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
-        actual, wanted = np.array([terms.get().sum(dtype=np.float64)]), np.array([weight * smooth])
+        smoothness, slope = ref.grid_smoothness(photograph_grid(grids, expected[1]))
+        actual, truth = np.array([terms.get().sum(dtype=np.float64)]), np.array([weight * smoothness])
         kernel = "color_grid_smoothness"
-        yield by_element(kernel, f"value, {label}", actual, wanted, SUM, floor=1e-2)
-        actual, wanted = of_photograph(grids, grad_smoothness), weight * slope
-        largest = max(float(np.abs(wanted).max()), 1e-6)
-        yield by_element(kernel, f"derivatives, {label}", actual, wanted, 2e-5, floor=largest)
+        yield by_element(kernel, f"value, {label}", actual, truth, SUM, floor=1e-2)
+        actual, truth = photograph_grid(grids, grad_smoothness), weight * slope
+        largest = max(float(np.abs(truth).max()), 1e-6)
+        yield by_element(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, 1, device.upload(gradient), step)
-        whole = gradient.astype(np.float64) + grad_smoothness
-        expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
-        updated = np.stack([of_photograph(grids, values) for values in expected])
-        expected = ref.centered_grids(updated).reshape(expected.shape)
+        total = gradient.astype(np.float64) + grad_smoothness
+        expected[1], moment1, moment2 = ref.adam_step(expected[1], total, moment1, moment2, step, rate)
+        updated = np.stack([photograph_grid(grids, values) for values in expected])
+        expected = ref.center_grids(updated).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
         yield by_element(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)
@@ -146,26 +144,28 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     near = np.abs(np.einsum("ab,bhw->ahw", matrix[:, :3], image[:3]) + matrix[:, 3, None, None] - 1).min(axis=0)
     image[:, near < MARGIN] = 0
     gradient = rng.normal(size=image.shape).astype(np.float32)
-    camera, workspace = camera_of(device, width, height), Workspace(device)
+    camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
-    planes = planes_of(device, camera, image)
+    planes = to_planes(device, camera, image)
     actual = transform_colors(workspace, camera, planes, matrix).get()
     exact = image[:3].astype(np.float64)
-    expected = ref.colored(exact, matrix)
+    expected = ref.apply_color_matrix(exact, matrix)
     yield by_element("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
-    uploaded = planes_of(device, camera, gradient)
-    grad_image, waiting = color_gradients(workspace, camera, planes, matrix, uploaded)
-    by_image, grad_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
-    passed = grad_image.get()
-    yield by_element("colors_backward", f"gradient, {label}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
-    yield equal("colors_backward", f"gradient outside the image, {label}", outside(camera, passed), 0.0)
-    size = float(np.sqrt(gradient.size))
-    yield by_element("colors_backward", f"gradient by the matrix, {label}", waiting(), grad_matrix, SUM, floor=size)
+    uploaded = to_planes(device, camera, gradient)
+    grad_image, wait_for_matrix = color_gradients(workspace, camera, planes, matrix, uploaded)
+    expected, grad_matrix = ref.color_matrix_backward(exact, matrix, gradient[:3].astype(np.float64))
+    grad = grad_image.get()
+    yield by_element("colors_backward", f"gradient, {label}", grad[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("colors_backward", f"gradient outside the image, {label}", outside(camera, grad), 0.0)
+    floor, actual_matrix = float(np.sqrt(gradient.size)), wait_for_matrix()
+    yield by_element(
+        "colors_backward", f"gradient by the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
+    )
     if channels > 3:
         yield equal("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
-        yield equal("colors_backward", f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])
+        yield equal("colors_backward", f"gradient of the fourth plane, {label}", grad[3], uploaded.get()[3])
 
 
 @CHECKS.add("colors_forward", "colors_backward")
@@ -176,35 +176,33 @@ def colors(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare the response of a camera to an image with values below black and above white, and both gradients."""
+    """Compare a camera response on an image with values below black and above white, and both gradients."""
     label, kernel = f"{width} x {height} px", "camera_response"
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)
     gradient = rng.normal(size=image.shape).astype(np.float32)
     values = np.zeros((), CAMERA)
-    values["cx"], values["cy"] = middle = 0.625 * width, 0.375 * height
-    camera, workspace = replace(camera_of(device, width, height), values=values), Workspace(device)
+    values["cx"], values["cy"] = center = 0.625 * width, 0.375 * height
+    camera, workspace = replace(make_camera(device, width, height), values=values), Workspace(device)
     for name in ("response", "grad_response"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
-    planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
-    actual, passed = (
-        respond(workspace, camera, planes, row).get(),
-        respond(workspace, camera, planes, row, uploaded).get(),
-    )
+    planes, uploaded = to_planes(device, camera, image), to_planes(device, camera, gradient)
+    actual = respond(workspace, camera, planes, row).get()
+    grad_image = respond(workspace, camera, planes, row, uploaded).get()
     sums = workspace.array("response sums", (20, camera.rows)).get()
-    exact, given = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
-    expected = appearance.taken(exact, row, middle)
+    exact, upstream = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
+    expected = appearance.apply_response(exact, row, center)
     yield by_element(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield equal(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
-    by_image, grad_row = appearance.taken_backward(exact, row, middle, given)
-    largest = max(float(np.abs(by_image).max()), 1.0)
-    yield by_element(kernel, f"gradient, {label}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
-    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, passed[:3]), 0.0)
+    expected, grad_row = appearance.apply_response_backward(exact, row, center, upstream)
+    largest = max(float(np.abs(expected).max()), 1.0)
+    yield by_element(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
+    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
     yield by_element(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
     if channels > 3:
         yield equal(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
-        yield equal(kernel, f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])
+        yield equal(kernel, f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 @CHECKS.add("camera_response")

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, by_element, by_norm, check_image, equal
-from clsplat.conformance.checks.images import SIZES, camera_of, comparison_of, outside, planes_of
-from clsplat.conformance.scenes import Case, gradients_of_sums, random_case, safe_case
+from clsplat.conformance.checks.images import SIZES, make_camera, make_comparison, outside, to_planes
+from clsplat.conformance.scenes import Case, random_case, safe_case, sums_to_gradients
 from clsplat.density.statistics import ABS_X
 from clsplat.density.survey import BLENDED, SQUARE, WEIGHT
 from clsplat.losses.depth import InverseDepth
@@ -45,7 +45,7 @@ def check_blend(device: Device, case: Case, label: str, sort: Sort = "radix") ->
     yield from check_image("blend_forward", f"transmittance, {label}", actual, left[None])
 
 
-def pixel_sums_of(
+def sum_pixels(
     device: Device,
     case: Case,
     weights: NDArray[Any],
@@ -71,7 +71,7 @@ def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], label: str) ->
     """Compare sums over pixels, [N, PIXEL_SUMS or more], after conversion to gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
-    mean2d, conic = gradients_of_sums(splats, m)
+    mean2d, conic = sums_to_gradients(splats, m)
     yield by_norm(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
     yield by_norm(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
     yield by_norm(kernel, f"gradients of opacities, {label}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
@@ -81,18 +81,18 @@ def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], label: str) ->
         yield by_norm(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
 
 
-def _opaque(parameters: dict[str, NDArray[Any]]) -> None:
+def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
     parameters["log_scales"] += 0.6
     parameters["logit_opacity"] += 2
 
 
-def dim(parameters: dict[str, NDArray[Any]]) -> None:
+def make_dim(parameters: dict[str, NDArray[Any]]) -> None:
     """Make splats so faint that transmittance falls below 0.01 within a batch of 256, and 40 more still contribute."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -3.7
 
 
-def _of_all_sizes(parameters: dict[str, NDArray[Any]]) -> None:
+def _vary_sizes(parameters: dict[str, NDArray[Any]]) -> None:
     parameters["log_scales"][:10] += 4
     parameters["log_scales"][10:20] -= 6
 
@@ -102,9 +102,9 @@ def images(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 15, 17), (60, 33, 31), (120, 40, 30), (40, 5, 3)):
         case = safe_case(rng, count, width, height, MARGIN)
         yield from check_blend(device, case, f"{count} Gaussians, {width} x {height} px")
-    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, _opaque), "long tiles, finished pixels")
-    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, dim), "long tiles, dim pixels")
-    yield from check_blend(device, safe_case(rng, 30, 40, 40, MARGIN, _of_all_sizes), "huge and tiny splats")
+    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, _make_opaque), "long tiles, finished pixels")
+    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, make_dim), "long tiles, dim pixels")
+    yield from check_blend(device, safe_case(rng, 30, 40, 40, MARGIN, _vary_sizes), "huge and tiny splats")
 
 
 @CHECKS.add("blend_backward", "sum_records")
@@ -113,12 +113,12 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
         case = safe_case(rng, count, width, height, MARGIN)
         weights = rng.normal(size=(3, height, width)).astype(np.float32)
         label = f"{count} Gaussians, {width} x {height} px"
-        yield from check_sum(case, pixel_sums_of(device, case, weights), weights, label)
-    case = safe_case(rng, 300, 14, 14, 2e-6, _opaque)
+        yield from check_sum(case, sum_pixels(device, case, weights), weights, label)
+    case = safe_case(rng, 300, 14, 14, 2e-6, _make_opaque)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
-    yield from check_sum(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
-    case = safe_case(rng, 300, 14, 14, 2e-6, dim)
-    yield from check_sum(case, pixel_sums_of(device, case, weights), weights, "long tiles, dim pixels")
+    yield from check_sum(case, sum_pixels(device, case, weights), weights, "long tiles, finished pixels")
+    case = safe_case(rng, 300, 14, 14, 2e-6, make_dim)
+    yield from check_sum(case, sum_pixels(device, case, weights), weights, "long tiles, dim pixels")
 
 
 @CHECKS.add("blend_backward", "sum_records")
@@ -127,8 +127,8 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     case = safe_case(rng, 40, width, height, MARGIN)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     texture = np.where(rng.random((height, width)) < 0.9, rng.uniform(0, 0.5, (height, width)), -1).astype(np.float32)
-    yield from check_sum(case, pixel_sums_of(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
-    m = pixel_sums_of(device, case, weights, ALL_SUMS, texture=texture)
+    yield from check_sum(case, sum_pixels(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
+    m = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
     yield from check_sum(case, m, weights, "with weights and texture")
     blended = ref.blend_weights(case.project(), width, height) * (texture >= 0)
     yield by_norm("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
@@ -137,11 +137,11 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
     yield by_norm("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
     flags = np.where(texture < 0, -1, texture > 0.3).astype(np.float32)
-    for one in (case, safe_case(rng, 300, width, height, 2e-6, _opaque)):  # finished pixels
-        counts = pixel_sums_of(device, one, weights, ALL_SUMS, texture=flags)[:, BLENDED]
-        expected = (ref.blend_weights(one.project(), width, height) > 0) * (flags > 0)
+    for scene in (case, safe_case(rng, 300, width, height, 2e-6, _make_opaque)):  # finished pixels
+        counts = sum_pixels(device, scene, weights, ALL_SUMS, texture=flags)[:, BLENDED]
+        expected = (ref.blend_weights(scene.project(), width, height) > 0) * (flags > 0)
         yield equal("blend_backward", "numbers of pixels", counts, expected.sum(axis=(1, 2)))
-    yield from check_sum(case, pixel_sums_of(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
+    yield from check_sum(case, sum_pixels(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
 @CHECKS.add("blend_forward", "blend_backward")
@@ -164,7 +164,7 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("blend_backward")
 def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
-    """A loss of the transmittance is a loss of an image of black splats in front of one white channel."""
+    """Compare a loss of the transmittance with one of an image of black splats in front of a white channel."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, label = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
@@ -174,13 +174,13 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         behind = device.upload(planes[3] * np.abs(frame.transmittance.get()))
         sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), behind=behind)
         splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
-        of_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
-        black, only = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
-        of_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), only)
-        mean2d, conic = gradients_of_sums(splats, sums.get()[:, :count].T.astype(np.float64))
-        yield by_norm("blend_backward", f"splat means, {label}", mean2d, of_image.mean2d + of_left.mean2d, GRADIENT)
-        yield by_norm("blend_backward", f"conics, {label}", conic, of_image.conic + of_left.conic, GRADIENT)
-        opacity = (of_image.opacity + of_left.opacity) * splats.opacity
+        from_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
+        black, channel = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
+        from_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
+        mean2d, conic = sums_to_gradients(splats, sums.get()[:, :count].T.astype(np.float64))
+        yield by_norm("blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_left.mean2d, GRADIENT)
+        yield by_norm("blend_backward", f"conics, {label}", conic, from_image.conic + from_left.conic, GRADIENT)
+        opacity = (from_image.opacity + from_left.opacity) * splats.opacity
         yield by_norm("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
 
 
@@ -212,23 +212,23 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("blend_forward", "blend_backward")
 def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 150, 50, 70)
-    case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and too many tiles for a mask
+    case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and more tiles than a mask holds
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
-    image, sums = render(device, case).image.get(), pixel_sums_of(device, case, weights)
+    image, sums = render(device, case).image.get(), sum_pixels(device, case, weights)
     yield equal("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
-    again = pixel_sums_of(device, case, weights, sort="bitonic")
+    again = sum_pixels(device, case, weights, sort="bitonic")
     yield equal("sort_tiles", "sums over pixels, against the radix sort", again, sums)
-    banded = pixel_sums_of(device, case, weights, budget=RenderLimits(250, 3))
+    banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
     yield equal("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
-    yield equal("blend_backward", "sums over pixels, a second time", pixel_sums_of(device, case, weights), sums)
+    yield equal("blend_backward", "sums over pixels, a second time", sum_pixels(device, case, weights), sums)
 
 
-# inverse_depth.cl, and the fourth plane of blending, which it reads.
+# inverse_depth.cl, and the fourth plane of blending, its input.
 
 Floats = NDArray[Any]
 
 
-def gradients_of(
+def differentiate(
     device: Device, case: Case, weights: Floats, budget: RenderLimits | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return values for the loss Σ weights · (image, inverse depth): image, [4, H, W], sums over pixels,
@@ -247,21 +247,21 @@ def gradients_of(
 def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Results:
     """Compare image, sums and gradients with the reference."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
-    image, m, depths, means = gradients_of(device, case, weights)
+    image, m, depths, means = differentiate(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
     yield from check_image("blend_forward", f"inverse depth, {label}", image[3:], expected[None])
-    of_image = ref.blend_backward(splats, width, height, background, weights[:3])
-    of_depth, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
-    mean2d, conic = (getattr(of_image, name) + getattr(of_depth, name) for name in ("mean2d", "conic"))
-    opacity = of_image.opacity + of_depth.opacity
-    actual = gradients_of_sums(splats, m)
+    from_image = ref.blend_backward(splats, width, height, background, weights[:3])
+    from_depth, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
+    mean2d, conic = (getattr(from_image, name) + getattr(from_depth, name) for name in ("mean2d", "conic"))
+    opacity = from_image.opacity + from_depth.opacity
+    actual = sums_to_gradients(splats, m)
     yield by_norm("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
     yield by_norm("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
     yield by_norm("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
-    yield by_norm("blend_backward", f"colors with depths, {label}", m[:, 6:9], of_image.color, GRADIENT)
+    yield by_norm("blend_backward", f"colors with depths, {label}", m[:, 6:9], from_image.color, GRADIENT)
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
     yield by_norm("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
-    upstream = mean2d, conic, opacity, of_image.color
+    upstream = mean2d, conic, opacity, from_image.color
     numbers = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]
@@ -277,60 +277,60 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
         plain = Rasterizer(device, "radix").forward(
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
-        image, *sums = gradients_of(device, case, weights)
+        image, *sums = differentiate(device, case, weights)
         yield equal("blend_forward", f"colors, {label}", image[:3], plain.image.get()[:, :height, :width])
-        for one, other in zip(sums, gradients_of(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
-            yield equal("sum_inverse_depths", f"against bands of tiles, {label}", other, one)
+        for actual, banded in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
+            yield equal("sum_inverse_depths", f"against bands of tiles, {label}", banded, actual)
 
 
 @CHECKS.add("inverse_depth_loss")
 def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
     for width, height, count in ((1, 1, 1), (17, 33, 64), (40, 20, 65)):
         x = rng.uniform(0, 1, (4, height, width)).astype(np.float32)
-        comparison = comparison_of(device, x, x[:3])
+        comparison = make_comparison(device, x, x[:3])
         camera = comparison.camera
         comparison.gradient = device.zeros((4, camera.rows, camera.stride))
         flat = rng.permutation(width * height)[:count]
-        places = flat // width, flat % width
+        rows, columns = positions = flat // width, flat % width
         targets, weights = rng.uniform(0, 1, (2, count)).astype(np.float32)
-        targets[:1] = x[3][places][:1]  # equal values have no gradient
-        pixels = device.upload((places[0] * camera.stride + places[1]).astype(np.uint32))
+        targets[:1] = x[3][positions][:1]  # equal values have no gradient
+        pixels = device.upload((rows * camera.stride + columns).astype(np.uint32))
         comparison.depths = KnownDepths(pixels, device.upload(targets), device.upload(weights), 3.0)
         value, scale = InverseDepth(weight=0.5).add(comparison).value(), 0.5 * 3 / count
-        expected, by_plane = ref.inverse_depth_loss(x[3].astype(np.float64), places, targets, weights)
+        expected, grad_plane = ref.inverse_depth_loss(x[3].astype(np.float64), positions, targets, weights)
         label = f"{count} pixels of {width} x {height}"
         terms = comparison.workspace.array("inverse_depth_terms", count).get()
         yield by_element("inverse_depth_loss", f"terms, {label}", terms, expected, SUM, floor=1e-3)
         total = np.array([scale * expected.sum()])
         yield by_element("inverse_depth_loss", f"value, {label}", np.array([value]), total, SUM, floor=1e-6)
         actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
-        truth[3, :height, :width] = scale * by_plane
+        truth[3, :height, :width] = scale * grad_plane
         yield by_element("inverse_depth_loss", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
 
 
-# overlay: a layer of splats in front of an image.
+# layer.cl: a layer of splats in front of an image.
 
 
 def check_layer(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Results:
     """Compare the composite, the loss and the gradients; the sign of T does not matter."""
-    camera, workspace = camera_of(device, width, height), Workspace(device)
+    camera, workspace = make_camera(device, width, height), Workspace(device)
     layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
     left = rng.random((height, width)).astype(np.float32)
     gradient = rng.normal(size=image.shape).astype(np.float32)
     signed = np.where(rng.random(left.shape) < 0.5, -1, 1) * left
-    planes = {"image": planes_of(device, camera, layer), "transmittance": planes_of(device, camera, signed[None])}
+    planes = {"image": to_planes(device, camera, layer), "transmittance": to_planes(device, camera, signed[None])}
     frame, label, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
-    actual = lay_over(workspace, frame, planes_of(device, camera, image), scale)
+    actual = lay_over(workspace, frame, to_planes(device, camera, image), scale)
     both, behind = actual.image.get(), actual.behind.get()
     inside = np.s_[..., :height, :width]
     exact = left.astype(np.float64)
-    yield by_element("lay_over", f"both, {label}", both[inside], ref.laid_over(layer, exact, image), 1e-6, floor=1.0)
+    yield by_element("lay_over", f"both, {label}", both[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
     loss, grad_left = ref.layer_cover(exact, scale)
     yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
     yield by_element("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
-    for planes_found in (both, behind):
-        yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, planes_found), 0.0)
-    grad_both = planes_of(device, camera, gradient)
+    for output in (both, behind):
+        yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, output), 0.0)
+    grad_both = to_planes(device, camera, gradient)
     look_behind(workspace, frame, grad_both)
     expected = ref.gradient_behind(exact, gradient)
     yield by_element("look_behind", f"derivatives, {label}", grad_both.get()[inside], expected, 1e-6, floor=1.0)

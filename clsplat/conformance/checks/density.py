@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
-from clsplat.conformance.checks.images import comparison_of, magnitude_of, planes_of
-from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
+from clsplat.conformance.checks.images import make_comparison, sobel_magnitude, to_planes
+from clsplat.conformance.scenes import Case, add_world_filter, random_case, safe_case
 from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import contributions, sensitivities
@@ -53,7 +53,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         planes[ABS_X:] = np.abs(planes[ABS_X:])
         image = frame.image.get()[:, :height, :width]
         photograph = image + rng.normal(size=image.shape).astype(np.float32)
-        comparison = comparison_of(device, image, photograph)  # with a gradient of 7
+        comparison = make_comparison(device, image, photograph)  # with a gradient of 7
         error = ref.view_error(np.full(image.shape, 7.0), image.astype(np.float64), photograph)
         view = ViewGradients(frame, comparison, [], device.upload(planes))
         for _ in range(2):
@@ -66,7 +66,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         columns = {
             ("screen_grad", "accumulate_norm"): ref.screen_gradient(sums[:, :2], width, height),
             ("screen_grad_abs_sum", "accumulate_sum"): sums[:, ABS_X : ABS_X + 2] @ half,
-            ("rendered_texture", "sample_magnitude"): magnitude_of(image)[row, column],
+            ("rendered_texture", "sample_magnitude"): sobel_magnitude(image)[row, column],
             ("screen_radius", "accumulate_radius"): radius,
             ("blend_weight", "accumulate_pixel_sum"): sums[:, WEIGHT],
             ("gain", "accumulate_gain"): width * height * ref.screen_gain(sums[:, :2], conic),
@@ -87,7 +87,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
         model, camera = case.model(device), case.device_camera(device)
         rasterizer, weights = Rasterizer(device, "radix"), rng.normal(size=(3, 31, 33)).astype(np.float32)
         frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
-        pixel_sums = rasterizer.pixel_sums(model, frame, planes_of(device, camera, weights))
+        pixel_sums = rasterizer.pixel_sums(model, frame, to_planes(device, camera, weights))
         stats = SplatStats(model.gaussians, ("splitting",))
         comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
         for _ in range(2):
@@ -98,8 +98,8 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
         yield by_norm("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
 
 
-def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
-    """Return the tables of random Gaussians on both sides of each threshold before an edit, and the Gaussians after."""
+def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
+    """Return the tables of random Gaussians on both sides of each threshold, and the Gaussians after an edit."""
     case = random_case(rng, count)
     p = case.parameters
     sizes = EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))
@@ -123,7 +123,7 @@ def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[
 @CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "share_opacity", "gather_rows")
 def edits(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        before, gaussians = _edited(device, rng, count)
+        before, gaussians = _run_edit(device, rng, count)
         size, opacity = np.exp(before["log_scales"]).max(axis=1), 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
         gradient = ref.mean_gradient(before["stats/screen_grad"][:, 0], before[SEEN][:, 0])
         action = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=True)
@@ -174,7 +174,7 @@ def choices(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("cap_opacity")
 def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        for case in (random_case(rng, count), with_world_filter(random_case(rng, count), rng)):
+        for case in (random_case(rng, count), add_world_filter(random_case(rng, count), rng)):
             gaussians, oracle = case.model(device).gaussians, case.gaussians()
             cap_opacity(gaussians, 0.3)
             scale2 = np.exp(2 * oracle.log_scales)
@@ -219,10 +219,10 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.
 
-SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, width, height: with whole tiles, and with parts
+SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, width, height: whole and partial tiles
 
 
-def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
+def black_photograph(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
     """Return a black photograph at the camera of a scene."""
     camera = case.device_camera(device)
     colors = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
@@ -234,7 +234,7 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in SIZES:
         case = safe_case(rng, count, width, height, MARGIN)
         masks = (None, rng.random((height, width)) < 0.6)
-        photographs = [photograph_of(device, case, mask) for mask in masks]
+        photographs = [black_photograph(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
         actual, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
@@ -242,19 +242,19 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
         yield by_element("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
         yield equal("blend_backward", f"{label}, a second time", again, actual)
         actual = sensitivities(_render_views(device, case, photographs, background), count)
-        squares = np.sum([_squares(case, background, mask) for mask in masks], axis=0)
+        squares = np.sum([_falloff_squares(case, background, mask) for mask in masks], axis=0)
         yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
 
 
 def _render_views(
     device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]
 ) -> Iterator[RenderedView]:
-    """The views of photographs, by a new rasterizer and model."""
+    """Yield the views of photographs, rendered by a new rasterizer and model."""
     rasterizer = Rasterizer(device, "radix")
     return RenderedView.render_all(rasterizer, case.model(device), photographs, device.upload(background))
 
 
-def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
+def _falloff_squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
     """Return (dI/dG)² summed over the channels and the pixels of a mask, [N]."""
     width, height = case.size
     counted, total = np.ones((height, width)) if mask is None else mask, np.zeros(len(case.project().opacity))

@@ -4,8 +4,7 @@ import numpy as np
 
 from clsplat.conformance.check import Checks, Results
 from clsplat.conformance.checks import blending, images, projection, tiles, training
-from clsplat.conformance.checks import tiles as large
-from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
+from clsplat.conformance.scenes import add_world_filter, random_case, safe_case
 from clsplat.opencl.device import Device
 
 CHECKS = Checks()
@@ -18,13 +17,14 @@ def rendering(device: Device, rng: np.random.Generator) -> Results:
     yield from projection.check_record(device, case, label)
     yield from tiles.check_list(device, case, "radix", label)
     yield from blending.check_blend(device, case, label)
-    many = safe_case(rng, 300, 14, 14, change=blending.dim)
+    many = safe_case(rng, 300, 14, 14, change=blending.make_dim)
     yield from blending.check_blend(device, many, "300 that cover each other")
-    for one, of in ((case, label), (many, "300 that cover each other")):
-        weights = rng.normal(size=(3, *one.size[::-1])).astype(np.float32)
-        yield from blending.check_sum(one, blending.pixel_sums_of(device, one, weights), weights, of)
+    for scene, name in ((case, label), (many, "300 that cover each other")):
+        weights = rng.normal(size=(3, *scene.size[::-1])).astype(np.float32)
+        sums = blending.sum_pixels(device, scene, weights)
+        yield from blending.check_sum(scene, sums, weights, name)
     yield from projection.check_gradient(device, case, rng, label)
-    filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    filtered = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
     yield from projection.check_record(device, filtered, "30 filtered Gaussians")
     yield from projection.check_gradient(device, filtered, rng, "30 filtered Gaussians")
 
@@ -34,7 +34,7 @@ def large_splats(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:4] += 2.5
     yield from tiles.check_list(device, case, "radix", "a scene of large Gaussians")
-    yield from large.check_all(device, rng)
+    yield from tiles.check_large(device, rng)
 
 
 @CHECKS.add("scan_blocks", "scan_offsets", "radix_count", "radix_scatter")

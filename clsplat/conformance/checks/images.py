@@ -19,16 +19,16 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import mask_transients, measure_residuals
 
 CHECKS = Checks()
-SIZES = ((1, 1), (11, 11), (17, 33), (257, 9))  # at the limits of the SSIM window, of tiles, and of a group's columns
+SIZES = ((1, 1), (11, 11), (17, 33), (257, 9))  # around the size of the SSIM window, of tiles, and of a group's columns
 LOSSES = ((L1, ref.l1, "pixel_loss"), (L2, ref.l2, "pixel_loss"), (Dssim, ref.dssim, "ssim_gradient"))
 
 
-def camera_of(device: Device, width: int, height: int) -> DeviceCamera:
+def make_camera(device: Device, width: int, height: int) -> DeviceCamera:
     tile = int(device.tuning["TILE"])
     return DeviceCamera(device.zeros(1), width, height, -(-width // tile), -(-height // tile), tile)
 
 
-def planes_of(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Array:
+def to_planes(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Array:
     """Upload an image, [C, height, width], as planes of whole tiles, zero outside."""
     planes = np.zeros((len(image), camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = image
@@ -37,17 +37,17 @@ def planes_of(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Arra
 
 def outside(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
     """Return the planes with the image itself set to zero."""
-    rest = planes.copy()
-    rest[..., : camera.height, : camera.width] = 0
-    return rest
+    border = planes.copy()
+    border[..., : camera.height, : camera.width] = 0
+    return border
 
 
-def comparison_of(device: Device, x: NDArray[Any], y: NDArray[Any]) -> Comparison:
+def make_comparison(device: Device, x: NDArray[Any], y: NDArray[Any]) -> Comparison:
     """Return a comparison of a render x and a photograph y, [3, H, W]."""
-    camera = camera_of(device, x.shape[2], x.shape[1])
+    camera = make_camera(device, x.shape[2], x.shape[1])
     gradient = device.empty((3, camera.rows, camera.stride))
     gradient.fill(7)
-    return Comparison(Workspace(device), camera, planes_of(device, camera, x), planes_of(device, camera, y), gradient)
+    return Comparison(Workspace(device), camera, to_planes(device, camera, x), to_planes(device, camera, y), gradient)
 
 
 def image_pair(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -62,12 +62,12 @@ def check_loss(
     device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
 ) -> Results:
     """Compare the value and the gradient of a loss."""
-    comparison, label = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
+    comparison, label = make_comparison(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
     actual = loss.add(comparison)
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
-    value_of = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
+    value_kernel = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
     values = np.array([actual.value()]), np.array([weight * value])
-    yield by_element(value_of, f"value of {label}", *values, SUM, floor=1e-2)
+    yield by_element(value_kernel, f"value of {label}", *values, SUM, floor=1e-2)
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     largest = max(float(np.abs(weight * gradient).max()), 1e-30)
@@ -86,7 +86,7 @@ def losses(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("pixel_loss", "ssim_gradient")
 def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
     x, y = image_pair(rng, 50, 20)
-    comparison = comparison_of(device, x, y)
+    comparison = make_comparison(device, x, y)
     expected = np.zeros(x.shape)
     for weight, (loss, oracle, _) in zip((0.8, 3.0, 0.2), LOSSES, strict=True):
         loss(weight=weight).add(comparison)
@@ -99,8 +99,8 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
 def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         (x, y), label = image_pair(rng, width, height), f"{width} x {height} px"
-        gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
-        comparison.gradient = planes_of(device, comparison.camera, gradient)
+        gradient, comparison = rng.normal(size=x.shape).astype(np.float32), make_comparison(device, x, y)
+        comparison.gradient = to_planes(device, comparison.camera, gradient)
         actual = view_error(comparison).get()
         rows = comparison.workspace.array("row_errors", (3, comparison.camera.rows)).get()
         values = [table.astype(np.float64) for table in (gradient, x, y)]
@@ -114,7 +114,7 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
 def entropies(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         x, label = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
-        comparison = comparison_of(device, x, x[:3])
+        comparison = make_comparison(device, x, x[:3])
         comparison.gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
         value = WeightEntropy(weight=0.7).add(comparison).value()
         expected = np.array([0.7 * x[3].mean(dtype=np.float64)])
@@ -129,7 +129,7 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
         mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
-        camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        camera, workspace, label = make_camera(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("photograph", (3, camera.rows, camera.stride)).fill(9)
         colors = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
         counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
@@ -139,48 +139,49 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
         yield equal("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
         apply_mask(workspace, camera, colors, counted)
         yield equal("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
-        shows, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
-        uploaded = device.upload(np.ascontiguousarray(shows)), device.upload(before), device.upload(after)
+        visibility, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
+        uploaded = device.upload(np.ascontiguousarray(visibility)), device.upload(before), device.upload(after)
         masked = colors.get()
         change_background(workspace, camera, colors, *uploaded)
         truth = masked.astype(np.float64)
-        truth[:, :height, :width] += shows / 255 * (after - before.astype(np.float64))[:, None, None]
+        truth[:, :height, :width] += visibility / 255 * (after - before.astype(np.float64))[:, None, None]
         yield by_element("change_background", f"colors, {label}", colors.get(), truth, 1e-6, floor=1.0)
 
 
 @CHECKS.add("blur_rows", "blur_columns")
 def blur(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (15, 4), (33, 18), (65, 7)):
-        for sigma, share in ((1.0, None), (2.5, 0.7), (0.5, 0.05)):
+        for sigma, fraction in ((1.0, None), (2.5, 0.7), (0.5, 0.05)):
             image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
-            mask = None if share is None else rng.random((height, width)) < share
-            camera, workspace = camera_of(device, width, height), Workspace(device)
-            counted = None if mask is None else planes_of(device, camera, mask[None])
-            planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
+            mask = None if fraction is None else rng.random((height, width)) < fraction
+            camera, workspace = make_camera(device, width, height), Workspace(device)
+            counted = None if mask is None else to_planes(device, camera, mask[None])
+            planes = Planes(workspace, camera, to_planes(device, camera, image), counted)
             actual = Blur(sigma=sigma).apply(planes, step=1).colors.get()
-            expected = ref.blurred(image.astype(np.float64), sigma, mask)
+            expected = ref.blur(image.astype(np.float64), sigma, mask)
             label = f"sigma {sigma:g}, {width} x {height} px"
             yield by_element("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
             yield equal("blur_columns", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
 
 
 def check_haar(
-    device: Device, rng: np.random.Generator, width: int, height: int, share: float | None, taps: NDArray[Any]
+    device: Device, rng: np.random.Generator, width: int, height: int, fraction: float | None, taps: NDArray[Any]
 ) -> Results:
-    """Compare a photograph after the Haar transform, and the gradient of its filter."""
+    """Compare a photograph after the Haar filter, and the gradient of the filter."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
-    mask = None if share is None else rng.random((height, width)) < share
-    camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px, h = {taps}"
+    mask = None if fraction is None else rng.random((height, width)) < fraction
+    camera, workspace = make_camera(device, width, height), Workspace(device)
+    label = f"{width} x {height} px, h = {taps}"
     for name in ("haar", "haar sums"):
         workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
-    counted = None if mask is None else planes_of(device, camera, mask[None])
+    counted = None if mask is None else to_planes(device, camera, mask[None])
     numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
-    planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
+    planes = Planes(workspace, camera, to_planes(device, camera, image), counted)
     actual, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
-    expected = ref.haar_filtered(exact, taps, mask)
+    expected = ref.haar_filter(exact, taps, mask)
     yield by_element("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
-    derivatives = filter_gradients(planes, numbers, planes_of(device, camera, gradient))()
+    derivatives = filter_gradients(planes, numbers, to_planes(device, camera, gradient))()
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
     grad_both = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
@@ -190,11 +191,11 @@ def check_haar(
 @CHECKS.add("haar_forward", "haar_backward")
 def haar(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (2, 2), (16, 5), (17, 33), (129, 66)):
-        for share in (None, 0.6):
-            yield from check_haar(device, rng, width, height, share, rng.normal(size=2).round(2))
+        for fraction in (None, 0.6):
+            yield from check_haar(device, rng, width, height, fraction, rng.normal(size=2).round(2))
 
 
-def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
+def sobel_magnitude(image: NDArray[Any]) -> NDArray[Any]:
     """Return |Sobel| / 8 of the luminance of an image, [3, H, W], in float64."""
     luminance = np.tensordot([0.299, 0.587, 0.114], image.astype(np.float64), axes=1)
     across, down = (ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0))
@@ -206,12 +207,12 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (7, 5), (17, 17), (40, 30), (65, 3)):
         image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
         mask = rng.random((height, width)) < 0.9
-        camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        camera, workspace, label = make_camera(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("texture", (camera.rows, camera.stride)).fill(9)
-        expected = magnitude_of(image)
+        expected = sobel_magnitude(image)
         for counted in (None, mask):
-            uploaded = None if counted is None else planes_of(device, camera, counted[None])
-            actual = known_gradient(workspace, camera, planes_of(device, camera, image), uploaded).get()
+            uploaded = None if counted is None else to_planes(device, camera, counted[None])
+            actual = known_gradient(workspace, camera, to_planes(device, camera, image), uploaded).get()
             if counted is not None:
                 expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
             kernel = "image_gradient" if counted is None else "hide_masked"
@@ -219,36 +220,36 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
             yield equal(kernel, f"texture outside the image, {label}", outside(camera, actual), 0.0)
 
 
-SCALES = (1.0, 1e-2, 8.0)  # factors on differences: some are outside the histogram on either side
+SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside of the histogram's range
 
 
 def check_transient(
-    device: Device, rng: np.random.Generator, width: int, height: int, scale: float, share: float | None
+    device: Device, rng: np.random.Generator, width: int, height: int, scale: float, fraction: float | None
 ) -> Results:
-    """Compare residuals, their histogram, and masks; a mask keeps `share` of the pixels."""
+    """Compare residuals, their histogram, and masks; `fraction` of the pixels count."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
-    counted = np.ones((height, width), bool) if share is None else rng.random((height, width)) < share
-    camera, workspace = camera_of(device, width, height), Workspace(device)
+    counted = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
+    camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("residuals", "counted pixels"):
         workspace.array(name, (1, camera.rows, camera.stride)).fill(7)
-    mask = None if share is None else planes_of(device, camera, counted[None])
-    planes = planes_of(device, camera, x), planes_of(device, camera, y)
-    actual, waiting = measure_residuals(workspace, camera, *planes, mask)
+    mask = None if fraction is None else to_planes(device, camera, counted[None])
+    planes = to_planes(device, camera, x), to_planes(device, camera, y)
+    actual, wait_for_histogram = measure_residuals(workspace, camera, *planes, mask)
     label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
     yield by_element("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
-    rest = actual.get()[0].copy()
-    rest[:height, :width][counted] = -1
-    yield equal("measure_residuals", f"pixels that do not count, {label}", rest, -1.0)
-    numbers = ref.residual_numbers(values[counted].astype(np.float64))
-    yield equal("measure_residuals", f"numbers, {label}", waiting(), numbers)
+    others = actual.get()[0].copy()
+    others[:height, :width][counted] = -1
+    yield equal("measure_residuals", f"pixels that do not count, {label}", others, -1.0)
+    histogram = ref.residual_histogram(values[counted].astype(np.float64))
+    yield equal("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
         threshold = float(np.float32(np.quantile(values, quantile)))
-        kept = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
-        expected = np.zeros_like(kept)
-        expected[:height, :width] = ref.without_transients(values, counted, threshold, reach)
-        yield equal("mask_transients", f"mask, {label}", kept, expected)
+        mask = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
+        expected = np.zeros_like(mask)
+        expected[:height, :width] = ref.mask_transients(values, counted, threshold, reach)
+        yield equal("mask_transients", f"mask, {label}", mask, expected)
 
 
 @CHECKS.add("measure_residuals", "mask_transients")

@@ -31,7 +31,7 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     motion = rng.normal(0, 0.3, (count, width))
     center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
     apart = np.abs(TIME - center) / np.exp(duration)
-    duration[(apart > 3) & (apart < 3.7)] += 0.5  # 3.33 is the end of what can be seen
+    duration[(apart > 3) & (apart < 3.7)] += 0.5  # Gaussians are visible up to 3.33
     center[::10], duration[::10] = 0.875, -2.5
     duration[5::10] = STATIC_LOG_DURATION
     motion[:, fields["time_center"]], motion[:, fields["log_duration"]] = center[:, None], duration[:, None]
@@ -39,32 +39,33 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
 
 
-def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
-    """Compare the tables at a time, and the gradients of the motion."""
+def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
+    """Compare the tables at TIME, and the gradients of the motion."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
     model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
     drawn = evaluate_motion(Workspace(device), model, camera).gaussians
-    means, quats, logits = ref.moved(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
-    there = np.isfinite(means).all(axis=1)
+    means, quats, logits = ref.move_gaussians(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
+    present = np.isfinite(means).all(axis=1)
     actual = drawn.get("means")
-    yield wrong("move_forward", f"which are there, {label}", np.isfinite(actual).all(axis=1) != there)
-    yield by_element("move_forward", f"means, {label}", actual[there], means[there], 1e-6, floor=1.0)
-    yield by_element("move_forward", f"logits, {label}", drawn.get("logit_opacity")[there, 0], logits[there], 1e-5, 1.0)
+    yield wrong("move_forward", f"which are present, {label}", np.isfinite(actual).all(axis=1) != present)
+    yield by_element("move_forward", f"means, {label}", actual[present], means[present], 1e-6, floor=1.0)
+    actual = drawn.get("logit_opacity")[present, 0]
+    yield by_element("move_forward", f"logits, {label}", actual, logits[present], 1e-5, 1.0)
     yield by_element("turn_forward", f"quaternions, {label}", drawn.get("quats"), quats, 1e-6, floor=1.0)
 
     gradients = GaussianGradients(model.gaussians)
-    given = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
-    for name, values in given.items():
-        values[~there] = 0
+    grads = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
+    for name, values in grads.items():
+        values[~present] = 0
         planes = np.zeros(gradients[name].shape, np.float32)
         planes[:, :count] = values.T
         gradients[name].set(planes)
     backpropagate_motion(model, camera, gradients)
-    g = {name: values.astype(np.float64) for name, values in given.items()}
+    g = {name: values.astype(np.float64) for name, values in grads.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
-    grad_motion, grad_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
+    grad_motion, grad_logit = ref.move_gaussians_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
     actual, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
     for name, columns in motion_fields(width).items():
@@ -72,7 +73,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     yield by_norm("move_backward", f"by the logit at the center, {label}", center, grad_logit, CONIC)
 
 
-def check_still(device: Device, rng: np.random.Generator) -> Results:
+def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
     """Check that Gaussians with a motion of zero give the same bits as static ones."""
     case = random_case(rng, 65)
     motion = np.zeros((65, motion_width(3, True)), np.float32)
@@ -81,8 +82,8 @@ def check_still(device: Device, rng: np.random.Generator) -> Results:
         case, parameters={**case.parameters, MOTION: motion}, view=replace(case.view, time=float(np.float32(0.7)))
     )
     images = []
-    for one in (case, still):
-        frame = Rasterizer(device, "radix").forward(one.model(device), one.device_camera(device), device.zeros(3))
+    for scene in (case, still):
+        frame = Rasterizer(device, "radix").forward(scene.model(device), scene.device_camera(device), device.zeros(3))
         images.append(frame.image.get())
     yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
 
@@ -117,12 +118,12 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
 def motion(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        yield from check_moment(device, rng, count, motion_width(1, False))
+        yield from check_motion_at_time(device, rng, count, motion_width(1, False))
         yield from check_step(device, rng, count, motion_width(3, True))
         yield from check_step(device, rng, count, motion_width(3, True), every=0)
     for width in WIDTHS:
-        yield from check_moment(device, rng, 65, width)
-    yield from check_still(device, rng)
+        yield from check_motion_at_time(device, rng, 65, width)
+    yield from check_zero_motion(device, rng)
 
 
 @CHECKS.add("motion_l2", "short_duration")

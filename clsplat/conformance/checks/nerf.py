@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.check import GRADIENT, SUM, Checks, Results, by_element, by_norm, equal
-from clsplat.conformance.checks.images import planes_of
+from clsplat.conformance.checks.images import to_planes
 from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.reference.training import adam_step
 from clsplat.conformance.scenes import random_case
@@ -18,7 +18,7 @@ from clsplat.nerf.training import AdamStep, LearnedField
 from clsplat.opencl.device import Array, Device
 
 CHECKS = Checks()
-RAYS = (1, 63, 64, 65)  # at the limits of a tile of samples and a chunk of tiles
+RAYS = (1, 63, 64, 65)  # around the size of a tile of samples and a chunk of tiles
 SHAPE = FieldShape(
     near=0.2,
     depth=3,
@@ -33,7 +33,7 @@ SHAPE = FieldShape(
 BACKGROUND = np.array([1.0, 0.7, 0.4], np.float32)
 WIDTH, HEIGHT = 19, 13
 ENCODING = 4e-5  # bound on a sine: 2^4 times a distance of about 6, in float32
-EDGES = 2e-6  # bound on distances, as a share of the largest
+EDGES = 2e-6  # bound on distances, relative to the largest
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class GridLevel:
     first: int
 
     def entries(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return its entries, [entries, FEATURES]."""
+        """Return the level's entries, [entries, FEATURES]."""
         values = parameters[self.first : self.first + FEATURES * self.level.entries]
         return values.reshape(-1, FEATURES).astype(np.float64)
 
@@ -63,7 +63,7 @@ class FieldCase:
 
     @classmethod
     def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
-        """Return a case with random rays.  keys: changes of SHAPE."""
+        """Return a case with random rays.  keys: changed keys of SHAPE."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
         parameters = shape.initial_parameters(int(rng.integers(100)))
         for layer in shape.layers:
@@ -75,9 +75,9 @@ class FieldCase:
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
         cast, levels = field.levels.sample_rays(camera, draw, rays), field.levels
-        pixels = ref.drawn_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
+        pixels = ref.draw_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
         filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
-        planes = planes_of(device, camera, photograph)
+        planes = to_planes(device, camera, photograph)
         return cls(shape, levels, parameters, photograph, planes, cast, ref.cones(scene.camera(), filled))
 
     @property
@@ -88,7 +88,8 @@ class FieldCase:
         """Return the random numbers for the edges of each ray."""
         draw = self.rays.draw or Draw(0, 0, 0)
         count = self.rays.count
-        return np.stack([ref.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(count)])
+        rays = range(draw.first, draw.first + count)
+        return np.stack([ref.random_units(ray, samples + 1, kind, draw.seed, draw.step) for ray in rays])
 
     def target_colors(self) -> NDArray[np.float64]:
         """Return the photograph's colors of the rays that count, [counted, 3]."""
@@ -98,19 +99,19 @@ class FieldCase:
     def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return encoded positions and directions of samples, [S, features]."""
         means, variances = ref.frustums(self.cones, edges.astype(np.float64))
-        sines = ref.encoded_frustums(means, variances, self.shape.degrees)
-        direction = ref.encoded_directions(self.cones, self.shape.direction_degrees)
-        of_grid = [
+        sines = ref.encode_frustums(means, variances, self.shape.degrees)
+        direction = ref.encode_directions(self.cones, self.shape.direction_degrees)
+        features = [
             grid.level.forward(grid.entries(self.parameters), *self.places(edges)) for grid in self.grid_levels()
         ]
-        position = np.concatenate([*of_grid, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
+        position = np.concatenate([*features, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
         return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
 
     def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions of samples in the grid's cube, [S, 3], and their variances, [S]."""
         assert self.shape.grid is not None
         means, variances = (table.reshape(-1, 3) for table in ref.frustums(self.cones, edges.astype(np.float64)))
-        return ref.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
+        return ref.grid_positions(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
 
     def grid_levels(self) -> list[GridLevel]:
         """Return the levels of the grid; an empty list without a grid."""
@@ -120,7 +121,7 @@ class FieldCase:
         ]
 
 
-def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
+def read_rows(table: Array, first: int, count: int) -> NDArray[Any]:
     """Return features `first` to `first + count` of each sample, [S, count], from [tiles, rows, SAMPLES]."""
     return np.asarray(table.get()[:, first : first + count].transpose(0, 2, 1).reshape(-1, count))
 
@@ -130,7 +131,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
     """Compare pixels, rays, and the edges of samples, random and evenly spaced."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(7, 11, 5))
-        pixels = ref.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
+        pixels = ref.draw_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
         for rays in (case.rays, replace(case.rays, draw=None)):
@@ -140,14 +141,14 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
 def _check_edge(case: FieldCase, label: str) -> Results:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
-    drawn, again = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
+    coarse_units, fine_units = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
     is_drawn = case.rays.draw is not None
     expected = [
-        ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, own if is_drawn else None) for own in drawn
+        ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, row if is_drawn else None) for row in coarse_units
     ]
     yield by_element("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
-    pairs = zip(edges.astype(np.float64), weights.astype(np.float64), again, strict=True)
-    expected = [ref.fine_edges(t, w, shape.fine_samples, own if is_drawn else None) for t, w, own in pairs]
+    pairs = zip(edges.astype(np.float64), weights.astype(np.float64), fine_units, strict=True)
+    expected = [ref.fine_edges(t, w, shape.fine_samples, row if is_drawn else None) for t, w, row in pairs]
     yield by_element("resample_edges", label, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
 
@@ -161,12 +162,12 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
         (table, first), (seen, row) = (
             place(level.raw_colors.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
         )
-        actual = rows_of(table, first, case.shape.position_rows)
+        actual = read_rows(table, first, case.shape.position_rows)
         yield by_element("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
-        yield equal("encode_frustums", f"what fills blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
-        actual = rows_of(seen, row, case.shape.direction_rows)
+        yield equal("encode_frustums", f"padding of blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
+        actual = read_rows(seen, row, case.shape.direction_rows)
         yield by_element("encode_directions", f"{count} rays", actual[:, : direction.shape[1]], direction, 2e-6, 1.0)
-        yield equal("encode_directions", f"what fills blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
+        yield equal("encode_directions", f"padding of blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
 
 
 # A grid of features: positions of samples in it, features, and gradients of its entries.
@@ -195,19 +196,19 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
-        at, variances = case.places(level.edges.get())
-        actual = rows_of(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
-        yield by_element("grid_places", f"means of {count} rays", actual[:, :3], at, 1e-5, 1.0)
+        means, variances = case.places(level.edges.get())
+        actual = read_rows(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
+        yield by_element("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
         yield by_element("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
         case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
-        yield from _check_grid(device, rng, case, _places(rng, tiles, ends))
+        yield from _check_grid(device, rng, case, _random_positions(rng, tiles, ends))
 
 
-def _places(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
+def _random_positions(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
     """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means are on faces of cells."""
-    at = rng.uniform(*ends, (tiles, 3, SAMPLES))
-    faces = np.where(rng.random(at.shape) < 1 / 6, np.rint(4 * at) / 4, at)
+    means = rng.uniform(*ends, (tiles, 3, SAMPLES))
+    faces = np.where(rng.random(means.shape) < 1 / 6, np.rint(4 * means) / 4, means)
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
 
 
@@ -223,7 +224,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     encoding.places(tiles).set(places)
     encoding.read_grid(case.on_device, tiles)
     table, first = case.levels.network.position(tiles)
-    features = rows_of(table, first, shape.grid_rows)
+    features = read_rows(table, first, shape.grid_rows)
     grad_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
     grad_features[:, :, ::3] = 0  # samples without a gradient
     gradients = list[NDArray[np.float32]]()
@@ -235,13 +236,13 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     for parts, gradient in zip((1, 3), others, strict=True):
         yield equal("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
     by_sample = _by_sample(grad_features)
-    at, variances = np.split(_by_sample(places), [3], axis=1)
+    means, variances = np.split(_by_sample(places), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
-        expected = grid.level.forward(grid.entries(case.parameters), at, variances)
+        expected = grid.level.forward(grid.entries(case.parameters), means, variances)
         yield by_element("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
-        expected, grad_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(actual)
+        expected, grad_entries = grid.level.backward(by_sample[:, rows], means, variances), grid.entries(actual)
         yield by_norm("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
         untouched = np.all(expected == 0, axis=1)
         yield equal("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[untouched], 0.0)
@@ -291,15 +292,15 @@ def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[re
     gradient = gradient[: shape.network_parameters]
     used = np.zeros(shape.network_parameters, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
-        of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
+        grad_weights, grad_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
-            yield by_norm(name, f"weights of {layer.name}, {label}", weights, np.asarray(of_weights), GRADIENT)
-        yield by_norm("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(of_biases), GRADIENT)
+            yield by_norm(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), GRADIENT)
+        yield by_norm("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), GRADIENT)
         table = used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
         table[np.ix_(layer.inputs, range(layer.outputs))] = True
         used[layer.first_bias : layer.first_bias + layer.outputs] = True
-    yield equal("dense_sums", f"what fills blocks, {label}", gradient[~used], 0.0)
+    yield equal("dense_sums", f"padding of blocks, {label}", gradient[~used], 0.0)
 
 
 @dataclass(frozen=True)
@@ -331,7 +332,7 @@ class _Comparison:
 
     def deviations(self, label: str) -> Results:
         colors, densities = (
-            rows_of(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
+            read_rows(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
         for name, actual, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
             yield by_element("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
@@ -349,7 +350,7 @@ class _Comparison:
 
 @CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """Check that a whole image has each pixel at its position, and zeros outside."""
+    """Check that an image has each pixel at its position, and zeros outside."""
     case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)

@@ -13,13 +13,13 @@ from clsplat.conformance.checks.blending import (
     MARGIN,
     check_blend,
     check_sum,
-    dim,
-    pixel_sums_of,
+    make_dim,
     render,
+    sum_pixels,
 )
 from clsplat.conformance.checks.projection import check_gradient, check_record
 from clsplat.conformance.checks.training import check_fused
-from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
+from clsplat.conformance.scenes import Case, add_world_filter, random_case, safe_case
 from clsplat.density.survey import SQUARE
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import RenderLimits
@@ -29,7 +29,7 @@ BOX: dict[str, Any] = {"variance": 0.0, "pixel_box": 1.0}
 SIZES = {"of pixels": 0.0, "far below a pixel": -2.5, "of many pixels": 2.0}  # added to the log scales
 
 
-def of_size(size: float, rng: np.random.Generator, count: int, width: int, height: int) -> Case:
+def sized_case(size: float, rng: np.random.Generator, count: int, width: int, height: int) -> Case:
     def change(parameters: dict[str, NDArray[Any]]) -> None:
         parameters["log_scales"] += np.float32(size)
         parameters["logit_opacity"] += np.float32(max(0, -size))
@@ -43,7 +43,7 @@ def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Re
         case, label = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
         yield from check_record(device, case, label)
         yield from check_gradient(device, case, rng, label)
-    filtered = with_world_filter(random_case(rng, 30, **BOX), rng)
+    filtered = add_world_filter(random_case(rng, 30, **BOX), rng)
     yield from check_record(device, filtered, "filtered Gaussians for the pixel's box")
     yield from check_gradient(device, filtered, rng, "filtered Gaussians for the pixel's box")
     yield from check_fused(device, rng, random_case(rng, 40, **BOX), "40 Gaussians for the pixel's box")
@@ -52,18 +52,19 @@ def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Re
 @CHECKS.add("blend_forward", "blend_backward", "count_large", "emit_large")
 def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 33, 15), (65, 40, 30)):
-        case = of_size(0.0, rng, count, width, height)
+        case = sized_case(0.0, rng, count, width, height)
         yield from check_blend(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
-    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, dim, **BOX), "long tiles over the pixel's box")
+    case = safe_case(rng, 300, 14, 14, 2e-6, make_dim, **BOX)
+    yield from check_blend(device, case, "long tiles over the pixel's box")
     for label, size in SIZES.items():
-        case = of_size(size, rng, 25, 40, 30)
+        case = sized_case(size, rng, 25, 40, 30)
         yield from check_blend(device, case, f"splats {label} over the pixel's box")
         weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
-        sums = pixel_sums_of(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
+        sums = sum_pixels(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
         yield from check_sum(case, sums, weights, f"splats {label} over the pixel's box")
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
         yield by_norm("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
-    few = pixel_sums_of(device, case, weights)
+    few = sum_pixels(device, case, weights)
     yield from check_sum(case, few, weights, "without more sums over the pixel's box")
 
 
@@ -76,6 +77,6 @@ def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Results:
     yield equal(
         "sort_tiles", "pixels over their box, by the other sort", render(device, case, "bitonic").image.get(), image
     )
-    sums = pixel_sums_of(device, case, weights)
-    banded = pixel_sums_of(device, case, weights, budget=RenderLimits(250, 3))
+    sums = sum_pixels(device, case, weights)
+    banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
     yield equal("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)

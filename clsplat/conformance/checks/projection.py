@@ -23,11 +23,11 @@ from clsplat.conformance.check import (
 )
 from clsplat.conformance.scenes import (
     Case,
-    gradients_of_sums,
-    needles,
+    add_world_filter,
+    gradients_to_sums,
+    needle_case,
     random_case,
-    sums_of_gradients,
-    with_world_filter,
+    sums_to_gradients,
 )
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
@@ -46,10 +46,10 @@ LONG_FILTERS: dict[str, dict[str, float]] = {
     "mip": {"variance": 0.1, "compensate": 1.0},
     "box": {"variance": 0.0, "pixel_box": 1.0},
 }
-LONG = 1e-3  # the largest error of a gradient of a long splat, relative to the largest gradient
+LONG = 1e-3  # largest error in the gradient of a long splat, relative to the largest gradient
 
 
-def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def project_records(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return records, [N, RECORD], depth keys, [N], and radii, [N], from the kernel."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
@@ -60,7 +60,7 @@ def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], N
 def check_record(device: Device, case: Case, label: str) -> Results:
     """Compare the records of a scene with the reference."""
     kernel = "project_forward"
-    records, keys, radius = splats_of(device, case)
+    records, keys, radius = project_records(device, case)
     truth, (width, height) = case.project(), case.size
     # the kernel also culls splats that no pixel of the image can see: they must be outside or too faint
     drawn = records[:, 5] > 0
@@ -72,7 +72,7 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     drawn &= truth.visible
     record = records[drawn]
     yield by_element(kernel, f"means, {label}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
-    conic = covariances_of(record) if case.pixel_box else record[:, 2:5]
+    conic = record_covariances(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
     error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
     yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
@@ -90,7 +90,7 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     yield wrong(kernel, f"extents, {label}", _wrong_extents(record, truth, drawn))
 
 
-def covariances_of(record: NDArray[Any]) -> NDArray[Any]:
+def record_covariances(record: NDArray[Any]) -> NDArray[Any]:
     """Return covariances, [N, 3], from the fields of records for the box filter."""
     k, s, t, turned = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
     xx, xy, yy = t**2 + k**2 * s**2, k * s**2, s**2
@@ -130,14 +130,14 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
     yield by_norm("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
 
 
-def check_long(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare gradients by Gaussian, relative to the largest one, from the sums for a loss Σ weights · image."""
+def check_long_splats(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
+    """Compare the gradients of each Gaussian, relative to the largest, for the loss Σ weights · image."""
     model, rasterizer, (width, height) = case.model(device), Rasterizer(device, "radix"), case.size
     frame, truth = rasterizer.forward(model, case.device_camera(device), device.zeros(3)), case.project()
     weights, gaussians = scipy.ndimage.gaussian_filter(rng.normal(size=(3, height, width)), (0, 2, 2)), model.gaussians
     exact = ref.blend_backward(truth, width, height, np.zeros(3), weights)
     m = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
-    m[:, : gaussians.count] = sums_of_gradients(truth, exact).T
+    m[:, : gaussians.count] = gradients_to_sums(truth, exact).T
     gradients = rasterizer.gradients(model, frame, device.upload(m))
     expected = expected_gradients(case, truth, m[:, : gaussians.count].astype(np.float64).T)
     for name in ("means", "quats", "log_scales"):
@@ -151,7 +151,7 @@ def check_long(device: Device, case: Case, rng: np.random.Generator, label: str)
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Return the gradients of all parameters, and of the projected means, from sums over pixels, [N, PIXEL_SUMS]."""
-    grad_mean2d, grad_conic = gradients_of_sums(truth, m)
+    grad_mean2d, grad_conic = sums_to_gradients(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
     reference, camera = case.gaussians(), case.camera()
@@ -166,7 +166,7 @@ def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[s
     }
 
 
-def not_drawable(rng: np.random.Generator) -> Case:
+def undrawable_case(rng: np.random.Generator) -> Case:
     """Return 40 Gaussians; the first nine are behind the camera, huge, faint, or NaN."""
     case = random_case(rng, 40)
     p, pose = case.parameters, case.view.world_to_camera
@@ -182,7 +182,7 @@ def not_drawable(rng: np.random.Generator) -> Case:
     return case
 
 
-def wide_view(rng: np.random.Generator) -> Case:
+def wide_angle_case(rng: np.random.Generator) -> Case:
     """Return Gaussians all over a view of 170 degrees."""
     case = random_case(rng, 40)
     camera, pose, (width, height) = case.view.camera, case.view.world_to_camera, case.size
@@ -194,8 +194,8 @@ def wide_view(rng: np.random.Generator) -> Case:
     return replace(case, view=replace(case.view, camera=camera))
 
 
-def beyond_the_clamp(rng: np.random.Generator) -> Case:
-    """Return wide Gaussians whose rays are beyond the limits of the linear projection."""
+def clamped_case(rng: np.random.Generator) -> Case:
+    """Return wide Gaussians whose rays are beyond the limits at which the linear projection is clamped."""
     case = random_case(rng, 30)
     depth, far = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
     in_camera = np.stack([far * depth, 0.2 * depth, depth], axis=1)
@@ -212,13 +212,13 @@ def projection(device: Device, rng: np.random.Generator) -> Results:
     for degree in range(3):
         yield from check_record(device, random_case(rng, 20, degree=degree), f"harmonics of degree {degree}")
     for variance, compensate in FILTERS:
-        case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
+        case = add_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
         yield from check_record(device, case, f"filters of {variance:g} px², compensate {compensate:g}")
 
 
 @CHECKS.add("project_forward")
 def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Results:
-    records, keys, radius = splats_of(device, not_drawable(rng))
+    records, keys, radius = project_records(device, undrawable_case(rng))
     culled = [0, 1, 2, 3, 4, 5, 7, 8]
     yield equal("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
     yield equal("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
@@ -233,7 +233,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
     hide(model.gaussians, left_out)
     rasterizer, background = Rasterizer(device, "radix"), device.upload(np.full(3, 0.25, np.float32))
     for view in sorted({0, min(HIDDEN_VIEWS, views) - 1, views - 1}):
-        label = f"what view {view} of {views} leaves out of {count} Gaussians"
+        label = f"hidden Gaussians of {count}, view {view} of {views}"
         frame = rasterizer.forward(model, replace(camera, view=view), background)
         actual, hidden = frame.image.get().copy(), left_out[view]
         yield equal("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
@@ -241,7 +241,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
         yield equal("project_forward", f"radii of {label}", frame.radius.get()[:count][hidden], 0.0)
         others = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
         expected = rasterizer.forward(others.model(device), camera, background).image.get()
-        yield equal("project_forward", f"a picture without {label}", actual, expected)
+        yield equal("project_forward", f"image without {label}", actual, expected)
 
 
 @CHECKS.add("project_forward")
@@ -258,26 +258,26 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
         case = random_case(rng, 20, degree=degree)
         yield from check_gradient(device, case, rng, f"harmonics of degree {degree}")
     for variance, compensate in FILTERS:
-        case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
+        case = add_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
         yield from check_gradient(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
-    yield from check_gradient(device, beyond_the_clamp(rng), rng, "rays beyond the image")
+    yield from check_gradient(device, clamped_case(rng), rng, "rays beyond the image")
 
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare gradients of long splats, whose terms cancel in other formulas, from the sums of a blended image."""
+    """Compare gradients of long splats, whose terms would cancel in other formulas, from sums over a blended image."""
     for aspect in ASPECTS:
         for name, settings in LONG_FILTERS.items():
-            case = needles(rng, 12, aspect, **settings)
-            yield from check_long(device, case, rng, f"needles of {aspect} to 1, filter {name}")
-    yield from check_long(device, wide_view(rng), rng, "a view of 170 degrees")
+            case = needle_case(rng, 12, aspect, **settings)
+            yield from check_long_splats(device, case, rng, f"needles of {aspect} to 1, filter {name}")
+    yield from check_long_splats(device, wide_angle_case(rng), rng, "a view of 170 degrees")
 
 
 @CHECKS.add("sampling_interval", "filter_variance")
 def world_filter(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         case = random_case(rng, count)
-        case.parameters["means"][::3] *= 4  # out of sight of some, or of all
+        case.parameters["means"][::3] *= 4  # invisible to some cameras, or to all
         views = []
         for i in range(5):
             pose = case.view.world_to_camera.astype(np.float32).astype(np.float64)
@@ -319,13 +319,13 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str)
     pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * drawn
     actual = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
     m, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
-    grad_mean2d, grad_conic = gradients_of_sums(truth, m)
-    by_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
-    upstream = grad_mean2d, grad_conic, by_opacity, m[:, 6:9]
+    grad_mean2d, grad_conic = sums_to_gradients(truth, m)
+    grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
+    upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
     numbers = case.degree, case.variance, case.compensate
     expected = ref.pose_gradient(case.gaussians(), case.camera(), *numbers, truth, *upstream)
-    turn = case.camera().rotation
-    values = {"shift": turn @ actual[:3], "turn": turn @ actual[3:6], "focal length": actual[6:]}
+    rotation = case.camera().rotation
+    values = {"shift": rotation @ actual[:3], "turn": rotation @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
         yield by_norm("pose_gradient", f"derivative by the {name}, {label}", value[None], exact[None], CONIC)
 
@@ -337,8 +337,8 @@ def poses(device: Device, rng: np.random.Generator) -> Results:
     for degree in range(3):
         yield from check_pose(device, random_case(rng, 20, degree=degree), rng, f"harmonics of degree {degree}")
     for variance, compensate in ((0.1, 1.0), (0.0, 0.0)):
-        case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
+        case = add_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
         yield from check_pose(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
-    yield from check_pose(device, beyond_the_clamp(rng), rng, "rays beyond the limits")
+    yield from check_pose(device, clamped_case(rng), rng, "rays beyond the limits")
     case = replace(random_case(rng, 30), variance=0.0, pixel_box=1.0)
     yield from check_pose(device, case, rng, "the pixel's box")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import SUM, Checks, Results, by_element, by_norm, equal
-from clsplat.conformance.checks.images import outside, planes_of
+from clsplat.conformance.checks.images import outside, to_planes
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
@@ -17,15 +17,15 @@ from clsplat.render.sky import Skies
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # width, height, texels along a side
+SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # width, height, texels per side
 NEAR = 2e-6  # bound on a texel's weight: positions are differences of numbers up to 512
 
 
 def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
     """Return a camera with a wide lens in a random direction."""
     case = random_case(rng, 1, width, height)
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    pose = np.column_stack([turn * np.linalg.det(turn), case.view.world_to_camera[:, 3]])
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = np.column_stack([rotation * np.linalg.det(rotation), case.view.world_to_camera[:, 3]])
     camera = replace(case.view.camera, fx=0.25 * width, fy=0.3 * width)
     return replace(case, view=replace(case.view, camera=camera, world_to_camera=pose))
 
@@ -38,7 +38,7 @@ class SkyView:
         self.camera: DeviceCamera = case.device_camera(device)
         self.directions = ref.rays(case.camera(), width, height)
         self.texels = rng.random((side, side, 3)).astype(np.float32)
-        self.sky = DeviceSky(device.upload(planes_in_rows(self.texels)), side)
+        self.sky = DeviceSky(device.upload(flatten_map(self.texels)), side)
         self.free = rng.random((side, side)) < 0.95
         self.learned = device.upload(self.free.reshape(1, -1).astype(np.float32))
         self.left = rng.random((height, width)).astype(np.float32)
@@ -46,26 +46,26 @@ class SkyView:
         self.skies = Skies(device, Workspace(device))
 
     def planes(self, image: NDArray[Any]) -> Array:
-        return planes_of(self.camera.array.device, self.camera, np.asarray(image, np.float32))
+        return to_planes(self.camera.array.device, self.camera, np.asarray(image, np.float32))
 
     def inside(self, planes: NDArray[Any]) -> NDArray[Any]:
         return planes[..., : self.camera.height, : self.camera.width]
 
 
-def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
+def flatten_map(texels: NDArray[Any]) -> NDArray[np.float32]:
     """Reshape [side, side, C] to [C, side * side]."""
     return np.ascontiguousarray(texels.reshape(-1, texels.shape[2]).T, np.float32)
 
 
 def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
     """Compare an image and the gradient of the map; finished pixels have a negative transmittance."""
-    view, label = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
+    view, label = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels per side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
     expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
     actual = planes.get()
-    yield by_element("sky_forward", f"picture, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
+    yield by_element("sky_forward", f"image, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
     yield equal("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
     grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
@@ -74,7 +74,7 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     yield by_norm("sky_backward", f"derivatives, {label}", grad_texels.get().T, rows[shown], SUM)
     yield by_norm("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, rows[shown], SUM)
     hidden = np.delete(rows, shown, axis=0)
-    yield equal("sky_gather", f"texels that are not shown, {label}", hidden, 0.0)
+    yield equal("sky_gather", f"texels outside the view, {label}", hidden, 0.0)
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
@@ -87,8 +87,8 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
     behind, sums = view.skies.cover(
         view.sky, view.learned, view.camera, view.planes(photograph), view.transmittance, difference, scale
     )
-    held = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
-    chosen, actual = ref.shows_sky(sky, np.where(held, 9, photograph), difference), behind.get()
+    learned = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
+    chosen, actual = ref.sky_mask(sky, np.where(learned, 9, photograph), difference), behind.get()
     loss, grad_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
         expected = view.left * grad_left
@@ -112,24 +112,24 @@ def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("sky_update")
 def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
-    """Compare three updates; texels that the view does not show stay unchanged."""
+    """Compare three updates; texels outside the view stay unchanged."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
     shown = view.skies.runs(view.camera, side).shown.get()
     moments = {name: device.zeros((width, texels)) for name, width in (("moment1", 3), ("moment2", 3), ("biases", 2))}
     moments["free"], free = view.learned, view.free.ravel()[shown]
-    expected = planes_in_rows(view.texels)[:, shown].astype(np.float64)
+    expected = flatten_map(view.texels)[:, shown].astype(np.float64)
     first, second = np.zeros_like(expected), np.zeros_like(expected)
     before, pixels = view.sky.texels.get(), 3 * 9 * 7
     for updates in (1, 2, 3):
         gradient = (rng.normal(size=expected.shape) / pixels).astype(np.float32)
         view.skies.update(view.sky, view.camera, device.upload(gradient), moments, 0.01)
-        given = pixels * gradient.astype(np.float64)
-        new, first, second = ref.adam_step(expected, given, first, second, updates, 0.01, epsilon=1.0)
+        total = pixels * gradient.astype(np.float64)
+        new, first, second = ref.adam_step(expected, total, first, second, updates, 0.01, epsilon=1.0)
         expected = np.where(free, new, expected)
     actual = view.sky.texels.get()
     yield by_element("sky_update", "colors of texels", actual[:, shown], expected, 1e-6, floor=1.0)
-    yield by_element("sky_update", "their first moments", moments["moment1"].get()[:, shown], first, 1e-5, floor=0.1)
-    yield by_element("sky_update", "their second moments", moments["moment2"].get()[:, shown], second, 1e-5, floor=0.1)
+    for name, moment in (("moment1", first), ("moment2", second)):
+        yield by_element("sky_update", f"{name} of texels", moments[name].get()[:, shown], moment, 1e-5, floor=0.1)
     hidden = np.setdiff1d(np.arange(texels), shown)
-    yield equal("sky_update", "texels that the view does not show", actual[:, hidden], before[:, hidden])
+    yield equal("sky_update", "texels outside the view", actual[:, hidden], before[:, hidden])

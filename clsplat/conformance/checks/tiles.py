@@ -14,38 +14,38 @@ from clsplat.render.tiles import Sort, Tiler
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # at the limits of local memory
-# at the limits of the teams' runs (8 * 64) and of the shortest run of one item
+LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # around the limits of local memory
+# around a team's run (8 * 64) and the shortest run of one item
 COUNTS = (1, 63, 64, 65, 511, 513, 1025, 16385, 40001)
 
 
-def tiler_of(device: Device, sort: Sort = "radix") -> Tiler:
+def make_tiler(device: Device, sort: Sort = "radix") -> Tiler:
     return Tiler(device, Workspace(device), sort)
 
 
 def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
     """Compare an exclusive prefix sum, which saturates at the largest number."""
-    offsets = tiler_of(device).scan(device.upload(values), len(values), "test").get()
+    offsets = make_tiler(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
     return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
 
 
 def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
     """Compare a stable sort of keys below 2^bits."""
-    sorted_keys, places = tiler_of(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
+    sorted_keys, order = make_tiler(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
-    yield equal("radix_scatter", f"places of {len(keys)} keys of {bits} bits", places.get(), expected)
+    yield equal("radix_scatter", f"positions of {len(keys)} keys of {bits} bits", order.get(), expected)
     yield equal("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
 
 
-def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], deepest: int) -> Results:
-    """Sort tiles of these lengths by depth keys below `deepest`, ties by pair."""
+def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
+    """Sort tiles of these lengths by depth keys below `max_key`, ties by pair."""
     tiles, pairs = len(lengths), sum(lengths)
     pair_tile = rng.permutation(np.repeat(np.arange(tiles), lengths)).astype(np.uint32)
-    depth_key = rng.integers(0, deepest, pairs).astype(np.uint32)
+    depth_key = rng.integers(0, max_key, pairs).astype(np.uint32)
     pair_splat = np.arange(pairs, dtype=np.uint32)
     upload = device.upload
-    offsets, ordered = tiler_of(device, "bitonic")._sort_in_tiles(
+    offsets, ordered = make_tiler(device, "bitonic")._sort_in_tiles(
         upload(pair_tile), upload(pair_splat), upload(depth_key), pairs, tiles
     )
     actual = offsets.get()
@@ -73,8 +73,8 @@ def radix_sort(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
 def bitonic_sort(device: Device, rng: np.random.Generator) -> Results:
-    for deepest in (50, 2**31):
-        yield from check_bitonic(device, rng, LENGTHS, deepest)
+    for max_key in (50, 2**31):
+        yield from check_bitonic(device, rng, LENGTHS, max_key)
 
 
 @CHECKS.add("count_large", "emit_large", "emit_pairs", "find_tile_offsets", "permute")
@@ -88,7 +88,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
-    """Check that each tile lists the splats that reach it, front to back, once, and few others."""
+    """Check that each tile lists the splats that reach it once, front to back, and few others."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
@@ -101,20 +101,20 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     if len(tile) < lists.pairs:
         yield wrong(kernel, f"pairs outside all tiles, {label}", np.ones(lists.pairs - len(tile)))
         return
-    sorted_places = np.lexsort((ordered, keys[ordered], tile))
+    sorted_order = np.lexsort((ordered, keys[ordered], tile))
     kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
-    yield equal(kernel, f"order in tiles, {label}", sorted_places, np.arange(lists.pairs))
+    yield equal(kernel, f"order in tiles, {label}", sorted_order, np.arange(lists.pairs))
     listed = np.zeros((tiles, count), int)
     np.add.at(listed, (tile, ordered), 1)
     yield wrong("emit_pairs", f"pairs listed twice, {label}", listed > 1)
     strongest, bounded = _strongest(frame, case)
-    yield wrong("emit_pairs", f"pairs that are missing, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
-    yield wrong("emit_pairs", f"pairs too many, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
+    yield wrong("emit_pairs", f"missing pairs, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
+    yield wrong("emit_pairs", f"superfluous pairs, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
     pairs = np.bincount(splats, minlength=count)
-    kept = lists.tile_count.get()[:count]
-    yield equal("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, kept)
-    first = lists.first_pair.get()[:count][kept > 0]
-    yield equal("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(kept))
+    tile_count = lists.tile_count.get()[:count]
+    yield equal("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, tile_count)
+    first = lists.first_pair.get()[:count][tile_count > 0]
+    yield equal("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(tile_count))
 
 
 def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -140,16 +140,16 @@ def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
     return strongest, inside[:, None] & ~thin
 
 
-# Splats that reach more tiles than a mask has bits: the items of a group share their rectangles.
+# Splats that reach more tiles than a mask has bits; the items of a group share the work on their rectangles.
 
 TALL = (3, 130)  # tiles: two or three rows for each of 64 items, none for the last
-WHOLE = ((8, 4), (11, 3))  # tiles: as many as a mask has bits, and one more
-SURPLUS = (-7, -1, 5)  # errors of a count, as another compiler might make
+MASK_SIZED = ((8, 4), (11, 3))  # tiles: as many as a mask has bits, and one more
+SURPLUS = (-7, -1, 5)  # errors in a count, as another compiler might cause
 UNTOUCHED = 0xDEADBEEF
 
 
-def case_of(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Return Gaussians of half the image's longer side, and some of a tenth; columns, rows: of tiles."""
+def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
+    """Return Gaussians of half the image's longer side, and some of a tenth; columns, rows: tiles."""
     tile = int(device.tuning["TILE"])
     width, height, side = columns * tile, rows * tile, max(columns, rows) * tile
     case = random_case(rng, count, side, side)
@@ -160,19 +160,19 @@ def case_of(device: Device, rng: np.random.Generator, columns: int, rows: int, c
 
 @CHECKS.add("count_large", "emit_large", "project_forward")
 def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
-    yield from check_all(device, rng)
+    yield from check_large(device, rng)
 
 
-def check_all(device: Device, rng: np.random.Generator) -> Results:
+def check_large(device: Device, rng: np.random.Generator) -> Results:
     """Compare lists of images with many rows, of rectangles at the limits of a mask, and of wrong counts."""
-    for columns, rows in (TALL, *WHOLE):
-        case, label = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
+    for columns, rows in (TALL, *MASK_SIZED):
+        case, label = large_case(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
         yield from check_list(device, case, "radix", label)
-    yield from check_miscounted(device, case_of(device, rng, *TALL))
+    yield from check_wrong_counts(device, large_case(device, rng, *TALL))
 
 
-def check_miscounted(device: Device, case: Case) -> Results:
-    """Check that each splat lists exactly as many tiles as were counted, right or wrong, each once."""
+def check_wrong_counts(device: Device, case: Case) -> Results:
+    """Check that each splat lists exactly as many tiles as were counted, even if the count is wrong, each once."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     number, camera = len(case.parameters["means"]), frame.camera
@@ -200,9 +200,9 @@ def check_miscounted(device: Device, case: Case) -> Results:
         tile, splat = (array.get() for array in arrays)
         label = f"large Gaussians counted with {surplus:+d} tiles"
         owner = np.repeat(np.arange(number), count)
-        yield equal("emit_large", f"places of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
+        yield equal("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
         yield wrong("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
-        yield equal("emit_large", f"places behind {label}", tile[len(owner) :], UNTOUCHED)
+        yield equal("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
         yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, twice), 0, counts=True)

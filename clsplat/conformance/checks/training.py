@@ -10,8 +10,8 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
-from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, splats_of
-from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, project_records
+from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.deferred import Deferred
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gaussians, hide
@@ -63,7 +63,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
             yield by_element("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * largest)
 
 
-def _sums_of(
+def _random_pixel_sums(
     device: Device, rng: np.random.Generator, case: Case, rasterizer: Rasterizer, model: DeviceModel
 ) -> tuple[Frame, Array]:
     """Return the frame of a case, and its sums over pixels for a random gradient of the image."""
@@ -79,7 +79,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
-    frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
+    frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
     grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
     expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
     yield by_norm(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
@@ -93,8 +93,8 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
         yield by_element(kernel, f"{name}, {label}", gaussians.get(name), before - step, 3e-7, floor)
 
 
-def check_seen(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare the fifth update, only of visible rows, with earlier moments, by each kernel from the same gradients."""
+def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
+    """Compare the fifth update, of visible rows only, by each kernel from the same gradients and earlier moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -104,7 +104,7 @@ def check_seen(device: Device, rng: np.random.Generator, case: Case, label: str)
     for kernel in ("update_gaussians", "adam_step"):
         rasterizer, model = Rasterizer(device, "radix"), case.model(device)
         gaussians, adam = model.gaussians, Adam(model.gaussians)
-        frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
+        frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
         gradients = rasterizer.gradients(model, frame, pixel_sums)
         seen = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
         adam.updates = dict.fromkeys(PARAMETERS, 4)
@@ -127,7 +127,7 @@ def check_seen(device: Device, rng: np.random.Generator, case: Case, label: str)
             yield by_element(kernel, f"{table} of rows seen, {label}", actual[seen], truth[seen], 3 * SUM, floor=0.1)
 
 
-def behind_each_fifth(case: Case) -> Case:
+def put_every_fifth_behind(case: Case) -> Case:
     """Return the case with every fifth Gaussian behind the camera."""
     case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
     return case
@@ -142,15 +142,15 @@ def adam_updates(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("adam_step", "update_gaussians")
 def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        yield from check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
+        yield from check_seen_rows(device, rng, put_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
 
 
 @CHECKS.add("update_gaussians")
 def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Results:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
-        case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
+        case = add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
         label = f"{count} Gaussians, degree {degree}"
-        yield from check_fused(device, rng, behind_each_fifth(case), label)
+        yield from check_fused(device, rng, put_every_fifth_behind(case), label)
 
 
 def check_penalty(
@@ -233,16 +233,16 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
         yield Deviation("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
 
 
-# Deferred updates of harmonics: they wait until a view sees their Gaussians.
+# Deferred updates of harmonics, which wait until a view sees their Gaussians.
 
 DEFERRED_COUNTS = (1, 15, 17, 65, 150)
 CULLED = 0xFFFFFFFF
-LONGEST = 5  # fewer than the steps, so that the list is full once
+MAX_DEFERRED = 5  # less than STEPS, so that the list fills up once
 STEPS = 8
 
 
 def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
-    """Return the rows that a view sees: few, and in few of the blocks of 16."""
+    """Return the rows that a view sees, [N]: few, and in few of the blocks of 16."""
     blocks = rng.random(-(-count // 16)) < 0.4
     return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
 
@@ -257,19 +257,19 @@ def train(
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)
     frame = Rasterizer(device, "radix").forward(model, camera, device.upload(BACKGROUND))
-    deferred = gaussians.deferred = Deferred(gaussians, LONGEST) if rows == "deferred" else None
+    deferred = gaussians.deferred = Deferred(gaussians, MAX_DEFERRED) if rows == "deferred" else None
     for step, (mask, gradient) in enumerate(zip(seen, gradients, strict=True), 1):
         keys = np.full(gaussians.capacity, CULLED, np.uint32)
         keys[: gaussians.count][mask] = 7
-        of_view = replace(frame, depth_key=device.upload(keys))
-        of_loss = GaussianGradients(gaussians)
-        planes = np.zeros(of_loss["sh_rest"].shape, np.float32)
+        view_frame = replace(frame, depth_key=device.upload(keys))
+        loss_gradients = GaussianGradients(gaussians)
+        planes = np.zeros(loss_gradients["sh_rest"].shape, np.float32)
         planes[:, : gaussians.count] = gradient.T
-        of_loss["sh_rest"].set(planes)
+        loss_gradients["sh_rest"].set(planes)
         if deferred:
-            deferred.catch_up(of_view.depth_key)
+            deferred.catch_up(view_frame.depth_key)
         others = set(gaussians.trained) - {"sh_rest"}
-        adam.step(model, of_view, of_loss, Rates().at(step, extent=2.0), others, rows)
+        adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), others, rows)
     return {name: gaussians.get(name) for name in Deferred.names}
 
 
@@ -349,7 +349,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Result
     left_out = rng.random((2, count)) < 0.5
     hide(model.gaussians, left_out)
     actual = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
-    expected, _, _ = splats_of(device, case)
+    expected, _, _ = project_records(device, case)
     expected[left_out[1]] = 0
     yield equal("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)
 
@@ -360,5 +360,5 @@ def dropout(device: Device, rng: np.random.Generator) -> Results:
         case = replace(random_case(rng, count), dropout=DROPOUT)
         yield from check_dropout(device, case, rng, f"{count} Gaussians, some dropped")
         yield from check_hidden(device, case, rng)
-    filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    filtered = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
     yield from check_dropout(device, replace(filtered, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")

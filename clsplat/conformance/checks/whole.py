@@ -30,15 +30,15 @@ CHECKS = Checks()
 SPEED = Checks()  # run once per device, not for each schedule
 STEPS = 60
 MAX_TRAINING_S = 40.0  # time after which a slow device stops early
-MEMORY_SHARE = 0.25  # share of free memory to use, since device and host may share it and must not swap
+MEMORY_FRACTION = 0.25  # of free memory to use, since device and host may share it and must not swap
 FIRST_BUFFER = 128 << 20  # bytes
 MAX_TOUCH_S = 4.0  # longest time to write a buffer
-CLAIMED = "other programs may use the device's memory; close them and run `clsplat doctor` again"
+IN_USE = "other programs may use the device's memory; close them and run `clsplat doctor` again"
 BENCH = (256, 256, 20_000)  # width, height, Gaussians
 
 
-def _photographs(device: Device, case: Case) -> Photograph:
-    """Return the scene as the device renders it, in 8 bits."""
+def _render_photograph(device: Device, case: Case) -> Photograph:
+    """Return a photograph of the scene as the device renders it, in 8 bits."""
     camera = case.device_camera(device)
     frame = Rasterizer(device, "radix").forward(case.model(device), camera, device.zeros(3))
     image = frame.image.get()[:, : camera.height, : camera.width]
@@ -49,7 +49,7 @@ def train(
     device: Device, case: Case, start: dict[str, NDArray[Any]], steps: int
 ) -> tuple[list[float], dict[str, NDArray[Any]]]:
     """Train `start` on the render of a scene, with one density edit; return the losses and all tables."""
-    photograph = _photographs(device, case)
+    photograph = _render_photograph(device, case)
     model = Case(start, case.view).model(device)
     gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")
     adam, stats = Adam(gaussians), SplatStats(gaussians)
@@ -74,56 +74,56 @@ def training(device: Device, rng: np.random.Generator) -> Results:
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
     start["sh_base"] *= 0  # gray
     values, tables = train(device, case, start, STEPS)
-    again, same = train(device, case, start, len(values))
+    again, again_tables = train(device, case, start, len(values))
     count, label = len(tables["means"]), f"{len(values)} steps"
     yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
     yield equal("training", f"losses of {label}, a second time", np.array(again), np.array(values[: len(again)]))
     for name, table in tables.items():
-        if table.shape != same[name].shape:
-            difference, where = abs(len(same[name]) - count), f"rows of {name} after {label}, a second time"
+        if table.shape != again_tables[name].shape:
+            difference, where = abs(len(again_tables[name]) - count), f"rows of {name} after {label}, a second time"
             yield Deviation("training", where, difference, 0, counts=True)
         else:
-            bits = same[name].view(np.uint32), table.view(np.uint32)
+            bits = again_tables[name].view(np.uint32), table.view(np.uint32)
             yield equal("training", f"{name} after {label}, a second time", *bits)
     finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
     yield Deviation("training", f"values that are not finite after {label}", finite, 0, counts=True)
     if len(values) == STEPS:
-        yield Deviation("training", f"the loss after {label}, as a share of the first one", values[-1] / values[0], 0.7)
+        yield Deviation("training", f"the loss after {label}, relative to the first one", values[-1] / values[0], 0.7)
 
 
 @SPEED.add()
 def memory(device: Device, rng: np.random.Generator) -> Results:
     """Allocate buffers of growing size up to the largest allowed, write each, and read samples.
 
-    A failed allocation is no failure of the device: other programs may use its memory, which OpenCL does not report.
+    A failed allocation is not counted as a failure: other programs may use memory, which OpenCL does not report.
     """
     promised, free = device.info.allocation, available_memory()
-    room = int(MEMORY_SHARE * min(device.info.memory, device.info.memory if free is None else free))
-    limit = min(promised, room) // 64 * 64  # allocations are rounded up to 64
-    held, size = 0, min(FIRST_BUFFER, limit)
+    budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free is None else free))
+    limit = min(promised, budget) // 64 * 64  # allocations are rounded up to 64
+    largest, size = 0, min(FIRST_BUFFER, limit)
     stopped = "more was not tried, because too little memory is free"
-    while size > held:
+    while size > largest:
         started = time.perf_counter()
         try:
             yield from _check_buffer(device, size)
         except MemoryLimitError:
-            stopped = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {CLAIMED}"
+            stopped = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {IN_USE}"
             break
-        held, size = size, min(2 * size, limit)
-        if 2 * (time.perf_counter() - started) > MAX_TOUCH_S and size > held:
+        largest, size = size, min(2 * size, limit)
+        if 2 * (time.perf_counter() - started) > MAX_TOUCH_S and size > largest:
             stopped = "more was not tried, because it would take too long"
             break
-    if held == promised // 64 * 64:
+    if largest == promised // 64 * 64:
         stopped = "the largest size works"
-    yield Note("memory", {"promised": promised, "held": held, "free": free, "stopped": stopped})
+    yield Note("memory", {"promised": promised, "held": largest, "free": free, "stopped": stopped})
 
 
 def _check_buffer(device: Device, size: int) -> Results:
-    whole = device.empty(size // 4)
-    whole.fill(1.5)
-    Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not show up at the other end
-    places = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
-    actual = np.array([whole.get_item(i) for i in places])
+    buffer = device.empty(size // 4)
+    buffer.fill(1.5)
+    Array(device, buffer.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not show up at the other end
+    indices = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
+    actual = np.array([buffer.get_item(i) for i in indices])
     expected = np.where(np.arange(len(actual)) == 0, 2.5, 1.5)
     yield equal("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", actual, expected)
 
@@ -153,6 +153,6 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Results:
 @SPEED.add()
 def speed(device: Device, rng: np.random.Generator) -> Results:
     peaks = measure_peaks(device, repeats=2)
-    one = bench_case(device, *BENCH, load("splat").settings)
-    result = run_bench({"": one}, Peaks(**asdict(peaks)), repeats=5)[""]
+    bench = bench_case(device, *BENCH, load("splat").settings)
+    result = run_bench({"": bench}, Peaks(**asdict(peaks)), repeats=5)[""]
     yield Note("speed", {"scene": BENCH, "peaks": asdict(peaks), **asdict(result)})

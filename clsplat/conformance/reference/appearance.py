@@ -1,4 +1,4 @@
-"""Compute bilateral grids, color matrices and camera responses, and their gradients.
+"""Apply bilateral grids, color matrices and camera responses, and compute their gradients.
 
 Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: differences of matrices [E | b] from the identity.
 """
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
 
 
-def gridded(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
+def apply_color_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
     """Return min(1, c + A [c; 1]) for every pixel, A the grid interpolated at its position and luminance."""
-    return np.minimum(changed_by_grid(image, grid), 1)
+    return np.minimum(unclamped_grid_colors(image, grid), 1)
 
 
-def gridded_backward(
+def color_grid_backward(
     image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * gridded) by the image and the grid; clamped values pass none."""
-    passed = np.where(changed_by_grid(image, grid) < 1, gradient, 0)
-    grad_image, grad_grid, with_one = passed.copy(), np.zeros(grid.shape), _with_one(image)
+    """Return the gradients of sum(gradient * output) with respect to image and grid; clamped values pass none."""
+    passed = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
+    grad_image, grad_grid, with_one = passed.copy(), np.zeros(grid.shape), _append_one(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
     levels, inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
     for (k, j, i), weight, slope in _corners(image, grid):
         node = grid[:, :, k, j, i]  # [3, 4, H, W]
         grad_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], passed)
-        through = np.einsum("abhw,ahw,bhw->hw", node, passed, with_one)
-        grad_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * through, 0)
+        grad_luminance = np.einsum("abhw,ahw,bhw->hw", node, passed, with_one)
+        grad_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * grad_luminance, 0)
         for a, b in itertools.product(range(3), range(4)):
             np.add.at(grad_grid[a, b], (k, j, i), weight * passed[a] * with_one[b])
     return grad_image, grad_grid
@@ -38,29 +38,29 @@ def gridded_backward(
 
 def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     """Return the sum over axes of the mean squared difference of neighboring nodes, and its gradient."""
-    value, derivatives = 0.0, np.zeros(grid.shape)
+    value, gradient = 0.0, np.zeros(grid.shape)
     for axis in (2, 3, 4):
         difference = np.diff(grid, axis=axis)
         if difference.size:
             value += float((difference**2).mean())
             ends = [(0, 0)] * axis + [(1, 1)] + [(0, 0)] * (4 - axis)
-            derivatives -= 2 * np.diff(np.pad(difference, ends), axis=axis) / difference.size
-    return value, derivatives
+            gradient -= 2 * np.diff(np.pad(difference, ends), axis=axis) / difference.size
+    return value, gradient
 
 
-def centered_grids(grids: NDArray[Any]) -> NDArray[Any]:
+def center_grids(grids: NDArray[Any]) -> NDArray[Any]:
     """Subtract from grids, [photographs, 3, 4, nz, ny, nx], the mean over photographs and positions at each level."""
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
 
-def _with_one(image: NDArray[Any]) -> NDArray[Any]:
+def _append_one(image: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([image, np.ones((1, *image.shape[1:]))])
 
 
-def changed_by_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
+def unclamped_grid_colors(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
     """Return c + A [c; 1] for every pixel, without the clamp."""
     matrix = sum(weight * grid[:, :, k, j, i] for (k, j, i), weight, _ in _corners(image, grid))
-    return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _with_one(image)))
+    return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _append_one(image)))
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
@@ -69,37 +69,35 @@ def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDA
     _, height, width = image.shape
     y, x = np.mgrid[:height, :width]
     luminance = np.clip(np.einsum("a,ahw->hw", WEIGHTS, image), 0, 1)
-    places = luminance * (nz - 1), (y + 0.5) / height * (ny - 1), (x + 0.5) / width * (nx - 1)
-    firsts = [
-        np.clip(np.floor(place), 0, max(n - 2, 0)).astype(int) for place, n in zip(places, (nz, ny, nx), strict=True)
-    ]
+    positions = luminance * (nz - 1), (y + 0.5) / height * (ny - 1), (x + 0.5) / width * (nx - 1)
+    firsts = [np.clip(np.floor(p), 0, max(n - 2, 0)).astype(int) for p, n in zip(positions, (nz, ny, nx), strict=True)]
     for corner in itertools.product((0, 1), repeat=3):
         nodes = [np.minimum(f + step, n - 1) for f, step, n in zip(firsts, corner, (nz, ny, nx), strict=True)]
-        shares = [p - f if step else 1 - (p - f) for p, f, step in zip(places, firsts, corner, strict=True)]
-        slope = (1 if corner[0] else -1) * (nz > 1) * shares[1] * shares[2]
-        yield tuple(nodes), np.prod(shares, axis=0), slope
+        weights = [p - f if step else 1 - (p - f) for p, f, step in zip(positions, firsts, corner, strict=True)]
+        slope = (1 if corner[0] else -1) * (nz > 1) * weights[1] * weights[2]
+        yield tuple(nodes), np.prod(weights, axis=0), slope
 
 
-# The colors of one photograph: an affine change of an image's colors, cut at white.
+# The colors of one photograph: an affine map of an image's colors, clamped at white.
 
 
-def colored(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
-    """min(1, E c + b) of every pixel."""
-    return np.minimum(_changed(image, matrix), 1)
+def apply_color_matrix(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return min(1, E c + b) for every pixel."""
+    return np.minimum(_transform(image, matrix), 1)
 
 
-def colored_backward(
+def color_matrix_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * colored) with respect to image and matrix; 0 where values are clipped."""
-    passed = np.where(_changed(image, matrix) < 1, gradient, 0)
+    """Return the gradients of sum(gradient * output) with respect to image and matrix; clamped values pass none."""
+    passed = np.where(_transform(image, matrix) < 1, gradient, 0)
     grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
     with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
     return grad_image, np.einsum("ahw,bhw->ab", passed, with_one)
 
 
 def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
-    """The matrix of a gain and a white balance, [3, 4]: green is tied, so that the luminance follows `exposure`."""
+    """Return the matrix of a gain and a white balance, [3, 4]; green is such that the luminance follows `exposure`."""
     luminance = np.array([0.299, 0.587, 0.114])  # BT.601
     green = -(luminance[0] * red + luminance[2] * blue) / luminance[1]
     return np.column_stack([np.diag(np.exp(exposure + np.array([red, green, blue]))), np.zeros(3)])
@@ -111,25 +109,25 @@ def gain_gradient(exposure: float, red: float, blue: float, grad_matrix: NDArray
     return np.array([q.sum(), q[0] - 0.299 / 0.587 * q[1], q[2] - 0.114 / 0.587 * q[1]])
 
 
-def _changed(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
-    """E c + b of every pixel."""
+def _transform(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return E c + b for every pixel."""
     return np.asarray(np.einsum("ab,bhw->ahw", matrix[:, :3], image) + matrix[:, 3, None, None])
 
 
-# What a camera makes of light, of 17 numbers: its center [2], a, b, c, and four of the curve of each channel.
+# The response of a camera to light, 17 numbers: center [2], a, b, c, and four of the curve of each channel.
 
 
-def taken(image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float]) -> NDArray[Any]:
-    """f(v x) of every pixel x; middle: the principal point, px."""
-    light = image * _falloff(image, row, middle)[0]
+def apply_response(image: NDArray[Any], row: NDArray[Any], center: tuple[float, float]) -> NDArray[Any]:
+    """Return f(v x) for every pixel x; center: the principal point, px."""
+    light = image * _falloff(image, row, center)[0]
     return np.stack([_curve(light[i], _slopes(row, i)) for i in range(3)])
 
 
-def taken_backward(
-    image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float], gradient: NDArray[Any]
+def apply_response_backward(
+    image: NDArray[Any], row: NDArray[Any], center: tuple[float, float], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * taken) with respect to the image and the numbers."""
-    falloff, q, away = _falloff(image, row, middle)
+    """Return the gradients of sum(gradient * output) with respect to the image and the 17 numbers."""
+    falloff, q, offset = _falloff(image, row, center)
     light, grad_light, grad_row = image * falloff, np.zeros(image.shape), np.zeros(17)
     for i in range(3):
         slopes = _slopes(row, i)
@@ -142,20 +140,20 @@ def taken_backward(
     grad_falloff = (grad_light * image).sum(axis=0)
     grad_row[2:5] = [(grad_falloff * q**power).sum() for power in (1, 2, 3)]
     a, b, c = row[2:5]
-    grad_row[:2] = [(grad_falloff * (a + 2 * b * q + 3 * c * q**2) * -2 * one).sum() for one in away]
+    grad_row[:2] = [(grad_falloff * (a + 2 * b * q + 3 * c * q**2) * -2 * axis).sum() for axis in offset]
     return grad_light * falloff, grad_row
 
 
 def _falloff(
-    image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float]
+    image: NDArray[Any], row: NDArray[Any], center: tuple[float, float]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """v, q, and what leads from the center to each pixel, [2, H, W], in half diagonals."""
+    """Return v, q, and the offset of each pixel from the center, [2, H, W], in half diagonals."""
     _, height, width = image.shape
     half = np.hypot(width, height) / 2
     y, x = np.mgrid[:height, :width] + 0.5
-    away = np.stack([(x - middle[0]) / half - row[0], (y - middle[1]) / half - row[1]])
-    q = (away**2).sum(axis=0)
-    return 1 + row[2] * q + row[3] * q**2 + row[4] * q**3, q, away
+    offset = np.stack([(x - center[0]) / half - row[0], (y - center[1]) / half - row[1]])
+    q = (offset**2).sum(axis=0)
+    return 1 + row[2] * q + row[3] * q**2 + row[4] * q**3, q, offset
 
 
 def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
@@ -165,7 +163,7 @@ def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the quarter of [0, 1] that a value is in, or the nearest one, and its offset in that quarter."""
+    """Return the quarter of [0, 1] that contains or is nearest to each value, and the offset in that quarter."""
     inside = np.clip(x, 0, 1)
     quarter = np.minimum((4 * inside).astype(int), 3)
     return quarter, inside - quarter / 4

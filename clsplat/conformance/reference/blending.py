@@ -17,55 +17,57 @@ from clsplat.conformance.reference.projection import project, project_backward
 
 Floats = NDArray[Any]
 SLOPE, CUBIC, QUINTIC = 1.5957691, 0.07333173, -0.00059424  # Φ(x) = 1 / (1 + e^-P), P = SLOPE x + CUBIC x³ + …
-REACH = 6.0  # of Φ, standard deviations
-UNIFORM = 0.4  # a pixel below this many standard deviations from its center to its edge: m and v by their series
+REACH = 6.0  # standard deviations beyond which Φ is constant
+UNIFORM = 0.4  # half a pixel in standard deviations below which mean and variance use series
 STEP = 1e-5  # step of finite differences, px or px², relative to the size of the splat
 
 
 def cdf(x: Floats) -> Floats:
+    """Return Φ(x), the cumulative normal distribution."""
     x = np.clip(x, -REACH, REACH)
     square = x * x
     return 1 / (1 + np.exp(-x * (SLOPE + square * (CUBIC + square * QUINTIC))))
 
 
 def density(x: Floats) -> Floats:
+    """Return the derivative of `cdf`."""
     x = np.clip(x, -REACH, REACH)
-    square, share = x * x, cdf(x)
-    return share * (1 - share) * (SLOPE + square * (3 * CUBIC + square * (5 * QUINTIC)))
+    square, probability = x * x, cdf(x)
+    return probability * (1 - probability) * (SLOPE + square * (3 * CUBIC + square * (5 * QUINTIC)))
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
     """Return the mass Z of a normal distribution within ½ of `dy`, and its mean and variance there; dy >= 0."""
     below, above = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored, where Φ is small and exact
-    share = np.maximum(cdf(above) - cdf(below), 1e-30)
+    mass = np.maximum(cdf(above) - cdf(below), 1e-30)
     if 0.5 / s < UNIFORM:
         tilt = dy / s**2
         mean = dy - tilt * (1 / 12 - 1 / (360 * s**2) - tilt**2 / 720)
-        return share, mean, np.maximum(1 / 12 - 1 / (360 * s**2) - tilt**2 / 240, 0)
+        return mass, mean, np.maximum(1 / 12 - 1 / (360 * s**2) - tilt**2 / 240, 0)
     below, above = np.clip(below, -REACH, REACH), np.clip(above, -REACH, REACH)
-    mean = (density(below) - density(above)) / share
-    variance = 1 + (below * density(below) - above * density(above)) / share - mean**2
-    return share, np.clip(-mean * s, dy - 0.5, dy + 0.5), np.clip(variance * s**2, 0, 1 / 12)
+    mean = (density(below) - density(above)) / mass
+    variance = 1 + (below * density(below) - above * density(above)) / mass - mean**2
+    return mass, np.clip(-mean * s, dy - 0.5, dy + 0.5), np.clip(variance * s**2, 0, 1 / 12)
 
 
 def box_response(covariance: Floats, dx: Floats, dy: Floats) -> Floats:
-    """Mean over the pixel at (dx, dy) px of e^(-dᵀ V⁻¹ d / 2), V = [xx, xy, yy] px²."""
+    """Return the mean of e^(-dᵀ V⁻¹ d / 2) over the pixel at (dx, dy) px, V = [xx, xy, yy] px²."""
     xx, xy, yy = covariance
     if xx > yy:
         return box_response(np.array([yy, xy, xx]), dy, dx)
     k, sy, sx = xy / yy, np.sqrt(yy), np.sqrt(xx - xy * xy / yy)
-    share, mean, variance = moments(np.abs(dy), sy)
+    mass, mean, variance = moments(np.abs(dy), sy)
     mean = np.where(dy < 0, -mean, mean)
     r = 12 * k * k * variance
     width = (1 + r * r) ** 0.25
     blur = np.sqrt(sx * sx + (1 + r - width * width) / 12)
     offset = -np.abs(dx - k * mean)
     across = cdf((offset + width / 2) / blur) - cdf((offset - width / 2) / blur)
-    return np.asarray(2 * np.pi * sy * sx * share / width * across)
+    return np.asarray(2 * np.pi * sy * sx * mass / width * across)
 
 
 def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats, ...]:
-    """d(response) by dx, dy, xx, xy, yy: central differences, on the same side of xx = yy."""
+    """Return the derivatives with respect to dx, dy, xx, xy, yy by central differences on one side of xx = yy."""
 
     def change(size: float, **by: float) -> Floats:
         ends = []
@@ -75,11 +77,11 @@ def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats,
         return (ends[0] - ends[1]) / (2 * size)
 
     xx, xy, yy = covariance
-    place = STEP * np.sqrt(xx - xy * xy / yy)
+    distance = STEP * np.sqrt(xx - xy * xy / yy)
     area = STEP * (xx * yy - xy * xy) / max(xx, yy)
     return (
-        change(place, x=1),
-        change(place, y=1),
+        change(distance, x=1),
+        change(distance, y=1),
         change(area, xx=1),
         change(area, xy=1),
         change(area, yy=1),
@@ -87,7 +89,7 @@ def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats,
 
 
 class BlendStep(NamedTuple):
-    """One splat over all pixels; every array is [H,W]."""
+    """The blending of one splat over all pixels; every array is [H,W]."""
 
     splat: int
     dx: NDArray[Any]
@@ -95,19 +97,19 @@ class BlendStep(NamedTuple):
     falloff: NDArray[Any]  # e^-σ
     alpha: NDArray[Any]
     before: NDArray[Any]  # transmittance in front of the splat
-    tried: NDArray[Any]  # the pixel had not stopped yet
+    tried: NDArray[Any]  # the pixel has not stopped before
     candidate: NDArray[Any]  # tried and not too faint
     blended: NDArray[Any]  # candidate and does not make the pixel stop
 
 
 def depth_order(splats: Splats) -> NDArray[Any]:
-    """Visible splats front to back, ties by index."""
+    """Return visible splats front to back, ties by index."""
     order = np.argsort(splats.depth, kind="stable")
     return order[splats.visible[order]]
 
 
 def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[BlendStep]:
-    """Walk through the splats front to back."""
+    """Yield the blending of each splat, front to back."""
     pixel_x, pixel_y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance = np.ones((height, width))
     running = np.ones((height, width), bool)
@@ -126,7 +128,7 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
         transmittance = np.where(blended, after, transmittance)
 
 
-def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
+def background_planes(background: NDArray[Any]) -> NDArray[Any]:
     """Return a background color, [3], or image, [3, H, W], as planes."""
     array = np.asarray(background)
     return array if array.ndim == 3 else array[:, None, None]
@@ -135,7 +137,7 @@ def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
 def blend(
     splats: Splats, width: int, height: int, background: NDArray[Any], thresholds: Thresholds = Thresholds()
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Image [3,H,W], final transmittance [H,W], number of blended splats [H,W]."""
+    """Return the image, [3,H,W], the final transmittance, [H,W], and the number of blended splats, [H,W]."""
     image = np.zeros((3, height, width))
     transmittance = np.ones((height, width))
     count = np.zeros((height, width), int)
@@ -144,7 +146,7 @@ def blend(
         image += splats.color[step.splat][:, None, None] * weight
         transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
         count += step.blended
-    return image + planes_behind(background) * transmittance, transmittance, count
+    return image + background_planes(background) * transmittance, transmittance, count
 
 
 def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
@@ -156,27 +158,27 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
 
 
 def weight_entropy(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
-    """-Σ w ln w of the weights of all splats and of what they leave, [H,W]."""
+    """Return -Σ w ln w over the weights of all splats and of the background, [H,W]."""
     weights = blend_weights(splats, width, height, thresholds)
     weights = np.concatenate([weights, 1 - weights.sum(axis=0, keepdims=True)])
     return -np.sum(weights * np.log(np.where(weights > 0, weights, 1)), axis=0)
 
 
 def entropy_gradients(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[NDArray[Any]]:
-    """d(entropy)/d(alpha) of each splat front to back, [H,W]: -(ln w + 1) T + Σ_behind (ln w + 1) w / (1 - alpha)."""
+    """Yield d(entropy)/d(alpha), [H,W], front to back: -(ln w + 1) T + Σ_behind (ln w + 1) w / (1 - alpha)."""
     steps = list(blend_steps(splats, width, height, thresholds))
     weights = [np.where(step.blended, step.alpha * step.before, 0) for step in steps]
     weights.append(1 - np.sum(weights, axis=0))
     terms = [(np.log(np.where(weight > 0, weight, 1)) + 1) * weight for weight in weights]
     for n, step in enumerate(steps):
-        own = (np.log(np.where(weights[n] > 0, weights[n], 1)) + 1) * step.before
-        yield -own + np.sum(terms[n + 1 :], axis=0) / (1 - step.alpha)
+        direct = (np.log(np.where(weights[n] > 0, weights[n], 1)) + 1) * step.before
+        yield -direct + np.sum(terms[n + 1 :], axis=0) / (1 - step.alpha)
 
 
 def contribution(
     splats: Splats, width: int, height: int, mask: NDArray[Any] | None = None, thresholds: Thresholds = Thresholds()
 ) -> NDArray[Any]:
-    """Blend weights summed over the pixels of a view that count, [N]; `mask`: [H,W], None: all count."""
+    """Return blend weights summed over the pixels of a view that count, [N]; `mask`: [H,W], None: all count."""
     weights = blend_weights(splats, width, height, thresholds)
     return np.sum(weights if mask is None else weights * mask, axis=(1, 2))
 
@@ -189,15 +191,15 @@ def alpha_gradients(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
-    """Each splat front to back with dL/dalpha, [H,W], in the prefix form; where alpha is capped it is zero.
+    """Yield each splat front to back with dL/dalpha, [H,W], in the prefix form; it is zero where alpha is capped.
 
     grad_image: [3,H,W], or [4,H,W] with the gradient of the entropy of weights.
     """
     grad_image, grad_entropy = grad_image[:3], grad_image[3:]
     entropy = entropy_gradients(splats, width, height, thresholds) if len(grad_entropy) else iter(())
     image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = (planes_behind(background) * grad_image).sum(axis=0)
-    behind = image - planes_behind(background) * final  # S_N - S_i, once splat i has been taken off
+    through_background = (background_planes(background) * grad_image).sum(axis=0)
+    behind = image - background_planes(background) * final  # S_N - S_i, after subtracting splat i
     for step in blend_steps(splats, width, height, thresholds):
         i, alpha, before = step.splat, step.alpha, step.before
         color = splats.color[i][:, None, None]
@@ -218,7 +220,7 @@ def blend_backward(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> SplatGradients:
-    """Gradients of the splats; grad_image: as in `alpha_gradients`."""
+    """Return the gradients of the splats; grad_image: as in `alpha_gradients`."""
     n = len(splats.opacity)
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
@@ -226,9 +228,9 @@ def blend_backward(
         grad.color[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         if splats.pixel_box:
-            by = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
-            grad.mean2d[i], grad.conic[i] = by[:2].sum(axis=(1, 2)), by[2:].sum(axis=(1, 2))
-            grad.mean2d_abs[i] = np.abs(by[:2]).sum(axis=(1, 2))
+            grads = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
+            grad.mean2d[i], grad.conic[i] = grads[:2].sum(axis=(1, 2)), grads[2:].sum(axis=(1, 2))
+            grad.mean2d_abs[i] = np.abs(grads[:2]).sum(axis=(1, 2))
             continue
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]
@@ -249,7 +251,7 @@ def falloff_squares(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """(dL/dG)² summed over pixels, [N], where alpha is the opacity times G."""
+    """Return (dL/dG)² summed over pixels, [N], where alpha is the opacity times G."""
     squares = np.zeros(len(splats.opacity))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         squares[step.splat] = np.sum((splats.opacity[step.splat] * grad_alpha) ** 2)
@@ -257,7 +259,7 @@ def falloff_squares(
 
 
 class Margin(NamedTuple):
-    """Smallest relative distances to a decision that float32 might take differently; inf where there is none."""
+    """Smallest relative distances to decisions that float32 might make differently; inf if there are none."""
 
     alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
@@ -284,11 +286,11 @@ def _relative_gap(values: NDArray[Any], threshold: float) -> float:
 
 
 class RenderOutput(NamedTuple):
-    """What `render` returns."""
+    """The result of `render`."""
 
     image: NDArray[Any]  # [3,H,W]
     transmittance: NDArray[Any]  # [H,W]
-    blended: NDArray[Any]  # [H,W] splats
+    blended: NDArray[Any]  # [H,W] number of splats
     splats: Splats
 
 
@@ -303,7 +305,7 @@ def render(
     thresholds: Thresholds = Thresholds(),
     pixel_box: float = 0.0,
 ) -> RenderOutput:
-    """Project and blend."""
+    """Project and blend Gaussians."""
     splats = project(gaussians, camera, degree, near, variance, compensate, thresholds, pixel_box)
     return RenderOutput(*blend(splats, camera.width, camera.height, background, thresholds), splats)
 
@@ -319,52 +321,52 @@ def render_backward(
     compensate: float = 0.0,
     thresholds: Thresholds = Thresholds(),
 ) -> tuple[dict[str, NDArray[Any]], SplatGradients]:
-    """Gradients of the parameters, and those of the splats on the way (for density control)."""
+    """Return the gradients of the parameters, and those of the splats (for density control)."""
     grad = blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
     upstream = grad.mean2d, grad.conic, grad.opacity, grad.color
     return project_backward(gaussians, camera, degree, variance, compensate, splats, *upstream), grad
 
 
-# The blended inverse depth, its gradient, and the loss of depths that are known at some pixels.
+# The blended inverse depth, its gradient, and the loss against known depths of some pixels.
 
 BLACK = np.zeros(3)
 
 
-def _painted(splats: Splats) -> Splats:
+def _color_by_inverse_depth(splats: Splats) -> Splats:
     inverse = np.where(splats.visible, 1 / np.where(splats.visible, splats.depth, 1), 0)
     return replace(splats, color=np.stack([inverse, *np.zeros((2, len(inverse)))], axis=1))
 
 
 def inverse_depth(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Floats:
-    """D, [H,W]."""
-    image, _, _ = blend(_painted(splats), width, height, BLACK, thresholds)
+    """Return the blended inverse depth D, [H,W]."""
+    image, _, _ = blend(_color_by_inverse_depth(splats), width, height, BLACK, thresholds)
     return np.asarray(image[0])
 
 
 def inverse_depth_backward(
     splats: Splats, width: int, height: int, grad: Floats, thresholds: Thresholds = Thresholds()
 ) -> tuple[SplatGradients, Floats]:
-    """Gradients of the splats, whose colors have none, and dL/dz, [N]; grad: dL/dD, [H,W]."""
+    """Return the gradients of the splats, zero for colors, and dL/dz, [N]; grad: dL/dD, [H,W]."""
     planes = np.stack([grad, *np.zeros((2, *grad.shape))])
-    actual = blend_backward(_painted(splats), width, height, BLACK, planes, thresholds)
-    grad_depth = -actual.color[:, 0] * _painted(splats).color[:, 0] ** 2
+    actual = blend_backward(_color_by_inverse_depth(splats), width, height, BLACK, planes, thresholds)
+    grad_depth = -actual.color[:, 0] * _color_by_inverse_depth(splats).color[:, 0] ** 2
     return actual._replace(color=0 * actual.color), grad_depth
 
 
 def inverse_depth_loss(
-    plane: Floats, places: tuple[Floats, Floats], targets: Floats, weights: Floats
+    plane: Floats, positions: tuple[Floats, Floats], targets: Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
-    """The terms q |D - 1/z| at the places (rows, columns), [K], and the gradient of their sum, [H,W]."""
-    difference = plane[places] - targets
+    """Return the terms q |D - 1/z| at positions (rows, columns), [K], and the gradient of their sum, [H,W]."""
+    difference = plane[positions] - targets
     gradient = np.zeros(plane.shape)
-    gradient[places] = weights * np.sign(difference)
+    gradient[positions] = weights * np.sign(difference)
     return weights * np.abs(difference), gradient
 
 
-# A layer in front of an image: the composite, the gradient of the image, and the loss on the layer's cover.
+# A layer in front of an image: the composite, the gradient of the image, and the loss on the layer's opacity.
 
 
-def laid_over(layer: NDArray[Any], left: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
+def overlay(layer: NDArray[Any], left: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
     """Return the composite of a layer, [3, H, W] on black, and an image behind it."""
     return np.concatenate([layer + left * image[:3], image[3:]])
 

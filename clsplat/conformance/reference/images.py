@@ -16,33 +16,33 @@ C2 = 0.03**2
 
 
 def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Mean absolute difference, and its gradient."""
+    """Return the mean absolute difference, and its gradient."""
     return np.mean(np.abs(x - y)), np.sign(x - y) / x.size
 
 
 def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Sum of |gradient (x - y)|, for the gradient of any losses with respect to x."""
+    """Return the sum of |gradient (x - y)|, for the gradient of any losses with respect to x."""
     return float(np.abs(gradient * (x - y)).sum())
 
 
 def l2(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Mean squared difference, and its gradient."""
+    """Return the mean squared difference, and its gradient."""
     return np.mean((x - y) ** 2), 2 * (x - y) / x.size
 
 
 def psnr(x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Peak signal-to-noise ratio of images in [0, 1], in dB."""
+    """Return the peak signal-to-noise ratio of images in [0, 1], in dB."""
     return 10 * np.log10(1 / np.mean((x - y) ** 2))
 
 
 def ssim_taps() -> NDArray[Any]:
-    """The 11 weights of the window, which sum to one."""
+    """Return the 11 weights of the window, which sum to one."""
     weights = np.exp(-(np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
 
 
 def window_mean(image: NDArray[Any]) -> NDArray[Any]:
-    """Weighted mean over 11x11 pixels, zeros outside the image: one term per offset."""
+    """Return the weighted mean over 11x11 pixels, zeros outside the image: one term per offset."""
     taps = ssim_taps()
     _, height, width = image.shape
     padded = np.pad(image, ((0, 0), (SSIM_RADIUS, SSIM_RADIUS), (SSIM_RADIUS, SSIM_RADIUS)))
@@ -54,7 +54,7 @@ def window_mean(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _ssim_terms(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """μ1, μ2, a1, a2, b1, b2."""
+    """Return μ1, μ2, a1, a2, b1, b2."""
     mu1, mu2 = window_mean(x), window_mean(y)
     variance1 = window_mean(x * x) - mu1**2
     variance2 = window_mean(y * y) - mu2**2
@@ -65,13 +65,13 @@ def _ssim_terms(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], ...]:
 
 
 def ssim_map(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-    """SSIM of every pixel and channel: [C,H,W]."""
+    """Return the SSIM of every pixel and channel, [C,H,W]."""
     _, _, a1, a2, b1, b2 = _ssim_terms(x, y)
     return a1 * a2 / (b1 * b2)
 
 
 def dssim(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """1 - mean SSIM, and its gradient."""
+    """Return 1 - mean SSIM, and its gradient."""
     mu1, mu2, a1, a2, b1, b2 = _ssim_terms(x, y)
     m = a1 * a2 / (b1 * b2)
     d_mu = 2 * mu2 * (a2 - a1) / (b1 * b2) - 2 * mu1 * m * (1 / b1 - 1 / b2)
@@ -83,7 +83,7 @@ def dssim(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
-    """MS-SSIM (Wang et al. 2003) over whole windows only, weights divided by their sum: one window at a time."""
+    """Return MS-SSIM (Wang et al. 2003) over complete windows, one at a time; weights are divided by their sum."""
     weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])[:scales]
     window = np.outer(ssim_taps(), ssim_taps())
     channels, products = len(x), np.ones(len(x))
@@ -108,16 +108,16 @@ def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
     return float(products.mean())
 
 
-# A Gaussian blur of the pixels that count, one place of the window at a time.
+# A Gaussian blur of the pixels that count, one offset at a time.
 
 
-def blurred(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Mean by the weights of a Gaussian, within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma: px."""
-    return averaged(image, math.ceil(3 * sigma), 1 / (2 * sigma * sigma), mask)
+def blur(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Return the Gaussian mean within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma: px."""
+    return masked_mean(image, math.ceil(3 * sigma), 1 / (2 * sigma * sigma), mask)
 
 
-def averaged(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Mean, by weights exp(-falloff d²), of the pixels that count within `reach`; where none does, the pixel itself.
+def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Return means, weighted by exp(-falloff d²), of the pixels that count within `reach`; else the pixel itself.
 
     image: [3, H, W]; mask: [H, W] bool; reach: px along each axis; falloff: px⁻².
     """
@@ -149,22 +149,22 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
     return back @ there
 
 
-def haar_filtered(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Analysis and synthesis along both axes; odd sizes repeat the last line, masked pixels are their block's mean.
+def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Analyze and synthesize along both axes; odd sizes repeat the last line, masked pixels are their block's mean.
 
     image: [3, H, W]; taps: [2]; mask: [H, W] bool.
     """
     _, height, width = image.shape
     odd = ((0, height % 2), (0, width % 2))
-    whole = np.pad(image, ((0, 0), *odd), mode="edge")
+    padded = np.pad(image, ((0, 0), *odd), mode="edge")
     counts = np.pad(np.ones((height, width), bool) if mask is None else mask, odd, mode="edge")
-    for row in range(0, whole.shape[1], 2):
-        for column in range(0, whole.shape[2], 2):
-            at = np.s_[row : row + 2, column : column + 2]
-            if counts[at].any():
-                whole[:, *at][:, ~counts[at]] = whole[:, *at][:, counts[at]].mean(axis=1, keepdims=True)
-    down, across = (analysis_and_synthesis(length, taps) for length in whole.shape[1:])
-    return np.asarray(down @ whole @ across.T)[:, :height, :width]
+    for row in range(0, padded.shape[1], 2):
+        for column in range(0, padded.shape[2], 2):
+            block = np.s_[row : row + 2, column : column + 2]
+            if counts[block].any():
+                padded[:, *block][:, ~counts[block]] = padded[:, *block][:, counts[block]].mean(axis=1, keepdims=True)
+    down, across = (analysis_and_synthesis(length, taps) for length in padded.shape[1:])
+    return np.asarray(down @ padded @ across.T)[:, :height, :width]
 
 
 def haar_gradient(
@@ -172,39 +172,39 @@ def haar_gradient(
 ) -> NDArray[Any]:
     """Return the gradient of sum(gradient * filtered image) with respect to the taps, [2].
 
-    The image is a square in each tap, so that a difference about its middle is exact at any distance.
+    The image is quadratic in each tap, so a central difference is exact at any distance.
     """
-    both = [(haar_filtered(image, taps + e, mask) - haar_filtered(image, taps - e, mask)) / 2 for e in np.eye(2)]
-    return np.array([(gradient * one).sum() for one in both])
+    slopes = [(haar_filter(image, taps + e, mask) - haar_filter(image, taps - e, mask)) / 2 for e in np.eye(2)]
+    return np.array([(gradient * slope).sum() for slope in slopes])
 
 
-# Residuals of an image, how many there are of each size, and the pixels that count without the large ones.
+# Residuals of an image, their histogram, and the pixels that count without the large residuals.
 
-BINS, LEAST = 96, 2.0**-12  # eighths of octaves, up to 1
+BINS, MIN_RESIDUAL = 96, 2.0**-12  # eighths of octaves, up to 1
 
 
 def residuals(image: NDArray[Any], photograph: NDArray[Any]) -> NDArray[Any]:
-    """The mean over the channels of the absolute difference."""
+    """Return the mean over the channels of the absolute difference."""
     return np.asarray(np.abs(image - photograph).mean(axis=0))
 
 
-def residual_numbers(values: NDArray[Any]) -> NDArray[np.int64]:
-    """The number of residuals by bin: an octave is cut in eight parts of one width."""
-    actual = np.zeros(BINS, np.int64)
+def residual_histogram(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the number of residuals per bin; an octave is divided into eight parts of equal width."""
+    histogram = np.zeros(BINS, np.int64)
     for value in values.ravel():
-        octave = math.floor(math.log2(value / LEAST)) if value > 0 else -1
-        part = math.floor((value / (LEAST * 2.0**octave) - 1) * 8)
-        actual[min(max(8 * octave + part, 0), BINS - 1)] += 1
-    return actual
+        octave = math.floor(math.log2(value / MIN_RESIDUAL)) if value > 0 else -1
+        eighth = math.floor((value / (MIN_RESIDUAL * 2.0**octave) - 1) * 8)
+        histogram[min(max(8 * octave + eighth, 0), BINS - 1)] += 1
+    return histogram
 
 
-def without_transients(
+def mask_transients(
     values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
 ) -> NDArray[np.bool_]:
     """Return which pixels count: pixels below the threshold, and pixels in whose box at least half are below it."""
-    actual = counted & (values < threshold)
-    below = actual.copy()
+    kept = counted & (values < threshold)
+    below = kept.copy()
     for y, x in zip(*np.nonzero(counted & ~below), strict=True):
         box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-        actual[y, x] = 2 * below[box].sum() >= counted[box].sum()
-    return actual
+        kept[y, x] = 2 * below[box].sum() >= counted[box].sum()
+    return kept

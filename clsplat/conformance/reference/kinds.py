@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh")
-RADIUS_TILE = 16  # px; the tile of the vanilla visibility test, whatever tile the kernels use
+RADIUS_TILE = 16  # px, tile of the original visibility test; kernels may use other tiles
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PinholeCamera:
 
 @dataclass
 class RawGaussians:
-    """Parameters as they are trained, before activations."""
+    """Trained parameters, before activations."""
 
     means: NDArray[Any]  # [N,3]
     quats: NDArray[Any]  # [N,4] w, x, y, z; not normalized
@@ -71,17 +71,17 @@ class Splats:
     """Projected Gaussians.  Rows that are not visible are zero, except for their radius."""
 
     mean2d: NDArray[Any]  # [N,2] px
-    conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance; with the pixel's box the covariance
+    conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance; of the covariance if `pixel_box`
     opacity: NDArray[Any]  # [N] after both filters
     color: NDArray[Any]  # [N,3]
     depth: NDArray[Any]  # [N] z
-    radius: NDArray[Any]  # [N] px, whole; 0 = not visible to density control; independent of opacity
+    radius: NDArray[Any]  # [N] px, a whole number; 0: not visible to density control; independent of opacity
     visible: NDArray[Any]  # [N] bool: blended
-    pixel_box: bool = False  # integrated over the box of each pixel (blending.py)
+    pixel_box: bool = False  # whether splats are integrated over each pixel's box (blending.py)
 
 
 class SplatGradients(NamedTuple):
-    """What `blend_backward` returns."""
+    """The result of `blend_backward`."""
 
     mean2d: NDArray[Any]  # [N,2]
     conic: NDArray[Any]  # [N,3] with respect to the scalars of Splats.conic

@@ -13,7 +13,7 @@ PRESENCE_MIN = 1 / 255
 
 
 def coefficients(row: NDArray[Any], degree: int) -> list[NDArray[Any]]:
-    """The vectors b_1, b_2, … of the polynomial of a row."""
+    """Return the vectors b_1, b_2, … of a row's polynomial."""
     return [row[0:3], row[5:8], row[8:11]][:degree]
 
 
@@ -23,7 +23,7 @@ def presence(row: NDArray[Any], time: float) -> float:
     return float(np.exp(-0.5 * distance**2))
 
 
-def moved(
+def move_gaussians(
     motion: NDArray[Any],
     means: NDArray[Any],
     quats: NDArray[Any],
@@ -48,7 +48,7 @@ def moved(
     return means, quats, logits
 
 
-def moved_backward(
+def move_gaussians_backward(
     motion: NDArray[Any],
     logit_opacity: NDArray[Any],
     grad_means: NDArray[Any],
@@ -58,8 +58,10 @@ def moved_backward(
     degree: int,
     turns: bool,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """dL/d(motion) [N,W] and dL/d(logit_opacity) [N] from the gradients at the time; those by means and quaternions are
-    the same at the center.  Zero where nothing can be seen."""
+    """Return dL/d(motion), [N,W], and dL/d(logit_opacity), [N], from the gradients at a time.
+
+    Gradients of means and quaternions at the center are those at the time.  Invisible Gaussians have zeros.
+    """
     grad_motion, grad_center = np.zeros_like(motion), np.zeros_like(logit_opacity)
     for n, row in enumerate(motion):
         dt, factor, duration = time - row[3], presence(row, time), np.exp(row[4])
@@ -68,7 +70,7 @@ def moved_backward(
         alpha = 1 / (1 + np.exp(-logit_opacity[n]))
         grad_alpha_t = grad_logit[n] / (alpha * factor * (1 - alpha * factor))
         grad_center[n] = grad_alpha_t * factor * alpha * (1 - alpha)
-        by_factor = grad_alpha_t * alpha
+        grad_factor = grad_alpha_t * alpha
         for order, vector in enumerate(coefficients(row, degree), 1):
             first = (0, 5, 8)[order - 1]
             grad_motion[n, first : first + 3] = grad_means[n] * dt**order
@@ -76,13 +78,13 @@ def moved_backward(
         if turns:
             grad_motion[n, -4:] = grad_quats[n] * dt
             grad_motion[n, 3] -= grad_quats[n] @ row[-4:]
-        grad_motion[n, 3] += by_factor * factor * dt / duration**2
-        grad_motion[n, 4] = by_factor * factor * (dt / duration) ** 2
+        grad_motion[n, 3] += grad_factor * factor * dt / duration**2
+        grad_motion[n, 4] = grad_factor * factor * (dt / duration) ** 2
     return grad_motion, grad_center
 
 
 def motion_l2(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of min(s, 1) |v| by extent, and its gradient of the motion; s counts as a constant in it."""
+    """Return the mean of min(s, 1) |v| / extent, and its gradient with respect to the motion; s is a constant."""
     time = np.minimum(np.exp(motion[:, 4]), 1)
     speed = np.linalg.norm(motion[:, :3], axis=1)
     gradient = np.zeros_like(motion)

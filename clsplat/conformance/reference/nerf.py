@@ -1,5 +1,7 @@
-"""Compute a field of densities and colors, a network, and the colors of its rays, forward and backward in float64
-(Barron et al. 2021, "Mip-NeRF"; the network is that of Mildenhall et al. 2020)."""
+"""Compute a field of densities and colors, its network, and the colors of rays, forward and backward in float64.
+
+Barron et al. 2021 (Mip-NeRF); the network is that of Mildenhall et al. 2020.
+"""
 
 from dataclasses import dataclass
 
@@ -17,14 +19,16 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 
 @dataclass(frozen=True)
 class DenseNetwork:
-    """Layers in order: `depth` layers of the trunk, of which the one after `skip` reads the position again, density,
-    bottleneck, condition, color."""
+    """Layers in order: `depth` layers of the trunk, density, bottleneck, condition, color.
+
+    The layer after `skip` reads the position again.
+    """
 
     depth: int
     skip: int | None  # layer whose outputs the position joins
 
     def forward(self, weights: Weights, position: Floats, direction: Floats) -> tuple[Floats, Floats, Inputs]:
-        """Raw colors [S, outputs], raw densities [S, outputs], and the inputs of each layer."""
+        """Return raw colors and raw densities, [S, outputs], and the inputs of each layer."""
         inputs, x = [], position
         for i in range(self.depth):
             inputs.append(x)
@@ -32,9 +36,9 @@ class DenseNetwork:
             if i == self.skip:
                 x = np.concatenate([x, position], axis=1)
         density, bottleneck, condition, color = weights[self.depth :]
-        seen = np.concatenate([x @ bottleneck[0] + bottleneck[1], direction], axis=1)
-        hidden = np.maximum(seen @ condition[0] + condition[1], 0)
-        inputs += [x, x, seen, hidden]
+        condition_input = np.concatenate([x @ bottleneck[0] + bottleneck[1], direction], axis=1)
+        hidden = np.maximum(condition_input @ condition[0] + condition[1], 0)
+        inputs += [x, x, condition_input, hidden]
         return hidden @ color[0] + color[1], x @ density[0] + density[1], inputs
 
     def backward(
@@ -74,41 +78,41 @@ class Composite:
         return colors, np.logaddexp(0, self.raw_densities + DENSITY_BIAS)
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Weights of the samples, and what is left behind each, [R, N]."""
+        """Return the weights of the samples, and the transmittance behind each, [R, N]."""
         left = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
         before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
         return before - left, left
 
     def colors(self) -> Floats:
-        """Colors of the rays, [R, 3]."""
+        """Return the colors of the rays, [R, 3]."""
         weights = self.weights()[0][..., None]
         return np.asarray((weights * self.samples[0]).sum(axis=1) + (1 - weights.sum(axis=1)) * self.background)
 
     def backward(self, grad_colors: Floats) -> tuple[Floats, Floats]:
         """Return the gradients of the raw colors and densities from those of the colors of the rays, [R, 3]."""
         (colors, _), (weights, left) = self.samples, self.weights()
-        part = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
-        grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * part * (1 - part)
+        sigmoid = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
+        grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * sigmoid * (1 - sigmoid)
         grad_weights = (grad_colors[:, None] * (colors - self.background)).sum(axis=-1)
         behind = np.cumsum((weights * grad_weights)[:, ::-1], axis=1)[:, ::-1] - weights * grad_weights
         slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
         return grad_raw, (left * grad_weights - behind) * self.lengths * slope
 
 
-# Cones of pixels, their samples, and the encodings of these, in float64 (Barron et al. 2021, "Mip-NeRF").
+# Cones of pixels, their samples, and the encodings of the samples.
 
-BLUR_PADDING, WEIGHT_FLOOR = 0.01, 1e-5  # alpha of equation 18; the released code's least sum
-MOST = 1 - float(np.finfo(np.float32).eps)
-PIXELS, COARSE, FINE = 8, 9, 10  # which random numbers: cl_kernels/rays.cl
+BLUR_PADDING, WEIGHT_FLOOR = 0.01, 1e-5  # alpha of equation 18; smallest sum in the released code
+MAX_UNIT = 1 - float(np.finfo(np.float32).eps)
+PIXELS, COARSE, FINE = 8, 9, 10  # kinds of random numbers, see cl_kernels/rays.cl
 
 
-def drawn_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
+def draw_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
     """Return a pixel out of `count` for each ray of a step, starting at ray `first`, [rays]."""
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 
 def cones(camera: PinholeCamera, pixels: NDArray[np.int64]) -> Floats:
-    """Origin, direction with depth 1, radius at a distance of 1 and length of the direction, [R, 8]."""
+    """Return origin, direction with depth 1, radius at distance 1, and length of the direction, [R, 8]."""
     x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
     y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
     rotation, translation = camera.world_to_camera[:, :3], camera.world_to_camera[:, 3]
@@ -118,14 +122,14 @@ def cones(camera: PinholeCamera, pixels: NDArray[np.int64]) -> Floats:
     return np.concatenate([origins, directions, radii, np.linalg.norm(directions, axis=1, keepdims=True)], axis=1)
 
 
-def units(ray: int, count: int, kind: int, seed: int, step: int) -> Floats:
-    """Random numbers in (0, 1] of the edges of a ray, [count]."""
+def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Floats:
+    """Return random numbers in (0, 1] for the edges of a ray, [count]."""
     words = [word for four in range(-(-count // 4)) for word in philox((ray, step, kind, four), (seed, 0))]
     return (np.array(words[:count], np.float64) // 256 + 1) / 2**24
 
 
 def coarse_edges(near: float, far: float, samples: int, drawn: Floats | None = None) -> Floats:
-    """Edges of a ray's coarse samples, [samples + 1]; drawn: [samples + 1] in (0, 1], for training."""
+    """Return the edges of a ray's coarse samples, [samples + 1]; drawn: [samples + 1] in (0, 1], for training."""
     edges = np.linspace(near, far, samples + 1)
     if drawn is None:
         return edges
@@ -135,7 +139,7 @@ def coarse_edges(near: float, far: float, samples: int, drawn: Floats | None = N
 
 
 def fine_edges(edges: Floats, weights: Floats, samples: int, drawn: Floats | None = None) -> Floats:
-    """Edges of a ray's fine samples, [samples + 1], where the coarse weights are (equation 18)."""
+    """Return the edges of a ray's fine samples, [samples + 1], distributed by the coarse weights (equation 18)."""
     padded = np.concatenate([weights[:1], weights, weights[-1:]])
     largest = np.maximum(padded[:-1], padded[1:])
     blurred = (largest[:-1] + largest[1:]) / 2 + BLUR_PADDING
@@ -143,16 +147,16 @@ def fine_edges(edges: Floats, weights: Floats, samples: int, drawn: Floats | Non
     distribution = np.concatenate([[0.0], np.cumsum(blurred / blurred.sum())])
     distribution[-1] = 1.0
     if drawn is None:
-        wanted = np.linspace(0, MOST, samples + 1)
+        quantiles = np.linspace(0, MAX_UNIT, samples + 1)
     else:
-        wanted = np.minimum((np.arange(samples + 1) + drawn) / (samples + 1), MOST)
-    return np.interp(wanted, distribution, edges)
+        quantiles = np.minimum((np.arange(samples + 1) + drawn) / (samples + 1), MAX_UNIT)
+    return np.interp(quantiles, distribution, edges)
 
 
 def frustums(rays: Floats, edges: Floats) -> tuple[Floats, Floats]:
-    """Means and diagonals of the covariances of conical frustums, each [R, N, 3].
+    """Return the means and the diagonals of the covariances of conical frustums, each [R, N, 3].
 
-    By integrals of powers of the distance over the frustum, and not by the stable form of the kernels (equation 7).
+    These are integrals of powers of the distance over the frustum, unlike the stable form in the kernels (equation 7).
     """
     origins, directions, radii = rays[:, None, :3], rays[:, None, 3:6], rays[:, None, 6:7]
     t0, t1 = edges[:, :-1, None], edges[:, 1:, None]
@@ -169,35 +173,35 @@ def frustums(rays: Floats, edges: Floats) -> tuple[Floats, Floats]:
     return origins + mean * directions, diagonal
 
 
-def encoded_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
-    """Means of sines, then of cosines, of 2^l x, [R, N, 6 degrees] (equations 13 and 14)."""
+def encode_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
+    """Return the means of sines, then of cosines, of 2^l x, [R, N, 6 degrees] (equations 13 and 14)."""
     scales = 2.0 ** np.arange(degrees)[:, None]
     angles = (means[..., None, :] * scales).reshape(*means.shape[:-1], -1)
     falls = np.exp(-0.5 * (variances[..., None, :] * scales**2)).reshape(angles.shape)
     return np.concatenate([falls * np.sin(angles), falls * np.cos(angles)], axis=-1)
 
 
-def encoded_directions(rays: Floats, degrees: int) -> Floats:
-    """Return directions of length 1, with their sines and cosines, [R, 3 + 6 degrees]."""
+def encode_directions(rays: Floats, degrees: int) -> Floats:
+    """Return unit directions with their sines and cosines, [R, 3 + 6 degrees]."""
     directions = rays[:, 3:6] / rays[:, 7:8]
     angles = (directions[:, None, :] * 2.0 ** np.arange(degrees)[:, None]).reshape(len(rays), -1)
     return np.concatenate([directions, np.sin(angles), np.cos(angles)], axis=1)
 
 
-# A grid of features in several resolutions, and its derivatives, in float64.
+# A grid of features at several resolutions, and its gradients.
 
 PRIMES = np.array([1, 2654435761, 805459861], np.uint64)  # equation 4 of Mueller et al. 2022
 CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
 
 
-def places(means: Floats, variances: Floats, corner: Floats, side: float) -> tuple[Floats, Floats]:
-    """Means of samples in the cube, [S, 3] in shares of its side, and the mean of their variances there, [S]."""
+def grid_positions(means: Floats, variances: Floats, corner: Floats, side: float) -> tuple[Floats, Floats]:
+    """Return means of samples in units of the cube's side, [S, 3], and means of their variances, [S]."""
     return (means - corner) / side, variances.mean(axis=-1) / side**2
 
 
 @dataclass(frozen=True)
 class HashLevel:
-    """A cube of n^3 cells; its corners share `entries` by a hash if there are fewer entries."""
+    """A cube of n^3 cells, whose corners share `entries` by a hash if there are fewer entries than corners."""
 
     cells: int
     entries: int
@@ -206,31 +210,31 @@ class HashLevel:
         """Return how well samples resolve a level, [S]: close to erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
         return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
 
-    def corners(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Entries of the corners around places in the cube, and their weights, both [S, 8]."""
-        cell = np.clip(np.floor(at * self.cells), 0, self.cells - 1)
-        within = at * self.cells - cell
+    def corners(self, positions: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """Return the entries of the corners around positions in the cube, and their weights, both [S, 8]."""
+        cell = np.clip(np.floor(positions * self.cells), 0, self.cells - 1)
+        within = positions * self.cells - cell
         sides = cell[:, None].astype(np.int64) + CORNERS
-        shares = np.where(CORNERS, within[:, None], 1 - within[:, None]).prod(axis=-1)
+        weights = np.where(CORNERS, within[:, None], 1 - within[:, None]).prod(axis=-1)
         if (self.cells + 1) ** 3 <= self.entries:
-            return sides @ np.array([1, self.cells + 1, (self.cells + 1) ** 2]), shares
+            return sides @ np.array([1, self.cells + 1, (self.cells + 1) ** 2]), weights
         mixed = np.bitwise_xor.reduce(sides.astype(np.uint64) * PRIMES & np.uint64(0xFFFFFFFF), axis=-1)
-        return (mixed % np.uint64(self.entries)).astype(np.int64), shares
+        return (mixed % np.uint64(self.entries)).astype(np.int64), weights
 
-    def forward(self, table: Floats, at: Floats, variances: Floats) -> Floats:
-        """Features of samples, [S, F], of a table of entries, [entries, F]; 0 outside of the cube."""
-        entries, shares = self._inside(at, variances)
-        return np.asarray((table[entries] * shares[..., None]).sum(axis=1))
+    def forward(self, table: Floats, positions: Floats, variances: Floats) -> Floats:
+        """Return features of samples, [S, F], from a table of entries, [entries, F]; 0 outside of the cube."""
+        entries, weights = self._inside(positions, variances)
+        return np.asarray((table[entries] * weights[..., None]).sum(axis=1))
 
-    def backward(self, grad_features: Floats, at: Floats, variances: Floats) -> Floats:
+    def backward(self, grad_features: Floats, positions: Floats, variances: Floats) -> Floats:
         """Return the gradients of the table, [entries, F], from those of the features."""
-        entries, shares = self._inside(at, variances)
+        entries, weights = self._inside(positions, variances)
         actual = np.zeros((self.entries, grad_features.shape[1]))
-        np.add.at(actual, entries, shares[..., None] * grad_features[:, None])
+        np.add.at(actual, entries, weights[..., None] * grad_features[:, None])
         return actual
 
-    def _inside(self, at: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return the corners inside the cube, with the weight of the level."""
-        inside = np.all((at >= 0) & (at <= 1), axis=1)
-        entries, shares = self.corners(np.where(inside[..., None], at, 0.5))
-        return entries, shares * (inside * self.weights(variances))[:, None]
+    def _inside(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """Return entries and weights of corners, with weight 0 outside of the cube, times the weight of the level."""
+        inside = np.all((positions >= 0) & (positions <= 1), axis=1)
+        entries, weights = self.corners(np.where(inside[..., None], positions, 0.5))
+        return entries, weights * (inside * self.weights(variances))[:, None]

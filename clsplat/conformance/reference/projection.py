@@ -12,7 +12,7 @@ from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, Pinhole
 
 
 def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[Any, ...]]:
-    """The 16 rows (value, d/dx, d/dy, d/dz), treating x, y, z as free."""
+    """Return the 16 rows (value, d/dx, d/dy, d/dz), treating x, y, z as independent."""
     c0, c1 = 0.28209479177387814, 0.4886025119029199
     a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
     d, e, f = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
@@ -39,7 +39,7 @@ def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[
 
 
 def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
-    """Value and gradient of the first (degree+1)² harmonics: [..., K, 4]."""
+    """Return value and gradient of the first (degree+1)² harmonics, [..., K, 4]."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     table = np.empty((*x.shape, (degree + 1) ** 2, 4))
     for k, row in enumerate(_harmonics(x, y, z)[: (degree + 1) ** 2]):
@@ -49,17 +49,17 @@ def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
 
 
 def sh_basis(directions: NDArray[Any], degree: int) -> NDArray[Any]:
-    """Y_k of unit directions: [..., 3] -> [..., K]."""
+    """Return Y_k of unit directions: [..., 3] -> [..., K]."""
     return _harmonic_table(directions, degree)[..., 0]
 
 
 def sh_basis_gradient(directions: NDArray[Any], degree: int) -> NDArray[Any]:
-    """dY_k/d(x, y, z), as polynomials of free x, y, z: [..., 3] -> [..., K, 3]."""
+    """Return dY_k/d(x, y, z), with x, y, z independent: [..., 3] -> [..., K, 3]."""
     return _harmonic_table(directions, degree)[..., 1:]
 
 
 def rotation_matrix(quat: NDArray[Any]) -> NDArray[Any]:
-    """R of q/|q|: [4] -> [3,3]."""
+    """Return the rotation matrix of q/|q|: [4] -> [3,3]."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array(
         [
@@ -71,7 +71,7 @@ def rotation_matrix(quat: NDArray[Any]) -> NDArray[Any]:
 
 
 def ray_limits(camera: PinholeCamera) -> NDArray[Any]:
-    """Limits of x/z and y/z in the Jacobian, for any principal point: [[x_lo, x_hi], [y_lo, y_hi]]."""
+    """Return the limits of x/z and y/z in the Jacobian, for any principal point: [[x_lo, x_hi], [y_lo, y_hi]]."""
     tan_x, tan_y = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
     return np.array(
         [
@@ -88,7 +88,7 @@ def clamped_ray(camera: PinholeCamera, point: NDArray[Any]) -> NDArray[Any]:
 
 
 def adjugate(matrix: NDArray[Any]) -> NDArray[Any]:
-    """d(det)/d(matrix) of a symmetric 2x2 matrix, which is det * inverse."""
+    """Return d(det)/d(matrix) of a symmetric 2x2 matrix, which is det * inverse."""
     return np.array([[matrix[1, 1], -matrix[0, 1]], [-matrix[1, 0], matrix[0, 0]]])
 
 
@@ -137,14 +137,14 @@ def opacity_factors(logit: float, foot: Footprint, compensate: float) -> tuple[f
 
 
 def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[Any], Any]:
-    """Unit vector from the camera to the Gaussian, and their distance."""
+    """Return the unit vector from the camera to the Gaussian, and their distance."""
     offset = mean - camera.position
     distance = np.linalg.norm(offset)
     return offset / distance, distance
 
 
 def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
-    """Σ Y_k(d) c_k + 0.5: [3]."""
+    """Return Σ Y_k(d) c_k + 0.5, [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
 
@@ -173,7 +173,7 @@ def project(
 ) -> Splats:
     """Project Gaussians; `degree` is the active one, `variance` (px²) and `compensate` (0 or 1) the screen filter.
 
-    pixel_box: 1, with neither of them, where splats are integrated over the pixel's box.
+    pixel_box: 1 integrates splats over the pixel's box, with both of these 0.
     """
     count = len(gaussians.means)
     splats = Splats(
@@ -216,7 +216,7 @@ def project(
 
 
 def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
-    """dL/dq of the raw quaternion from H = dL/dR."""
+    """Return dL/dq of the raw quaternion from H = dL/dR."""
     norm = np.linalg.norm(quat)
     unit = quat / norm
     w, x, y, z = unit
@@ -231,7 +231,7 @@ def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
 def point_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
 ) -> NDArray[Any]:
-    """dL/d(camera-space point), through the screen position and through J with its clamped ray."""
+    """Return dL/d(camera-space point), through the screen position and through J with its clamped ray."""
     x, y, z = foot.point
     fx, fy = camera.fx, camera.fy
     gu, gv = grad_mean2d
@@ -242,7 +242,7 @@ def point_gradient(
     if x_low <= x / z <= x_high:
         gx += -fx / z**2 * grad_j[0, 2]
         gz += 2 * fx * x / z**3 * grad_j[0, 2]
-    else:  # tx = limit * z, so J02 goes like 1/z and x is not in it
+    else:  # tx = limit * z, so J02 is proportional to 1/z and independent of x
         gz += fx * tx / z**3 * grad_j[0, 2]
     if y_low <= y / z <= y_high:
         gy += -fy / z**2 * grad_j[1, 2]
@@ -253,7 +253,7 @@ def point_gradient(
 
 
 def ratio_gradient(foot: Footprint) -> NDArray[Any]:
-    """d(det V / det V1)/dV, by the quotient rule; V1 = V + constant: [2,2]."""
+    """Return d(det V / det V1)/dV, [2,2], by the quotient rule; V1 = V + constant."""
     det0, det1 = determinant(foot.sharp), determinant(foot.dilated)
     return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
 
@@ -261,8 +261,8 @@ def ratio_gradient(foot: Footprint) -> NDArray[Any]:
 def covariance_gradient(
     splats: Splats, n: int, foot: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
 ) -> NDArray[Any]:
-    """dL/dV, [2,2], from the conic and from κ = sqrt(1 + compensate (det V / det V1 - 1))."""
-    # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
+    """Return dL/dV, [2,2], from the conic and from κ = sqrt(1 + compensate (det V / det V1 - 1))."""
+    # Conic -> 2D covariance: G_V = -K G_K K (for the pixel's box, V is given directly)
     a, b, c = splats.conic[n]
     conic = np.array([[a, b], [b, c]])
     ga, gb, gc = grad_conic
@@ -287,7 +287,7 @@ def project_backward(
     grad_opacity: NDArray[Any],
     grad_color: NDArray[Any],
 ) -> dict[str, NDArray[Any]]:
-    """Gradients of the parameters, named as in `PARAMETERS`; `filter_variance` is a constant.  Culled rows are zero."""
+    """Return the gradients of `PARAMETERS` by name; `filter_variance` is a constant, and culled rows are zero."""
     grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
     for n in np.flatnonzero(splats.visible).tolist():
         foot = footprint(gaussians, n, camera, variance)
@@ -316,7 +316,7 @@ def project_backward(
         grad_d = basis_gradient.T @ (gaussians.sh[n, :used] @ grad_c)
         grad["means"][n] = camera.rotation.T @ grad_point + (grad_d - direction * (direction @ grad_d)) / distance
 
-        # Σ = L Lᵀ, L = R diag(s'); s' = sqrt(s² + f) also sits in ρ = Π s/s'
+        # Σ = L Lᵀ, L = R diag(s'); s' = sqrt(s² + f) is also part of ρ = Π s/s'
         grad_l = 2 * grad_sigma @ foot.rotation @ np.diag(foot.filtered)
         grad["quats"][n] = quat_gradient(gaussians.quats[n], grad_l @ np.diag(foot.filtered))
         grad_filtered = np.sum(foot.rotation * grad_l, axis=0)
@@ -332,7 +332,10 @@ def project_backward(
 def sampling_interval(
     means: NDArray[Any], cameras: list[PinholeCamera], focal: list[float], near: float = 0.2, margin: float = 0.15
 ) -> NDArray[Any]:
-    """Return the smallest depth / focal length over the cameras that see each mean, [N]; if none does, the largest."""
+    """Return the smallest depth / focal length over the cameras that see each mean, [N].
+
+    Means that no camera sees have the largest interval of the others.
+    """
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
         for camera, f in zip(cameras, focal, strict=True):
@@ -350,20 +353,20 @@ def sampling_interval(
     return intervals
 
 
-def filtered(
+def apply_world_filter(
     log_scales: NDArray[Any], logit: NDArray[Any], variance: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Standard deviations and opacities as they are drawn: [N,3], [N] -> [N,3], [N]."""
+    """Return standard deviations, [N,3], and opacities, [N], after the 3D filter."""
     scale = np.exp(log_scales)
     drawn = np.sqrt(scale**2 + variance[:, None])
     return drawn, np.prod(scale / drawn, axis=1) / (1 + np.exp(-logit))
 
 
-# Gradients by the place and the focal length of a camera, one Gaussian at a time, in the axes of the camera.
+# Gradients of the pose and the focal length of a camera, one Gaussian at a time, in camera axes.
 
 
-def moved_camera(camera: PinholeCamera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
-    """The camera after W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
+def move_camera(camera: PinholeCamera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
+    """Return the camera after W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
     angle = np.linalg.norm(turn)
     x, y, z = turn
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -388,7 +391,7 @@ def pose_gradient(
     grad_opacity: NDArray[Any],
     grad_color: NDArray[Any],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `moved_camera` at zero."""
+    """Return dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `move_camera` at zero."""
     shift, turn, zoom = np.zeros(3), np.zeros(3), np.zeros(1)
     for n in np.flatnonzero(splats.visible).tolist():
         foot = footprint(gaussians, n, camera, variance)
@@ -421,9 +424,9 @@ def pose_gradient(
 def focal_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
 ) -> float:
-    """dL/dfx (axis 0) or dL/dfy (1), through the screen position and through J.
+    """Return dL/dfx (axis 0) or dL/dfy (axis 1), through the screen position and through J.
 
-    Limits of rays go like 1/f, so that J02 = -f limit/z of a clamped one does not change with f.
+    Limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
     """
     z = foot.point[2]
     ray = foot.point[axis] / z

@@ -1,4 +1,4 @@
-"""Compute the sky, an octahedral environment map behind the Gaussians, its gradient, and the loss on its cover.
+"""Compute the sky, an octahedral environment map behind the Gaussians, its gradient, and the cover loss.
 
 A map is [side, side, C]: row j, column i.  Directions are [H, W, 3] in the scene.
 """
@@ -19,7 +19,7 @@ def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
-    return in_camera @ camera.world_to_camera[:, :3]  # each row times the rotation: turned back
+    return in_camera @ camera.world_to_camera[:, :3]  # each row times the rotation, which is the inverse rotation
 
 
 def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
@@ -32,7 +32,7 @@ def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
     for j in (first_j, first_j + 1):
         for i in (first_i, first_i + 1):
             row, column = j, i
-            if column in (-1, side):  # the edge's other half is its neighbor
+            if column in (-1, side):  # across an edge is its mirrored half
                 row, column = side - 1 - row, min(max(column, 0), side - 1)
             if row in (-1, side):
                 row, column = min(max(row, 0), side - 1), side - 1 - column
@@ -40,7 +40,7 @@ def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
 
 
 def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
-    """The map's values in directions, [C, H, W]."""
+    """Return the map's values in directions, [C, H, W]."""
     height, width, _ = directions.shape
     image = np.zeros((texels.shape[2], height, width))
     for v, u in np.ndindex(height, width):
@@ -50,7 +50,7 @@ def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
 
 
 def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any], grad: NDArray[Any]) -> NDArray[Any]:
-    """Return the map's gradient of sum(grad * T * sky_image).  grad: [C, H, W]; transmittance: [H, W]."""
+    """Return the gradient of sum(grad * T * sky_image) by texels.  grad: [C, H, W]; transmittance: [H, W]."""
     grad_texels = np.zeros((side, side, len(grad)))
     for v, u in np.ndindex(*transmittance.shape):
         for row, column, weight in map_entries(directions[v, u], side):
@@ -58,8 +58,8 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
     return grad_texels
 
 
-def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
-    """Pixels whose 3 x 3 neighborhood in the photograph shows the sky in 6 of 9 places, [H, W]; images [3, H, W]."""
+def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
+    """Return which pixels have a 3 x 3 neighborhood with the sky in at least 6 pixels, [H, W]; images: [3, H, W]."""
     matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
     height, width = photograph.shape[1:]
     counts = sum(matches[v : v + height, u : u + width].astype(int) for v in range(3) for u in range(3))
@@ -68,5 +68,5 @@ def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) ->
 
 def sky_cover(chosen: NDArray[Any], transmittance: NDArray[Any], weight: float) -> tuple[float, NDArray[Any]]:
     """Return the loss of Gaussians that cover the sky, and its gradient with respect to the transmittance, [H, W]."""
-    share = chosen / chosen.size
-    return float(weight * (share * (1 - transmittance)).sum()), -weight * share
+    mean_weights = chosen / chosen.size
+    return float(weight * (mean_weights * (1 - transmittance)).sum()), -weight * mean_weights

@@ -43,7 +43,7 @@ def adam_step(
 def covariance_trace(
     log_scales: NDArray[Any], above: NDArray[Any] | float, extent: float
 ) -> tuple[float, NDArray[Any]]:
-    """Mean of max(sum of squared scales - above, 0) by extent².  log_scales: [N, 3]; above: scene units²."""
+    """Return the mean of max(sum of squared scales - above, 0) / extent².  log_scales: [N, 3]; above: scene units²."""
     scale2 = np.exp(2 * log_scales)
     excess = scale2.sum(axis=1) - above
     penalized = (excess > 0)[:, None]
@@ -51,7 +51,7 @@ def covariance_trace(
 
 
 def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
-    """Mean of max(longest / shortest axis - above, 0)."""
+    """Return the mean of max(longest / shortest axis - above, 0)."""
     rows = np.arange(len(log_scales))
     longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)
     ratio = np.exp(log_scales[rows, longest] - log_scales[rows, shortest])
@@ -63,20 +63,20 @@ def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[A
 
 
 def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Mean of the scales by extent.  log_scales: [N, 3]."""
+    """Return the mean of scales / extent.  log_scales: [N, 3]."""
     scales = np.exp(log_scales)
     return scales.mean() / extent, scales / scales.size / extent
 
 
 def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Mean of the opacities.  logit_opacity: [N, 1]."""
+    """Return the mean of the opacities.  logit_opacity: [N, 1]."""
     opacities = 1 / (1 + np.exp(-logit_opacity))
     return opacities.mean(), opacities * (1 - opacities) / opacities.size
 
 
 # Density control: which Gaussians are cloned, split and pruned, and their children.
 
-KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows left afterwards: itself; itself twice; two children; none
+KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows afterwards: itself; itself twice; two children; none
 
 
 @dataclass(frozen=True)
@@ -95,25 +95,25 @@ VANILLA = DensityRule()
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """‖g2d‖: pixels -> normalized device coordinates: [N,2] -> [N].  Also for `mean2d_abs`."""
+    """Return ‖g2d‖ in normalized device coordinates, [N], from gradients in px, [N,2]; also for `mean2d_abs`."""
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 
 def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
-    """Largest change of the loss by a shift of one standard deviation, to first order: [N]; 0 for a culled splat.
+    """Return the largest first-order change of the loss by a shift of one standard deviation, [N]; 0 if culled.
 
-    grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  It is the length of L^T g, with L L^T the covariance.
+    grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  This is the length of L^T g, with L L^T the covariance.
     """
-    actual = np.zeros(len(conic))
+    gain = np.zeros(len(conic))
     for i, (xx, xy, yy) in enumerate(conic):
         if xx > 0:
             lower = np.linalg.cholesky(np.linalg.inv([[xx, xy], [xy, yy]]))
-            actual[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
-    return actual
+            gain[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
+    return gain
 
 
 def mean_gradient(total: NDArray[Any], count: NDArray[Any]) -> NDArray[Any]:
-    """ḡ: [N]; 0 where the Gaussian was never visible."""
+    """Return the mean gradient ḡ, [N]; 0 where the Gaussian was never visible."""
     return np.where(count > 0, total / np.maximum(count, 1), 0)
 
 
@@ -129,7 +129,7 @@ def adc_actions(
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
     Pruning comes last and sees the new rows: copies and children have their parent's opacity, children its scale / 1.6.
-    split_gradient: the statistic of the split test if it is a different one (ḡabs).
+    split_gradient: the statistic of the split test if it differs (ḡabs).
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []
@@ -153,18 +153,18 @@ def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
 
 
 def decayed_logit(logit: NDArray[Any], factor: float) -> NDArray[Any]:
-    """The logit of `factor` times the opacity."""
+    """Return the logit of `factor` times the opacity."""
     opacity = factor / (1 + np.exp(-logit))
     return np.log(opacity / (1 - opacity))
 
 
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
-    """Reset opacities: after the 3D filter, whose factor is `filter_ratio`, they are at most `ceiling`, [N]."""
+    """Return logits, [N], whose opacities after the 3D filter, a factor of `filter_ratio`, are at most `ceiling`."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
     return np.log(opacity / (1 - opacity))
 
 
-# The splitting matrix (SteepGS, Wang et al. 2025): the change of the loss when a splat is split in two.
+# The splitting matrix (SteepGS, Wang et al. 2025): the change of the loss if a splat is split in two.
 
 
 def screen_splitting(
@@ -175,42 +175,42 @@ def screen_splitting(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """Σ dL/dalpha · (Hessian of alpha by the splat's mean) over pixels, one after another: [N,2,2] px⁻²."""
-    actual = np.zeros((len(splats.opacity), 2, 2))
+    """Return Σ dL/dalpha · (Hessian of alpha with respect to the splat's mean) over pixels, [N,2,2] px⁻²."""
+    matrices = np.zeros((len(splats.opacity), 2, 2))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         a, b, c = splats.conic[step.splat]
         conic = np.array([[a, b], [b, c]])
         for row, column in np.argwhere(grad_alpha != 0):
             slope = conic @ [step.dx[row, column], step.dy[row, column]]
             hessian = step.alpha[row, column] * (np.outer(slope, slope) - conic)
-            actual[step.splat] += grad_alpha[row, column] * hessian
-    return actual
+            matrices[step.splat] += grad_alpha[row, column] * hessian
+    return matrices
 
 
 def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
-    """d(projected mean)/d(mean): [2,3] px by scene unit."""
+    """Return d(projected mean)/d(mean), [2,3] px per scene unit."""
     x, y, z = camera.rotation @ mean + camera.translation
     perspective = np.array([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
     return perspective @ camera.rotation
 
 
 def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
-    """Lift matrices on the screen, [N,2,2], to the scene, with a form of the splat that stays: [N,3,3]."""
-    actual = np.zeros((len(on_screen), 3, 3))
+    """Lift screen matrices, [N,2,2], to the scene, [N,3,3], with the splat's shape held constant."""
+    matrices = np.zeros((len(on_screen), 3, 3))
     for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
         jacobian = mean_jacobian(camera, gaussians.means[n])
-        actual[n] = jacobian.T @ on_screen[n] @ jacobian
-    return actual
+        matrices[n] = jacobian.T @ on_screen[n] @ jacobian
+    return matrices
 
 
 def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
-    """Each row replaced by the mean of the rows that have its label, by weight, [N,c].
+    """Replace each row by the weighted mean of the rows with its label; return [N,c].
 
-    values: [N,c], labels, weights: [N].  Where all weights of a label are zero it is the first of its rows.
+    values: [N,c]; labels, weights: [N].  If all weights of a label are zero, its first row replaces the mean.
     """
-    shared = np.empty(values.shape)
+    means = np.empty(values.shape)
     for label in np.unique(labels):
         members = np.flatnonzero(labels == label)
         rows, weight = values[members].astype(np.float64), weights[members].astype(np.float64)
-        shared[members] = weight @ rows / weight.sum() if weight.any() else rows[0]
-    return shared
+        means[members] = weight @ rows / weight.sum() if weight.any() else rows[0]
+    return means
