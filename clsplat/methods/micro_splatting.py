@@ -21,7 +21,7 @@ from clsplat.formats.splats import SH_C0, inverse_opacities
 from clsplat.gaussians.gaussians import INTERVAL2, Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
-from clsplat.photos.photographs import known_gradient
+from clsplat.photos.photographs import unmasked_gradient
 from clsplat.render.filters import AT_REST
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
@@ -36,7 +36,7 @@ class RenderedTexture(Statistic):
         frame, comparison = view.frame, view.comparison
         gaussians.device.program("texture.cl").sample_magnitude(
             items=gaussians.count,
-            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
+            magnitude=unmasked_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
             splats=frame.splats,
             radius=frame.radius,
             total=total,

@@ -1,4 +1,4 @@
-"""Store parameters per photograph in a run's scalars, and update them by Adam."""
+"""Store parameters per photograph in the scalars of a run, and update them with Adam."""
 
 import json
 import math
@@ -26,7 +26,7 @@ ByNumber = dict[str, float]
 
 
 def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
-    """Update scalars by Adam (Kingma and Ba 2015), with the constants of the Gaussians' Adam.
+    """Update scalars with Adam (Kingma and Ba 2015) and the constants of the Gaussians' Adam.
 
     values: current values by name; `scalars` also holds NAME/updates, NAME/moment1, and NAME/moment2.
     """
@@ -67,14 +67,14 @@ class ViewTable:
         return self.keys(self.views[0])[0] in scalars
 
     def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:
-        """Set all rows, missing ones to 0, then `center`."""
+        """Set all rows (missing ones to 0), then center the table."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
             scalars.update(zip(self.keys(view), map(float, values), strict=True))
         self.center(scalars)
 
     def update(self, scalars: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Update the row of a view by Adam, with its own update count; then `center` a centered table."""
+        """Update the row of a view with Adam, with its own update count; then center a centered table."""
         values = {key: scalars.get(key, 0.0) for key in self.keys(view)}
         adam_step(scalars, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:

@@ -1,6 +1,6 @@
 """Read depth maps of other programs, one image per photograph, and fit them to the points of the scene.
 
-A value is an inverse depth, bright is near, up to a scale and an offset per map, as networks for monocular depth
+A value is an inverse depth (bright is near) up to a scale and an offset per map, as networks for monocular depth
 predict it.  Both are fitted to the points that the photograph shows, by least absolute differences, since some points
 are wrong.
 """
@@ -29,7 +29,7 @@ MIN_POINTS = 10  # per photograph, to fit a map
 MAX_PIXELS = 32_768  # of a map, used as supervision
 ROUNDS = 20
 EXACT = 1e-3  # of the points' spread: smaller differences do not get larger weights
-TINY = 1e-12  # scene units⁻¹, if all points have the same depth
+TINY = 1e-12  # scene units⁻¹, against division by zero if all points have the same depth
 MAX_RESIDUAL = 0.5  # of the points' spread; a map that leaves more does not fit
 
 
@@ -39,7 +39,7 @@ def _png_names(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """A folder of maps: `a.png`, of 8 or 16 bits and any size, for the photograph a.jpg; deeper ones likewise."""
+    """A folder of depth maps: `b/a.png`, of 8 or 16 bits and any size, for the photograph `b/a.jpg`."""
 
     folder: Path
     _files: dict[str, Path] = field(default_factory=dict, compare=False)
@@ -54,7 +54,7 @@ class DepthMaps:
         self._files.update(zip(new, files.paths, strict=True))
 
     def read(self, name: str, width: int, height: int) -> Floats:
-        """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError without one."""
+        """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError if it is missing."""
         self.require([name])
         pixels = read_image(self._files[name])[:, :, 0]
         values: NDArray[Any] = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
@@ -68,18 +68,18 @@ class DepthMaps:
         """Return rows, columns and inverse depths at an even grid of pixels of a photograph of size (width, height).
 
         rows, columns: [K] pixels of points, with their inverse depths [K].  Returns None, with a warning, if the map
-        does not fit these.  Raises DataError like `read`.
+        does not fit these depths.  Raises DataError like `read`.
         """
         values = self.read(name, *size)
         fit = fit_scale_and_offset(values[rows, columns], inverse)
         if fit is None:
-            LOG.warning("%s: the depth map does not fit the points of the photograph; it is ignored", name)
+            LOG.warning("%s: ignoring the depth map, which does not fit the points of the photograph", name)
             return None
         step = math.ceil(math.sqrt(values.size / MAX_PIXELS))
-        down, across = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)
-        depths = fit[0] * values[down, across] + fit[1]
+        y, x = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)
+        depths = fit[0] * values[y, x] + fit[1]
         near = depths > 0  # others are beyond the range of the map
-        return down[near], across[near], depths[near]
+        return y[near], x[near], depths[near]
 
 
 def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
@@ -94,18 +94,18 @@ def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float]
     weights, factor, offset = np.ones(len(x)), 0.0, 0.0
     for _ in range(ROUNDS):
         total = weights.sum()
-        middle_x, middle_y = (weights * x).sum() / total, (weights * y).sum() / total
-        square = (weights * (x - middle_x) ** 2).sum()
-        factor = float((weights * (x - middle_x) * (y - middle_y)).sum() / square) if square > 0 else 0.0
-        offset = float(middle_y - factor * middle_x)
+        mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
+        variance = (weights * (x - mean_x) ** 2).sum()
+        factor = float((weights * (x - mean_x) * (y - mean_y)).sum() / variance) if variance > 0 else 0.0
+        offset = float(mean_y - factor * mean_x)
         weights = 1 / np.maximum(np.abs(factor * x + offset - y), EXACT * spread + TINY)
-    left = float(np.median(np.abs(factor * x + offset - y)))
-    return (factor, offset) if factor > 0 and left <= MAX_RESIDUAL * spread else None
+    residual = float(np.median(np.abs(factor * x + offset - y)))
+    return (factor, offset) if factor > 0 and residual <= MAX_RESIDUAL * spread else None
 
 
-# Known depths at some pixels of the training photographs, of points or of depth maps.
+# Known depths at some pixels of the training photographs, from points or depth maps.
 
-SURE = 4  # photographs that must show a point for full weight
+FULL_WEIGHT_VIEWS = 4  # photographs that must show a point for full weight
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ class KnownDepths:
 
 
 class PointDepths:
-    """The structure-from-motion points in each training view, by index of the view.
+    """The depths of the structure-from-motion points in each training view, by index of the view.
 
-    maps: depth maps, fitted to the points and used instead of them.
+    maps: depth maps, which are fitted to the points and used instead of them.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class PointDepths:
         self._rows = [tracks.seen.get(name, np.empty(0, np.int64)) for name in names]
         counts = np.bincount(np.concatenate([*tracks.seen.values(), np.empty(0, np.int64)]))
         self._counts = np.pad(counts, (0, len(tracks.positions) - len(counts)))
-        self._held: dict[tuple[int, int, int], KnownDepths | None] = {}
+        self._cache: dict[tuple[int, int, int], KnownDepths | None] = {}
 
     def at(self, camera: DeviceCamera) -> KnownDepths | None:
         """Return the known depths for a training camera; None if there are none.
@@ -141,32 +141,33 @@ class PointDepths:
         if camera.view is None:
             return None
         key = camera.view, camera.width, camera.height
-        if key not in self._held:
-            self._held[key] = self._uploaded(camera, self._rows[camera.view])
-        return self._held[key]
+        if key not in self._cache:
+            self._cache[key] = self._upload(camera, self._rows[camera.view])
+        return self._cache[key]
 
-    def _uploaded(self, camera: DeviceCamera, rows: NDArray[np.int64]) -> KnownDepths | None:
-        places, depths, kept = nearest_in_pixels(camera, self.tracks.positions[rows])
+    def _upload(self, camera: DeviceCamera, rows: NDArray[np.int64]) -> KnownDepths | None:
+        indices, depths, order = nearest_in_pixels(camera, self.tracks.positions[rows])
         inverse: NDArray[np.floating] = 1 / depths
-        weights = np.minimum(1.0, self._counts[rows[kept]] / SURE)
+        weights = np.minimum(1.0, self._counts[rows[order]] / FULL_WEIGHT_VIEWS)
         if self.maps and camera.view is not None:
-            pixels = places // camera.stride, places % camera.stride
+            pixels = indices // camera.stride, indices % camera.stride
             samples = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
             if samples is None:
                 return None
-            places, inverse, weights = samples[0] * camera.stride + samples[1], samples[2], np.ones(len(samples[2]))
-        if not len(places):
+            indices, inverse, weights = samples[0] * camera.stride + samples[1], samples[2], np.ones(len(samples[2]))
+        if not len(indices):
             return None
         upload, values = self.device.upload, (inverse.astype(np.float32), weights.astype(np.float32))
-        return KnownDepths(upload(places.astype(np.uint32)), upload(values[0]), upload(values[1]), self.extent)
+        return KnownDepths(upload(indices.astype(np.uint32)), upload(values[0]), upload(values[1]), self.extent)
 
 
 def nearest_in_pixels(
     camera: DeviceCamera, positions: NDArray[np.floating]
 ) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.intp]]:
-    """Return the plane indices that positions [M, 3] project to, ascending [K], their depths and their rows.
+    """Return the ascending plane indices, [K], that positions, [M, 3], project to, and their depths and rows.
 
-    Of several in one pixel, the nearest is kept, the first of equally near ones.  Those outside the image are dropped.
+    In each pixel, only the nearest position counts, the first of equally near ones; others, and positions outside the
+    image, are dropped.
     """
     values = camera.values
     pose = np.asarray(values["world_to_camera"], np.float64).reshape(3, 4)
@@ -175,10 +176,10 @@ def nearest_in_pixels(
     depth = np.where(in_front, z, 1.0)
     column = np.floor(float(values["fx"]) * x / depth + float(values["cx"]))
     row = np.floor(float(values["fy"]) * y / depth + float(values["cy"]))
-    shown = in_front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    rows = np.flatnonzero(shown)
+    inside = in_front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    rows = np.flatnonzero(inside)
     indices = (row[rows] * camera.stride + column[rows]).astype(np.intp)
     order = np.lexsort((rows, depth[rows], indices))
     _, first = np.unique(indices[order], return_index=True)
-    kept = order[first]
-    return indices[kept], depth[rows[kept]], rows[kept]
+    nearest = order[first]
+    return indices[nearest], depth[rows[nearest]], rows[nearest]

@@ -1,7 +1,7 @@
 """Estimate the relative exposures of photographs from pixels that show the same points.
 
 For each channel, ln y = e + a, with the exposure e of a photograph and the color a of a point.  They minimize the sum
-of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced points, and weights differences as they appear
+of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced points, and weights differences by their size
 in the image, where haze on a dark point is small.  The solver is iteratively reweighted least squares, with conjugate
 gradients on sums in a fixed order.
 """
@@ -37,7 +37,7 @@ class Exposures:
 
     log_gains: dict[str, Floats]
     source: str  # in words
-    explained: float = 1.0  # fraction of the differences between photographs of the same point that gains remove
+    explained_variance: float = 1.0  # fraction of the differences between photographs of a point that gains remove
 
     @property
     def spread(self) -> float:
@@ -69,21 +69,21 @@ def exif_exposures(views: Sequence[View]) -> Exposures:
 
 
 def complete_exposures(measured: Exposures, exif: Exposures) -> Exposures:
-    """Complete exposures measured on tracks by those from EXIF.
+    """Add exposures from EXIF for photographs without exposures measured on tracks.
 
-    Those from EXIF are shifted by the mean difference over the photographs that have both; if there are none, they are
-    not used.
+    Exposures from EXIF are shifted by the mean difference over the photographs that have both; without such
+    photographs, they are not used.
     """
     if not measured.log_gains:
         return exif
-    both, more = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
-    if not both or not more:
+    both, new = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
+    if not both or not new:
         return measured
     offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in both], axis=0)
-    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in more}}
+    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in new}}
     mean = np.mean(list(combined.values()), axis=0)
-    source = f"{measured.source}, those of {len(more)} {exif.source}"
-    return Exposures({name: gains - mean for name, gains in combined.items()}, source, measured.explained)
+    source = f"{measured.source}, those of {len(new)} {exif.source}"
+    return Exposures({name: gains - mean for name, gains in combined.items()}, source, measured.explained_variance)
 
 
 def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
@@ -94,7 +94,7 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Expo
     by_name: dict[str, View] = {}
     for view in views:
         by_name.setdefault(view.name, view)
-    per_view = [samples(tracks, view, *read(view)) for view in by_name.values()]
+    per_view = [sample_points(tracks, view, *read(view)) for view in by_name.values()]
     photograph = np.repeat(np.arange(len(per_view)), [len(rows) for rows, _ in per_view])
     point, values = (np.concatenate([part[i] for part in per_view]) for i in (0, 1))
     log_gains, shared, residuals = np.full((len(per_view), 3), np.nan), 0, np.zeros(2)
@@ -103,18 +103,18 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Expo
         photographs = np.bincount(point[usable], minlength=len(tracks.positions))
         usable &= photographs[point] > 1
         shared = max(shared, int(np.count_nonzero(photographs > 1)))
-        parts = photograph[usable], point[usable], values[usable, channel], len(per_view)
-        log_gains[:, channel], with_gains = _fit(*parts)
-        residuals += with_gains, _fit(*parts, rounds=0)[1]
+        arguments = photograph[usable], point[usable], values[usable, channel], len(per_view)
+        log_gains[:, channel], with_gains = _fit(*arguments)
+        residuals += with_gains, _fit(*arguments, rounds=0)[1]
     is_known = np.isfinite(log_gains).all(axis=1)
     log_gains -= log_gains[is_known].mean(axis=0) if is_known.any() else 0
-    explained = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
-    source = f"at {shared:,} points, which explains {explained:.0%} of the variance between photographs of a point"
-    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, explained)
+    fraction = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
+    source = f"at {shared:,} points, which explains {fraction:.0%} of the variance between photographs of a point"
+    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, fraction)
 
 
-def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
-    """Return the rows of the points in a photograph, [S], and their colors there, [S, 3] in [0, 1]."""
+def sample_points(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
+    """Return the rows of the points that a photograph shows, [S], and their colors there, [S, 3] in [0, 1]."""
     rows = tracks.seen.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
     rotated = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # independent of threads
@@ -133,9 +133,9 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
 def _fit(
     photograph: Integers, point: Integers, values: Floats, count: int, rounds: int = ROUNDS
 ) -> tuple[Floats, float]:
-    """Return the exposures of photographs, [count], NaN for those with too few values, and the sum of residuals.
+    """Return the exposures of photographs, [count], NaN where there are too few values, and the sum of residuals.
 
-    rounds: 0 to keep all exposures equal.
+    rounds: 0 keeps all exposures equal.
     """
     exposures, logarithms, weights = np.zeros(count), np.log(values), np.ones(len(values))
     residuals = np.zeros(len(values))
@@ -157,17 +157,17 @@ def _corrections(photograph: Integers, point: Integers, target: Floats, weights:
         return np.bincount(photograph, differences, minlength=count).astype(np.float64)
 
     solution, residual = np.zeros(count), apply(target)
-    direction, square = residual.copy(), float((residual**2).sum())
+    direction, squared_norm = residual.copy(), float((residual**2).sum())
     rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
-    goal = max(TOLERANCE**2 * square, float((rounding**2).sum()))
+    goal = max(TOLERANCE**2 * squared_norm, float((rounding**2).sum()))
     for _ in range(count):
-        if square <= goal:
+        if squared_norm <= goal:
             break
-        image = apply(direction[photograph])
-        step = square / float((direction * image).sum())
-        solution, residual = solution + step * direction, residual - step * image
-        before, square = square, float((residual**2).sum())
-        direction = residual + square / before * direction
+        product = apply(direction[photograph])
+        step = squared_norm / float((direction * product).sum())
+        solution, residual = solution + step * direction, residual - step * product
+        previous, squared_norm = squared_norm, float((residual**2).sum())
+        direction = residual + squared_norm / previous * direction
     return solution
 
 

@@ -30,7 +30,7 @@ class Photograph:
     camera: DeviceCamera
     colors: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
-    empty: bool = False  # whether the mask leaves out every pixel
+    empty: bool = False  # whether the mask excludes every pixel
     transparency: Array | None = None  # [1, height, width] uint8, 255: only the background; None: opaque, or not kept
 
     @property
@@ -84,7 +84,7 @@ def _key(view: View) -> Key:
 class Photographs:
     """A cache of the photographs of a scene, up to `budget` bytes on the device; others are read again.
 
-    A thread reads announced views ahead; results are the same as without.
+    A thread prefetches photographs, which does not change results.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Photographs:
         self.background_name = background
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
-        self._held: dict[Key, Photograph] = {}  # least recently used first
+        self._cache: dict[Key, Photograph] = {}  # least recently used first
         self._reading: dict[Key, Future[Pixels]] = {}
         self._reader: ThreadPoolExecutor | None = None
         self._transparency = False
@@ -104,16 +104,16 @@ class Photographs:
         """Keep the transparency of photographs too, for random backgrounds."""
         if not self._transparency:
             self._transparency = True
-            self._held.clear()
+            self._cache.clear()
             self._reading.clear()
 
-    def fresh(self) -> "Photographs":
+    def empty_copy(self) -> "Photographs":
         """Return an empty cache, for views that are used once."""
         return Photographs(self.device, self.background_name, undistorted=self.undistorted)
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        cached = self._held.get(_key(view))
+        cached = self._cache.get(_key(view))
         return update_camera(cached.camera, view) if cached else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
@@ -122,20 +122,20 @@ class Photographs:
         Raises DataError if its file cannot be read.
         """
         key = _key(view)
-        photograph = self._held.pop(key, None)
+        photograph = self._cache.pop(key, None)
         if photograph is None:
-            reading = self._reading.pop(key, None)
-            colors, mask, shows = reading.result() if reading else self._read(view)
-            self._make_room(colors.nbytes + mask.nbytes + (0 if shows is None else shows.nbytes))
+            future = self._reading.pop(key, None)
+            colors, mask, alpha = future.result() if future else self._read(view)
+            self._make_room(colors.nbytes + mask.nbytes + (0 if alpha is None else alpha.nbytes))
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
-            transparency = None if shows is None else self.device.upload(shows)
+            transparency = None if alpha is None else self.device.upload(alpha)
             photograph = Photograph(self.camera(view), self.device.upload(colors), mask_on_device, empty, transparency)
         elif (camera := update_camera(photograph.camera, view)) is not photograph.camera:
             photograph = replace(photograph, camera=camera)
-        self._held[key] = photograph
+        self._cache[key] = photograph
         return photograph
 
-    def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
+    def get_usable(self, view: View, original: View, number: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger `original` if the mask excludes all pixels of the smaller.
 
         number: index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
@@ -150,24 +150,24 @@ class Photographs:
             )
         return replace(photograph, camera=replace(photograph.camera, view=number))
 
-    def announce(self, views: Iterable[View]) -> None:
-        """Start to read the photographs of views that are used next."""
+    def prefetch(self, views: Iterable[View]) -> None:
+        """Start to read the photographs of views that will be used next."""
         for view in views:
             key = _key(view)
-            if key not in self._held and key not in self._reading:
+            if key not in self._cache and key not in self._reading:
                 self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
                 self._reading[key] = self._reader.submit(self._read, view)
 
     def _read(self, view: View) -> Pixels:
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
         pixels = np.ascontiguousarray(image.transpose(2, 0, 1))
-        shows = load_transparency(view) if self._transparency else None
-        return Pixels(pixels[:3], pixels[3:], None if shows is None else shows[None])
+        transparency = load_transparency(view) if self._transparency else None
+        return Pixels(pixels[:3], pixels[3:], None if transparency is None else transparency[None])
 
     def _make_room(self, size: int) -> None:
-        total = sum(photograph.nbytes for photograph in self._held.values())
-        while self._held and total + size > self.budget:
-            total -= self._held.pop(next(iter(self._held))).nbytes
+        total = sum(photograph.nbytes for photograph in self._cache.values())
+        while self._cache and total + size > self.budget:
+            total -= self._cache.pop(next(iter(self._cache))).nbytes
 
 
 def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:
@@ -192,7 +192,7 @@ def change_background(
 ) -> None:
     """Replace the color `background` by `behind`, [3], in colors [3, rows, stride].
 
-    transparency: [1, height, width] uint8, 255 where only the background is seen.
+    transparency: [1, height, width] uint8, 255 where only the background is visible.
     """
     shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
     pixels = camera.rows * camera.stride
@@ -229,7 +229,7 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
     return magnitude
 
 
-def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
+def unmasked_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
     """Return gradient magnitudes, and -1 at masked pixels and their neighbors.  mask: [1, rows, stride]."""
     magnitude = image_gradient(workspace, camera, image)
     if mask is not None:
@@ -244,12 +244,12 @@ def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mas
     return magnitude
 
 
-def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], share: float) -> float:
-    """Return the quantile `share` of the magnitude over all pixels that count, per px, in steps of 1 / 4000."""
+def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], quantile: float) -> float:
+    """Return a quantile of the gradient magnitude over all pixels that count, per px, in steps of 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)
-        inside = known_gradient(workspace, camera, planes.colors, planes.mask).get()[: camera.height, : camera.width]
+        inside = unmasked_gradient(workspace, camera, planes.colors, planes.mask).get()[: camera.height, : camera.width]
         counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # without values below 0
-    below = np.searchsorted(np.cumsum(counts), share * counts.sum())
+    below = np.searchsorted(np.cumsum(counts), quantile * counts.sum())
     return float(below + 1) * MAX_MAGNITUDE / BINS

@@ -13,13 +13,13 @@ from pydantic import Field
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import AtLeastOne, Points, at_step, explain_schedule
 from clsplat.core.settings import OneOf, Settings
-from clsplat.photos.detail import DetailDivisor, course
+from clsplat.photos.detail import DetailDivisor, describe_sizes
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.scene.view import View
 
 # The view of each step depends only on the seed and the step, so a resumed run uses the same views.
 
-FINEST_SHARE = 0.3  # of steps with a random view of the finest size (released code of Mip-Splatting)
+FINEST_FRACTION = 0.3  # of steps with a random view of the finest size (released code of Mip-Splatting)
 
 
 class ViewPool:
@@ -82,7 +82,7 @@ class StackOrder(Order):
 
     def at(self, pool: ViewPool, step: int) -> View:
         rng = pool.random(step)
-        if rng.random() < FINEST_SHARE:
+        if rng.random() < FINEST_FRACTION:
             return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
         return pool.shuffled(range(len(pool.views)), step)
 
@@ -104,8 +104,8 @@ class ViewSettings(Settings):
         """Return settings whose resolution is a schedule.  photographs: of training, each [height, width, 3]."""
         if not isinstance(self.resolution, DetailDivisor):
             return self
-        resolution = self.resolution.of(photographs())
-        LOG.info(course(resolution))
+        resolution = self.resolution.to_schedule(photographs())
+        LOG.info(describe_sizes(resolution))
         return self.model_copy(update={"resolution": resolution})
 
     def divisor(self, step: int) -> float:
@@ -129,7 +129,7 @@ class ViewSettings(Settings):
         return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
 
     def full_size(self, last: int) -> int:
-        """Return the first step up to `last` with photographs larger than half their size."""
+        """Return the first step with photographs larger than half their size, or `last`."""
         return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
 
 
@@ -145,7 +145,7 @@ class Sample:
 
 
 class Sampler:
-    """Returns the sample of each step, which depends only on the views, the seed and the step."""
+    """The samples of all steps; each depends only on the views, the seed and the step."""
 
     def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
         self.settings, self._pool = settings, ViewPool(views, seed)

@@ -11,7 +11,7 @@ from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 
-REACH = 3  # standard deviations of a blur's window
+REACH = 3  # radius of a blur's window, standard deviations
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PhotographTransform(Settings):
 
 
 class Blur(PhotographTransform):
-    """Blur the photograph by a Gaussian; masked pixels do not count."""
+    """Blur the photograph with a Gaussian; masked pixels do not count."""
 
     type: Literal["blur"] = "blur"
     sigma: NonNegative
@@ -41,7 +41,7 @@ class Blur(PhotographTransform):
 
     def apply(self, planes: Planes, step: int) -> Planes:
         sigma = at_step(self.sigma, step)
-        return planes if sigma == 0 else _averaged(planes, math.ceil(REACH * sigma), 0.5 / sigma**2)
+        return planes if sigma == 0 else _average(planes, math.ceil(REACH * sigma), 0.5 / sigma**2)
 
 
 class MeanFilter(PhotographTransform):
@@ -49,13 +49,13 @@ class MeanFilter(PhotographTransform):
 
     type: Literal["mean_filter"] = "mean_filter"
     width: NonNegative
-    """Side of the square as a share of the photograph's width, rounded to an odd number of px; by step."""
+    """Side of the square as a fraction of the photograph's width, rounded to an odd number of px; by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
-        return _averaged(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)
+        return _average(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)
 
 
-def _averaged(planes: Planes, reach: int, falloff: float) -> Planes:
+def _average(planes: Planes, reach: int, falloff: float) -> Planes:
     """Average the pixels within `reach` px in x and y, with weights exp(-falloff distance²).  falloff: px⁻²."""
     if reach == 0:
         return planes

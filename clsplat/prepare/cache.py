@@ -47,7 +47,7 @@ class PlannedStep:
     origin: str  # folder of the photographs, which is the input of the first step
     inputs: str  # hash of its inputs
     folder: Path
-    why: str  # reason to run the step; "" when its result is there already
+    why: str  # reason to run the step; "" when its result exists already
 
     @property
     def key(self) -> str:
@@ -65,9 +65,9 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
     for step in steps:
         key = PlannedStep(step, str(source.resolve()), inputs, Path(), "").key
         folder = root / f"{step.stage}-{key[:12]}"
-        planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
+        planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _reason(step, inputs, folder, source)))
         inputs = key
-    # A step whose result is missing need not run when the result of a later one is there.
+    # A step whose result is missing need not run when the result of a later step exists.
     done = max((i for i, step in enumerate(planned) if not step.why), default=-1)
     return [replace(step, why="") if i < done else step for i, step in enumerate(planned)]
 
@@ -80,7 +80,7 @@ def prepare(
 ) -> Path:
     """Run the steps that have a reason to run, each inside `stage(name)`, and return the folder of the last result.
 
-    Raises OutputError when another process is making one of the results, and the errors of the steps.
+    Raises OutputError when another process is making one of the results, and any error of a step.
     """
     count = Count("steps of the preparation", len(planned), is_even=False)
     if reused := [planned_step.step.stage for planned_step in planned if not planned_step.why]:
@@ -88,8 +88,8 @@ def prepare(
     for number, planned_step in enumerate(planned):
         with counts_as_debug():  # each step logs its own progress
             count.reach(number)
-        with _exclusive(planned_step) if planned_step.why else nullcontext():
-            if planned_step.why and _fault(planned_step.folder):  # another process may have made it since
+        with _lock_result(planned_step) if planned_step.why else nullcontext():
+            if planned_step.why and _fault(planned_step.folder):  # another process may have made it meanwhile
                 with stage(planned_step.step.stage):
                     _run_step(planned_step, source, root)
             else:
@@ -100,24 +100,24 @@ def prepare(
 
 
 @contextmanager
-def _exclusive(planned_step: PlannedStep) -> Iterator[None]:
-    """Lock a result, so that only one process continues what an interrupted call left."""
+def _lock_result(planned_step: PlannedStep) -> Iterator[None]:
+    """Lock a result, so that only one process continues an interrupted call."""
     with raising_output_error(planned_step.folder.parent):
         make_folder(planned_step.folder.parent)
     with lock.lock_folder(planned_step.folder, planned_step.folder.with_name(f".{planned_step.folder.name}.lock")):
         yield
 
 
-def fingerprint(folder: Path, without: Path) -> str:
-    """Return a hash of the names and contents of the files below a folder, except hidden ones and those in `without`.
+def fingerprint(folder: Path, excluded: Path) -> str:
+    """Return a hash of the names and contents of the files below a folder, except hidden ones and those in `excluded`.
 
-    Raises DataError when there is no such folder, or a file in it cannot be read.
+    Raises DataError when the folder does not exist, or when a file in it cannot be read.
     """
     require_folder(folder)
     parts = []
     for base, folders, files in os.walk(folder):
-        below = {name: (Path(base) / name).resolve() for name in folders if name[0] != "."}
-        folders[:] = sorted(name for name, path in below.items() if path != without.resolve())
+        subfolders = {name: (Path(base) / name).resolve() for name in folders if name[0] != "."}
+        folders[:] = sorted(name for name, path in subfolders.items() if path != excluded.resolve())
         for name in sorted(files):
             path = Path(base) / name
             if name[0] != "." and path.is_file():
@@ -133,8 +133,8 @@ def make_note(planned: Sequence[PlannedStep]) -> dict[str, str]:
 def read_note(out: Path) -> dict[str, str] | None:
     """Return the note of a run folder, or None."""
     try:
-        text = read_json(out / PREPARE_SUMMARY)
-        return {"inputs": str(text["inputs"]), "folder": str(text["folder"])}
+        summary = read_json(out / PREPARE_SUMMARY)
+        return {"inputs": str(summary["inputs"]), "folder": str(summary["folder"])}
     except (DataError, KeyError, TypeError):
         return None
 
@@ -142,7 +142,7 @@ def read_note(out: Path) -> dict[str, str] | None:
 def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
     """Make a result in a hidden folder, and rename the folder when it is complete and synced to the disk.
 
-    A step that can resume finds there what an interrupted call made from the same inputs with the same settings.
+    A step that can resume continues from what an interrupted call with the same inputs and settings left there.
     """
     temporary = planned_step.folder.with_name(f".{planned_step.folder.name}")
     if planned_step.why != NO_RESULT:
@@ -204,7 +204,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _fault(folder: Path) -> str:
-    """Return what is wrong with a result; "" when it has its record and every listed file has its size."""
+    """Return what is wrong with a result; "" when its record exists and every listed file has the recorded size."""
     record = read_record(folder)
     if not record:
         return f"{RECORD} is missing or damaged"
@@ -218,11 +218,11 @@ def _fault(folder: Path) -> str:
     return ""
 
 
-def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return the reason to run a step, as the difference from the newest result; "" when the result is there."""
+def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
+    """Return the reason to run a step, as the difference from the newest result; "" when the result exists."""
     if folder.exists():
         fault = _fault(folder)
-        return fault and f"{fault}; the result is made again"
+        return fault and f"{fault}; the result is recomputed"
     results = []
     for other in folder.parent.glob(f"{step.stage}-*"):
         record = read_record(other)
@@ -230,22 +230,22 @@ def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
             results.append((other.stat().st_mtime, record))
     if not results:
         return NO_RESULT
-    before = max(results, key=lambda pair: pair[0])[1]
+    newest = max(results, key=lambda pair: pair[0])[1]
     for name, value in step.model_dump(mode="json").items():
-        if before["settings"].get(name) != value:
-            return f"{name} is {value}, was {before['settings'].get(name)}"
-    return "its input has changed" if before.get("inputs") != inputs else "the step itself has changed"
+        if newest["settings"].get(name) != value:
+            return f"{name} is {value}, was {newest['settings'].get(name)}"
+    return "its input has changed" if newest.get("inputs") != inputs else "the step itself has changed"
 
 
 def _digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are no figures of the step
+INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not figures of the step
 
 
 def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return the figures of each step, by its name, without steps whose results were removed."""
+    """Return the figures of each step by name, without steps whose results were removed."""
     records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}
@@ -256,7 +256,7 @@ def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
 
 # Make a COLMAP folder from photographs without a pipeline, for the command `clsplat data photos`.
 
-STEPS = ".steps"  # in the folder of the scene: results, from which an interrupted call continues
+STEPS = ".steps"  # folder in the scene for results, from which an interrupted call continues
 
 
 def place_photographs(
@@ -288,7 +288,7 @@ def place_photographs(
 
 
 def _require_free(out: Path) -> None:
-    """Raise DataError when the folder already contains what would be written there."""
+    """Raise DataError when the folder already contains other images or a model."""
     images = out / IMAGES
     if (out / MODEL).exists():
         raise DataError(f"{out}: already contains a model, `{MODEL}`; remove it or choose another folder")
@@ -301,9 +301,9 @@ def _publish(result: Path, out: Path) -> None:
     with raising_output_error(out):
         (out / IMAGES).unlink(missing_ok=True)
         link(result / IMAGES, out / IMAGES)
-        partial = out / STEPS / f".{MODEL}"
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.copytree(result / MODEL, partial)
-        sync_below(partial)
-        partial.rename(out / MODEL)
+        temporary = out / STEPS / f".{MODEL}"
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.copytree(result / MODEL, temporary)
+        sync_below(temporary)
+        temporary.rename(out / MODEL)
         sync_folder(out)

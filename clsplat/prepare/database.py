@@ -12,16 +12,16 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.signals import stopping_on_signals
 
 DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"
-MATCHING = "matching.json"  # how photographs were matched, for further attempts to place them
+MATCHING = "matching.json"  # settings of the matching, for further attempts to place photographs
 COUNT_PAIRS = """
 import sqlite3, sys
-with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as opened:
-    print(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:
+    print(connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
 """
 
 
 def require_pycolmap() -> ModuleType:
-    """Return pycolmap.  Raises ConfigError where it is not installed.
+    """Import pycolmap and return it.  Raises ConfigError when it is not installed.
 
     Importing pycolmap installs a SIGTERM handler that dumps and exits, and reports any exception as a broken install.
     Therefore signals wait until the import has finished, and then get their handlers back.
@@ -34,12 +34,12 @@ def require_pycolmap() -> ModuleType:
         raise ConfigError("finding cameras needs pycolmap: pip install 'pycolmap>=4,<5'") from error
     if signals:
         raise KeyboardInterrupt
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # errors are raised as exceptions, too
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # errors are raised as exceptions anyway
     return pycolmap
 
 
 @contextmanager
-def opened(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
+def open_database(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
     """Open COLMAP's database for the block; create it if necessary."""
     rows = pycolmap.Database.open(str(database))
     try:
@@ -49,15 +49,15 @@ def opened(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
 
 
 def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
-    """Return the names of the images, sorted; none when there is no database."""
+    """Return the names of the images, sorted; empty when there is no database."""
     if not database.exists():
         return []
-    with opened(pycolmap, database) as rows:
+    with open_database(pycolmap, database) as rows:
         return sorted(image.name for image in rows.read_all_images())
 
 
-def without_features(rows: Any) -> dict[int, str]:
-    """Return the images without features in an open database, by number, in order of their names."""
+def images_without_features(rows: Any) -> dict[int, str]:
+    """Return the names of the images without features in an open database, by number, sorted by name."""
     return {
         image.image_id: image.name
         for image in sorted(rows.read_all_images(), key=lambda image: image.name)
@@ -67,20 +67,20 @@ def without_features(rows: Any) -> dict[int, str]:
 
 def clear_features(pycolmap: ModuleType, database: Path) -> None:
     """Remove features and matches, but not cameras and images."""
-    with opened(pycolmap, database) as rows:
+    with open_database(pycolmap, database) as rows:
         for clear in ("two_view_geometries", "matches", "descriptors", "keypoints"):
             getattr(rows, f"clear_{clear}")()
 
 
 def feature_counts(pycolmap: ModuleType, database: Path) -> dict[str, int]:
     """Return the number of features of each image."""
-    with opened(pycolmap, database) as rows:
+    with open_database(pycolmap, database) as rows:
         return {image.name: rows.num_keypoints_for_image(image.image_id) for image in rows.read_all_images()}
 
 
-def verified(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
-    """Return the number of geometrically verified matches of each pair that has some."""
-    with opened(pycolmap, database) as rows:
+def verified_pairs(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
+    """Return the number of geometrically verified matches of each pair that has any."""
+    with open_database(pycolmap, database) as rows:
         names = {image.image_id: image.name for image in rows.read_all_images()}
         pairs, counts = rows.read_two_view_geometry_num_inliers()
     numbers = map(pycolmap.pair_id_to_image_pair, pairs)
@@ -88,16 +88,16 @@ def verified(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]
 
 
 @contextmanager
-def explained(path: Path, action: str) -> Iterator[None]:
-    """Raise DataError, as one sentence, for an error of pycolmap."""
+def raising_data_error(path: Path, action: str) -> Iterator[None]:
+    """Convert an error of pycolmap in the block to a DataError with a message of one sentence."""
     try:
         yield
     except (ValueError, RuntimeError) as error:
         raise DataError(f"{path}: could not {action} ({str(error).splitlines()[0]}); check the photographs") from error
 
 
-def pairs_done(database: Path) -> int:
-    """Return the number of pairs that pycolmap has matched while it writes; 0 when that cannot be read now.
+def count_matched_pairs(database: Path) -> int:
+    """Return the number of pairs that pycolmap has matched so far; 0 when it cannot be read at the moment.
 
     A child process reads it: a second SQLite library in pycolmap's process would release the locks of the first
     (https://www.sqlite.org/howtocorrupt.html, 2.2.1), and matches would be lost.
@@ -110,7 +110,7 @@ def pairs_done(database: Path) -> int:
         return 0
 
 
-def remove(database: Path) -> None:
+def remove_database(database: Path) -> None:
     """Remove a database and its journal."""
     for file in database.parent.glob(f"{database.name}*"):
         file.unlink()

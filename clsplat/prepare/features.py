@@ -19,12 +19,12 @@ from clsplat.core.progress import counted
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
-    explained,
     image_names,
-    opened,
-    remove,
+    images_without_features,
+    open_database,
+    raising_data_error,
+    remove_database,
     require_pycolmap,
-    without_features,
 )
 from clsplat.prepare.gather import gather, list_photographs, log_warnings
 from clsplat.prepare.shared_intrinsics import Cameras, group_photos, shared_camera_note
@@ -53,7 +53,7 @@ def find_features(
     options: FeatureOptions = FeatureOptions(),
     camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
-    without: Path | None = None,
+    excluded: Path | None = None,
 ) -> dict[str, Any]:
     """Find features; return the number of photographs and cameras, and why some photographs cannot be read.
 
@@ -62,20 +62,20 @@ def find_features(
     photographs can be read.
     """
     pycolmap = require_pycolmap()
-    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, excluded))
     groups = group_photos(out / IMAGES, names, cameras)
     figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
     log_warnings(figures)
     if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
         LOG.warning(
-            "the photographs are twice as wide as high, as panoramas are; "
-            "for panoramas, --set find_features.camera_model=EQUIRECTANGULAR"
+            "the photographs are twice as wide as high, like panoramas; "
+            "for panoramas, use --set find_features.camera_model=EQUIRECTANGULAR"
         )
     if note := shared_camera_note(out / IMAGES, groups):
         LOG.info("%s", note)
-    with explained(photographs, "find features"):
+    with raising_data_error(photographs, "find features"):
         if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new or an incomplete database
-            remove(out / DATABASE)
+            remove_database(out / DATABASE)
             _register(pycolmap, out, groups, camera_model)
     add_features(out / IMAGES, out / DATABASE, options)
     return figures
@@ -88,14 +88,14 @@ def _is_panorama(photograph: Path) -> bool:
 
 
 def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
-    """Find features of the photographs in a database that have none.  Raises DataError."""
+    """Find features of the photographs in a database that do not have any yet.  Raises DataError."""
     pycolmap = require_pycolmap()
-    with explained(images, "find features"), opened(pycolmap, database) as rows:
-        missing = without_features(rows)
+    with raising_data_error(images, "find features"), open_database(pycolmap, database) as rows:
+        missing = images_without_features(rows)
         for number, name in counted(missing.items(), "photographs with features", len(missing)):
-            pixels, (across, down) = read_gray(images / name, options.long_side)
+            pixels, (scale_x, scale_y) = read_gray(images / name, options.long_side)
             keypoints, descriptors = sift(pixels, options)
-            keypoints[:, :3] *= across, down, (across + down) / 2
+            keypoints[:, :3] *= scale_x, scale_y, (scale_x + scale_y) / 2
             with pycolmap.DatabaseTransaction(rows):
                 rows.write_keypoints(number, keypoints)
                 kind = pycolmap.FeatureExtractorType.SIFT
@@ -116,13 +116,13 @@ def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np
         sigma=BLUR,
         enable_precise_upscale=True,
     )
-    points, described = detector.detectAndCompute(pixels, None)
+    points, raw = detector.detectAndCompute(pixels, None)
     if not points:
         return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
     best = np.argsort([-point.response for point in points], kind="stable")[: options.count]
     keypoints = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size / 2, np.deg2rad(p.angle)) for p in points]
-    shares = described / np.maximum(described.sum(axis=1, keepdims=True), 1.0e-6)
-    descriptors = np.clip(np.rint(LEVELS * np.sqrt(shares)), 0, 255).astype(np.uint8)
+    fractions = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1.0e-6)
+    descriptors = np.clip(np.rint(LEVELS * np.sqrt(fractions)), 0, 255).astype(np.uint8)
     return np.array(keypoints, np.float32)[best], descriptors[best]
 
 
@@ -131,7 +131,7 @@ def _register(pycolmap: ModuleType, out: Path, groups: Sequence[Sequence[str]], 
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
     camera_of: Mapping[str, int] = {name: number for number, group in enumerate(groups, 1) for name in group}
-    with opened(pycolmap, out / DATABASE) as rows, pycolmap.DatabaseTransaction(rows):
+    with open_database(pycolmap, out / DATABASE) as rows, pycolmap.DatabaseTransaction(rows):
         for number, group in enumerate(groups, 1):
             camera = pycolmap.infer_camera_from_image(out / IMAGES / group[0], reader)
             camera.camera_id = number

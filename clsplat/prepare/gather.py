@@ -32,31 +32,31 @@ from clsplat.scene.quality import shows_nothing
 from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
-CONVERTED = {  # photographs that OpenCV cannot read, and commands that convert them to JPEG
+CONVERTERS = {  # photographs that OpenCV cannot read, and commands that convert them to JPEG
     "HEIC": ({".heic", ".heif"}, "heif-convert d.heic d.jpg, or sips -s format jpeg *.heic --out . on a Mac"),
     "AVIF": ({".avif"}, "ffmpeg -i d.avif d.jpg"),
     "DNG": ({".dng"}, "darktable-cli d.dng d.jpg"),
     "raw": ({".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}, "darktable-cli d.nef d.jpg"),
 }
-BRANDS = {  # at byte 8, behind `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV1 Image File Format
+BRANDS = {  # at byte 8, after `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV1 Image File Format
     "HEIC": {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"},
     "AVIF": {b"avif", b"avis"},
 }
-UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTED.values() for suffix in suffixes}
-NAMED_OTHERWISE = "contains {} data"  # why a photograph cannot be read
+UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTERS.values() for suffix in suffixes}
+OTHER_FORMAT = "contains {} data"  # why a photograph cannot be read
 MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
-CHECKED_SIDE = 64  # px: linked photographs are decoded at the smallest size, only to check them
+CHECKED_SIDE = 64  # px: linked photographs are decoded only to check them
 
 
-def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
-    """Return the names of the photographs below a folder, sorted, except hidden ones and those below `without`.
+def list_photographs(folder: Path, excluded: Path | None = None) -> list[str]:
+    """Return the names of the photographs below a folder, sorted, except hidden ones and those below `excluded`.
 
     Raises DataError when there are too few.
     """
-    names, unreadable = _photo_names(folder, without)
+    names, unreadable = _photo_names(folder, excluded)
     for text in _how_to_convert(unreadable):
         LOG.warning("%s: %s", folder, text)
-    require_photographs(folder, without)
+    require_photographs(folder, excluded)
     return names
 
 
@@ -71,35 +71,35 @@ def require_folder(folder: Path) -> None:
         raise DataError(f"{folder}: {fault}; expected a folder of photographs")
 
 
-def require_photographs(folder: Path, without: Path | None = None) -> None:
+def require_photographs(folder: Path, excluded: Path | None = None) -> None:
     """Raise DataError when there are too few photographs below a folder."""
-    names, unreadable = _photo_names(folder, without)
+    names, unreadable = _photo_names(folder, excluded)
     if len(names) < MIN_PHOTOGRAPHS:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
-        more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
+        hints = "".join(f"; {text}" for text in _how_to_convert(unreadable))
         raise DataError(
             f"{folder}: has {pluralize(len(names), 'photograph')}; "
-            f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){more}"
+            f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){hints}"
         )
 
 
 def _how_to_convert(unreadable: list[str]) -> list[str]:
     """Return a sentence for each kind of photo that cannot be read."""
     texts = []
-    for kind, (suffixes, command) in CONVERTED.items():
+    for kind, (suffixes, command) in CONVERTERS.items():
         if names := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
-            named = f"{pluralize(len(names), f'{kind} file')} cannot be read ({first_few(names)})"
-            texts.append(f"{named}: convert to JPEG, for example with {command}")
+            unreadable_files = f"{pluralize(len(names), f'{kind} file')} cannot be read ({first_few(names)})"
+            texts.append(f"{unreadable_files}: convert to JPEG, for example with {command}")
     return texts
 
 
-def _photo_names(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
+def _photo_names(folder: Path, excluded: Path | None) -> tuple[list[str], list[str]]:
     """Return the sorted names of the readable photos, and the names of photos in other formats."""
     require_folder(folder)
     names: list[str] = []
     unreadable: list[str] = []
     for base, folders, files in os.walk(folder):
-        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != without)
+        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != excluded)
         for file in files:
             suffix = Path(file).suffix.lower()
             if file[0] != "." and suffix in IMAGE_SUFFIXES | UNREADABLE_SUFFIXES:
@@ -109,7 +109,7 @@ def _photo_names(folder: Path, without: Path | None) -> tuple[list[str], list[st
 
 
 def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Link photographs into the folder `images`, or copy them upright; keep what an interrupted call put there.
+    """Link photographs into the folder `images`, or copy them upright; keep files that an interrupted call left there.
 
     Return the names of the readable photographs, and why the others cannot be read.
     """
@@ -117,13 +117,13 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     blank = 0
     for number, name in enumerate(names, 1):
         count.reach(number)
-        if _is_there(photographs / name, images / name):
+        if _is_gathered(photographs / name, images / name):
             readable.append(name)
             continue
         try:
             blank += _gather_one(photographs / name, images / name)
         except DataError as error:
-            damaged[name] = why_unreadable(photographs / name, error)
+            damaged[name] = failure_reason(photographs / name, error)
             continue
         readable.append(name)
     # written separately, since a copy of a PNG has no EXIF data
@@ -141,27 +141,27 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     return readable, damaged
 
 
-def why_unreadable(photograph: Path, error: DataError) -> str:
+def failure_reason(photograph: Path, error: DataError) -> str:
     """Return why a photograph cannot be read, in a few words: its actual format, or the message of `error`."""
     with suppress(OSError), open_regular(photograph) as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
             if head[4:8] == b"ftyp" and head[8:] in brands:
-                return NAMED_OTHERWISE.format(kind)
+                return OTHER_FORMAT.format(kind)
     return str(error).removeprefix(f"{photograph}: ").partition(";")[0]
 
 
 def remedy_for(damaged: Mapping[str, str]) -> str:
-    """Return how to make damaged photographs readable.  damaged: the reasons that `gather` returns, by name."""
-    kinds = [kind for kind in BRANDS if NAMED_OTHERWISE.format(kind) in damaged.values()]
-    texts = [f"convert {kind} files to JPEG, for example with {CONVERTED[kind][1]}" for kind in kinds]
-    if {NAMED_OTHERWISE.format(kind) for kind in kinds} != set(damaged.values()):
+    """Return how to make damaged photographs readable.  damaged: reasons by name, as `gather` returns them."""
+    kinds = [kind for kind in BRANDS if OTHER_FORMAT.format(kind) in damaged.values()]
+    texts = [f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}" for kind in kinds]
+    if {OTHER_FORMAT.format(kind) for kind in kinds} != set(damaged.values()):
         texts.append("export the others again" if kinds else "export them again")
     return "; ".join(texts)
 
 
 def _gather_one(source: Path, target: Path) -> bool:
-    """Link a photograph, or write it upright with its EXIF data; return whether it shows nothing.
+    """Link a photograph, or write it upright with its EXIF data; return whether the image is blank.
 
     Raises DataError when it cannot be read.
     """
@@ -187,7 +187,7 @@ def link(source: Path, target: Path) -> None:
 
     The link is relative, so it stays valid when both are moved together.
     """
-    if _is_there(source, target):
+    if _is_gathered(source, target):
         return
     try:
         target.unlink(missing_ok=True)
@@ -203,13 +203,13 @@ def link(source: Path, target: Path) -> None:
         partial.replace(target)
 
 
-def _is_there(source: Path, target: Path) -> bool:
-    """Whether the target is a complete copy, or a link to this source."""
+def _is_gathered(source: Path, target: Path) -> bool:
+    """Return whether the target is a complete copy of the source or a link to it."""
     return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())
 
 
 def log_warnings(figures: Mapping[str, Any]) -> None:
-    """Log the warnings about what a step left out."""
+    """Log warnings about the photographs that a step left out."""
     for text in warnings_for(figures):
         LOG.warning("%s", text)
 
@@ -223,16 +223,16 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
         texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy_for(damaged)}")
     if missing := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
-        named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
-        more = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
+        examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
+        alternative = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
         texts.append(
             f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed and are not "
-            f"used: {named}; to place them, add photographs from viewpoints in between{more}"
+            f"used: {examples}; to place them, add photographs from viewpoints in between{alternative}"
         )
-    if others := figures.get("other_models"):
-        sizes = ", ".join([*map(str, others[:-1]), pluralize(others[-1], "photograph")])
+    if sizes := figures.get("other_models"):
+        counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photograph")])
         texts.append(
-            f"only the largest model is used, without {pluralize(len(others), 'smaller model')} of {sizes}: add "
+            f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}: add "
             "photographs that connect them"
         )
     return texts
@@ -246,11 +246,11 @@ def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
     cameras = figures.get("map_cameras", {})
     try:
         damaged = [f"{name} ({reason})" for name, reason in figures.get("find_features", {}).get("damaged", {}).items()]
-        why = cameras.get("reasons", {})
-        missing = [f"{name} ({why[name]})" if name in why else str(name) for name in cameras["not_registered"]]
-        placed, lost = int(cameras["registered"]), [*damaged, *missing]
+        reasons = cameras.get("reasons", {})
+        missing = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
+        placed, unused = int(cameras["registered"]), [*damaged, *missing]
         error = float(cameras["error_px"])
-        text = f"{placed} of {placed + len(lost)} photographs placed, reprojection error {error:.2f} px"
+        text = f"{placed} of {placed + len(unused)} photographs placed, reprojection error {error:.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
-    return text + (f"; left out: {first_few(lost)}" if lost else "")
+    return text + (f"; left out: {first_few(unused)}" if unused else "")

@@ -1,7 +1,7 @@
 """Find cameras and points from matches with pycolmap, in several attempts until all photographs are placed.
 
-Another attempt follows when one leaves photographs out.  The model with the most photographs is kept; of equal ones,
-the first.
+When an attempt leaves photographs out, another one follows.  The model with the most photographs is kept, the first of
+equal ones.
 """
 
 import logging
@@ -21,25 +21,25 @@ from clsplat.prepare.database import (
     IMAGES,
     MODEL,
     clear_features,
-    explained,
     image_names,
+    raising_data_error,
     require_pycolmap,
-    verified,
+    verified_pairs,
 )
 from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
 from clsplat.prepare.features import FeatureOptions, add_features
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, log_warnings
-from clsplat.prepare.matching import Pairing, match_database, match_pairs, more_pairs
-from clsplat.prepare.rotation_only import why_no_depth
+from clsplat.prepare.matching import Pairing, expand_pairs, match_database, match_pairs
+from clsplat.prepare.rotation_only import no_depth_reason
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # fraction of the photographs: when more are placed, no attempt finds denser features
+ENOUGH = 0.9  # fraction of the photographs: when this many are placed, no attempt with denser features follows
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
 PAIR = 2  # track length of points that COLMAP drops from its models
-PAIR_ERROR = 1.0  # px, mean reprojection error: stricter, since two rays nearly meet for any pair of features
+PAIR_ERROR = 1.0  # px, mean reprojection error; strict, since the two rays of any pair of features nearly meet
 PAIR_ANGLE = 1.5  # degrees between two rays, as COLMAP requires for all points
 LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
@@ -51,7 +51,7 @@ LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter o
 
 @dataclass(frozen=True)
 class Attempt:
-    """How an attempt finds cameras; `label` describes it in the log."""
+    """Settings of an attempt to find cameras; `label` describes it in the log."""
 
     label: str
     mapper: Mapper = "incremental"
@@ -81,7 +81,7 @@ def map_cameras(
     attempts: int = MAX_ATTEMPTS,
     min_track_length: int = 3,
 ) -> dict[str, Any]:
-    """Place cameras and points in at most `attempts` attempts, write the largest model as sparse/0, return figures.
+    """Place cameras and points in at most `attempts` attempts, write the largest model to sparse/0, and return figures.
 
     `mapper: global` is faster for many photographs; more than one thread is faster but not bit-identical.
     min_track_length: the number of photographs in which a point must be seen, 2 or 3.
@@ -90,46 +90,46 @@ def map_cameras(
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
     names = image_names(pycolmap, source / DATABASE)
-    matched = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
-    if why := why_no_depth(pycolmap, source / DATABASE):
-        raise DataError(f"{source / IMAGES}: the photographs {why}")
-    models, used, more, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
+    if reason := no_depth_reason(pycolmap, source / DATABASE):
+        raise DataError(f"{source / IMAGES}: the photographs {reason}")
+    models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
         placed = models[0].num_reg_images() if models else 0
         if count == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
-        if attempt.dense and not models and matched.have_nothing_in_common():
+        if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
         try:
-            if attempt.wider and not (more := more_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
+            if attempt.wider and not (extra_pairs := expand_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
                 continue
             if attempt is not first:
                 LOG.info("placed %d of %d photographs; trying again with %s", placed, len(names), attempt.label)
             count += 1
-            candidates = _run_attempt(source, out, attempt, threads, models[:1], more)
+            candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.wider:
-                matched = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
+                graph = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
         except FAILURES as error:
             if not (attempt.wider or models):
                 raise
             LOG.warning("skipping an attempt that failed: %s", error)
             if not attempt.wider:
                 break
-            more, candidates = [], []
+            extra_pairs, candidates = [], []
         if candidates and candidates[0].num_reg_images() > placed:
-            models, used = candidates, attempt
+            models, best = candidates, attempt
     if not models:
-        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(matched)}")
-    database = used.database(source, out)
-    if why := why_no_depth(pycolmap, database, _names(models[0])):
-        placed_text = f"{models[0].num_reg_images()} of {len(names)}"
-        raise DataError(f"{source / IMAGES}: the {placed_text} photographs that were placed {why}")
-    if used.dense:
-        matched = MatchGraph.from_database(pycolmap, database, source / IMAGES)
+        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(graph)}")
+    database = best.database(source, out)
+    if reason := no_depth_reason(pycolmap, database, _names(models[0])):
+        counts = f"{models[0].num_reg_images()} of {len(names)}"
+        raise DataError(f"{source / IMAGES}: the {counts} photographs that were placed {reason}")
+    if best.dense:
+        graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == PAIR:
         models[0] = triangulate_pairs(models[0], database, out, threads)
-    figures = {**_write_best(models, out, names), "attempt": used.label, "denser_tried": (out / DENSE).exists()}
-    figures["reasons"] = explain_unplaced(matched, [_names(model) for model in models])
+    figures = {**_write_best(models, out, names), "attempt": best.label, "denser_tried": (out / DENSE).exists()}
+    figures["reasons"] = explain_unplaced(graph, [_names(model) for model in models])
     _remove_hidden(out)
     log_warnings(figures)
     return figures
@@ -141,12 +141,12 @@ def _remove_hidden(folder: Path) -> None:
 
 
 def _run_attempt(
-    source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any], more: Sequence[tuple[str, str]]
+    source: Path, out: Path, attempt: Attempt, threads: int, earlier: Sequence[Any], pairs: Sequence[tuple[str, str]]
 ) -> list[Any]:
     """Return the models of an attempt, the largest first; with the same features, it extends the earlier model."""
     pycolmap = require_pycolmap()
-    database, work = _fill_database(source, out, attempt, more), out / ".models"
-    if not verified(pycolmap, database):
+    database, work = _fill_database(source, out, attempt, pairs), out / ".models"
+    if not verified_pairs(pycolmap, database):
         return []
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
@@ -158,28 +158,28 @@ def _run_attempt(
     if attempt.loose:
         options.mapper.mergedict(LOOSE)
     pycolmap.set_random_seed(0)
-    with explained(source / IMAGES, "place the cameras"):
+    with raising_data_error(source / IMAGES, "place the cameras"):
         function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
         count = Count("photographs placed", len(image_names(pycolmap, database)))
 
-        def placed() -> None:
+        def on_placed() -> None:
             count.reach(min(max(2, count.done) + 1, count.total))
 
-        arguments: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
-        if attempt.loose and not attempt.dense and before:
+        arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_placed}
+        if attempt.loose and not attempt.dense and earlier:
             (out / ".before").mkdir(exist_ok=True)
-            before[0].write(str(out / ".before"))
+            earlier[0].write(str(out / ".before"))
             arguments["input_path"] = str(out / ".before")
-            count.reach(before[0].num_reg_images())
+            count.reach(earlier[0].num_reg_images())
         results = function(str(database), str(out / IMAGES), str(work), options=options, **arguments).values()
     models = [model for model in results if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
     return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def _fill_database(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str, str]]) -> Path:
+def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tuple[str, str]]) -> Path:
     """Fill the database of an attempt with features and matches, or continue one; return its path.
 
-    The pairs follow from the first database and the earlier model, so they are the same after a killed call.
+    The pairs depend only on the first database and the earlier model, so they are the same after a killed call.
     """
     database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():
@@ -192,7 +192,7 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, more: Sequence[tup
         add_features(source / IMAGES, database, DENSER)
         match_database(database, pairing)
     if attempt.dense or attempt.wider:
-        match_pairs(database, more, pairing.threads)
+        match_pairs(database, pairs, pairing.threads)
     return database
 
 
@@ -201,14 +201,14 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed, others, seen = _names(best), list[int](), set[str]()
+    placed, new_counts, counted = _names(best), list[int](), set[str]()
     for model in models:
-        others.append(len(_names(model) - seen))
-        seen |= _names(model)
+        new_counts.append(len(_names(model) - counted))
+        counted |= _names(model)
     return {
         "registered": len(placed),
         "not_registered": [name for name in names if name not in placed],
-        "other_models": [count for count in others[1:] if count],  # photographs that are in no larger model
+        "other_models": [count for count in new_counts[1:] if count],  # photographs that are in no larger model
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
@@ -219,9 +219,9 @@ def _names(*models: Any) -> set[str]:
 
 
 def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
-    """Triangulate the points of a model again, including points seen in only two photographs; keep its cameras.
+    """Triangulate the points of a model again, with points seen in only two photographs; keep its cameras.
 
-    database: the features and matches of the model; out: the folder with the images.
+    database: features and matches of the model.  out: folder with the images.
     """
     pycolmap = require_pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
@@ -230,11 +230,11 @@ def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.min_angle = options.mapper.filter_min_tri_angle = PAIR_ANGLE
     pycolmap.set_random_seed(0)
-    with tempfile.TemporaryDirectory(dir=out) as work, explained(out / IMAGES, "triangulate the points"):
-        points = pycolmap.triangulate_points(
+    with tempfile.TemporaryDirectory(dir=out) as work, raising_data_error(out / IMAGES, "triangulate the points"):
+        refined = pycolmap.triangulate_points(
             model, str(database), str(out / IMAGES), work, clear_points=True, options=options
         )
-    loose = [i for i, p in points.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
-    for number in loose:
-        points.delete_point3D(number)
-    return points
+    inaccurate = [i for i, p in refined.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
+    for number in inaccurate:
+        refined.delete_point3D(number)
+    return refined

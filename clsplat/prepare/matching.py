@@ -24,26 +24,26 @@ from clsplat.prepare.database import (
     IMAGES,
     MATCHING,
     PAIRS,
-    explained,
+    count_matched_pairs,
     image_names,
-    opened,
-    pairs_done,
+    open_database,
+    raising_data_error,
     require_pycolmap,
-    verified,
+    verified_pairs,
 )
 from clsplat.prepare.gather import link
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 MAX_EXHAUSTIVE = 200  # photographs up to which `auto` matches all pairs: the time grows with the square
-WORDS = 1024  # of a vocabulary learned from the photographs (Sivic and Zisserman 2003)
-SAMPLES = 40  # descriptors per word that k-means sees
+WORDS = 1024  # in the vocabulary learned from the photographs (Sivic and Zisserman 2003)
+SAMPLES = 40  # descriptors per word for k-means
 ROUNDS = 10  # iterations of k-means
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which pairs are matched, and with how many threads; see match_features."""
+    """Selection of the pairs to match, and the number of threads; see match_features."""
 
     matching: Matching = "auto"
     neighbors: int = 10
@@ -61,108 +61,108 @@ def match_features(
     """Match features between photographs: of all pairs, or of each with its next `neighbors` by name or similarity.
 
     `auto` matches all pairs of up to 200 photographs, and otherwise each photograph with the most similar ones.  More
-    than one thread is faster but not bit-identical: about one call in a hundred of pycolmap 4.2 gives two pairs other
-    matches.
+    than one thread is faster but not bit-identical: in about one of a hundred calls of pycolmap 4.2, two pairs get
+    different matches.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
     database = out / DATABASE
-    if not database.exists():  # an existing one continues: its pairs are not matched again
+    if not database.exists():  # pairs in an existing database are not matched again
         partial = out / f".{DATABASE}"
         shutil.copyfile(source / DATABASE, partial)
         partial.replace(database)
     pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
     chosen = match_database(database, pairing)
-    return {"matching": chosen, "pairs": len(verified(pycolmap, database))}
+    return {"matching": chosen, "pairs": len(verified_pairs(pycolmap, database))}
 
 
-def most_pairs(photographs: int, matching: Matching, neighbors: int) -> int:
+def max_pair_count(photographs: int, matching: Matching, neighbors: int) -> int:
     """Return the largest number of pairs that match_features matches."""
-    every = photographs * (photographs - 1) // 2
+    all_pairs = photographs * (photographs - 1) // 2
     is_exhaustive = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
-    return every if is_exhaustive else min(every, 2 * neighbors * photographs)
+    return all_pairs if is_exhaustive else min(all_pairs, 2 * neighbors * photographs)
 
 
-def match_database(database: Path, how: Pairing) -> Matching:
+def match_database(database: Path, pairing: Pairing) -> Matching:
     """Match the pairs of a database that are not matched yet, as match_features does; return the matching used.
 
-    Raises DataError.
+    Raises DataError when pycolmap fails.
     """
     pycolmap = require_pycolmap()
-    count, matching, neighbors = len(image_names(pycolmap, database)), how.matching, how.neighbors
+    count, matching, neighbors = len(image_names(pycolmap, database)), pairing.matching, pairing.neighbors
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
-    common = _options(pycolmap, how.threads)
-    with explained(database, "match photographs"):
+    common = _options(pycolmap, pairing.threads)
+    with raising_data_error(database, "match photographs"):
         if chosen == "sequential":
-            pairing = pycolmap.SequentialPairingOptions()
-            pairing.overlap, pairing.quadratic_overlap = neighbors, True
+            options = pycolmap.SequentialPairingOptions()
+            options.overlap, options.quadratic_overlap = neighbors, True
             LOG.info("matching %d photographs, each with the next %d by name", count, neighbors)
             steps = {*range(1, neighbors + 1), *(1 << power for power in range(neighbors))}
-            with _counted(database, sum(max(0, count - step) for step in steps)):
-                pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
+            with _count_pairs(database, sum(max(0, count - step) for step in steps)):
+                pycolmap.match_sequential(str(database), pairing_options=options, **common)
         elif chosen == "vocabulary":
             LOG.info("matching %d photographs, each with the %d most similar", count, 2 * neighbors)
-            pairs = _alike_pairs(pycolmap, database, 2 * neighbors)
-            with _counted(database, len(pairs)):
+            pairs = _find_similar_pairs(pycolmap, database, 2 * neighbors)
+            with _count_pairs(database, len(pairs)):
                 _match_listed(database, pairs, common)
         else:
             LOG.info("matching all pairs of %d photographs", count)
-            with _counted(database, count * (count - 1) // 2):
+            with _count_pairs(database, count * (count - 1) // 2):
                 pycolmap.match_exhaustive(str(database), **common)
     return chosen
 
 
 def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) -> None:
-    """Match the given pairs of a database that are not matched yet.  Raises DataError."""
+    """Match those of the given pairs that are not matched yet.  Raises DataError when pycolmap fails."""
     pycolmap = require_pycolmap()
-    with opened(pycolmap, database) as rows:
+    with open_database(pycolmap, database) as rows:
         numbers = {image.name: image.image_id for image in rows.read_all_images()}
         missing = [(a, b) for a, b in pairs if not rows.exists_two_view_geometry(numbers[a], numbers[b])]
         done = rows.num_matched_image_pairs()
     if not missing:
         return
     LOG.info("matching %s of photographs that are not placed yet", pluralize(len(missing), "more pair"))
-    with explained(database, "match photographs"), _counted(database, done + len(missing)):
+    with raising_data_error(database, "match photographs"), _count_pairs(database, done + len(missing)):
         _match_listed(database, missing, _options(pycolmap, threads))
 
 
-def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
-    """Return further pairs, each with a photograph of `left_out`, that `match_database` has not matched.
+def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
+    """Return pairs with at least one `unplaced` photograph that `match_database` has not matched.
 
-    Matching at most doubles the number of matched pairs: when there are more candidates, each unplaced photograph is
-    paired only with the most similar ones, at least one.
+    They at most double the number of matched pairs: when there are more candidates, each unplaced photograph is paired
+    only with the most similar ones, at least one.
     """
     pycolmap = require_pycolmap()
-    with opened(pycolmap, database) as rows:
+    with open_database(pycolmap, database) as rows:
         images = sorted(rows.read_all_images(), key=lambda image: image.name)
-        most = rows.num_matched_image_pairs()
-        if most == len(images) * (len(images) - 1) // 2:
+        max_pairs = rows.num_matched_image_pairs()
+        if max_pairs == len(images) * (len(images) - 1) // 2:
             return []
-        if spaced := [image.name for image in images if _is_spaced(image.name)]:
+        if invalid := [image.name for image in images if _has_space(image.name)]:
             LOG.warning(
-                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", spaced[0]
+                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", invalid[0]
             )
-            images = [image for image in images if not _is_spaced(image.name)]
-        is_left = [image.name in left_out for image in images]
+            images = [image for image in images if not _has_space(image.name)]
+        wanted = [image.name in unplaced for image in images]
         candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
-            if (is_left[i] or is_left[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
+            if (wanted[i] or wanted[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
-        if len(candidates) > most:
-            close = similarity(_descriptors(rows, images))
-            candidates = _closest(candidates, close, is_left, max(1, most // sum(is_left)))
+        if len(candidates) > max_pairs:
+            similarities = similarity(_descriptors(rows, images))
+            candidates = _closest(candidates, similarities, wanted, max(1, max_pairs // sum(wanted)))
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 
 def _closest(
-    pairs: Sequence[tuple[int, int]], close: NDArray[np.float64], is_left: Sequence[bool], count: int
+    pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], unplaced: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
-    """Return the pairs of each left-out photo with the `count` photographs most similar to it."""
-    counts, chosen = [0] * len(is_left), []
-    for i, j in sorted(pairs, key=lambda pair: -close[pair]):
-        if any(is_left[k] and counts[k] < count for k in (i, j)):
+    """Return the pairs of each unplaced photograph with the `count` photographs most similar to it."""
+    counts, chosen = [0] * len(unplaced), []
+    for i, j in sorted(pairs, key=lambda pair: -similarities[pair]):
+        if any(unplaced[k] and counts[k] < count for k in (i, j)):
             chosen.append((i, j))
             counts[i] += 1
             counts[j] += 1
@@ -177,20 +177,20 @@ def _options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
 
 def _match_listed(database: Path, pairs: Sequence[tuple[str, str]], options: dict[str, Any]) -> None:
     pycolmap = require_pycolmap()
-    listed = database.with_name(PAIRS)
-    write_text(listed, "".join(f"{a} {b}\n" for a, b in pairs))
-    imported = pycolmap.ImportedPairingOptions()
-    imported.match_list_path = listed
-    pycolmap.match_image_pairs(str(database), pairing_options=imported, **options)
+    list_file = database.with_name(PAIRS)
+    write_text(list_file, "".join(f"{a} {b}\n" for a, b in pairs))
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = list_file
+    pycolmap.match_image_pairs(str(database), pairing_options=pairing, **options)
 
 
-def _alike_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
-    with opened(pycolmap, database) as rows:
+def _find_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
+    with open_database(pycolmap, database) as rows:
         images = sorted(rows.read_all_images(), key=lambda image: image.name)
         tables = _descriptors(rows, images)
-    if spaced := [image.name for image in images if _is_spaced(image.name)]:
+    if invalid := [image.name for image in images if _has_space(image.name)]:
         raise DataError(
-            f"'{spaced[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
+            f"'{invalid[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
     return [(images[i].name, images[j].name) for i, j in similar_pairs(tables, neighbors)]
 
@@ -199,24 +199,24 @@ def _descriptors(rows: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
     return [np.asarray(rows.read_descriptors(image.image_id).data, np.float32) for image in images]
 
 
-def _is_spaced(name: str) -> bool:
+def _has_space(name: str) -> bool:
     return len(name.split()) > 1
 
 
 @contextmanager
-def _counted(database: Path, pairs: int) -> Iterator[None]:
+def _count_pairs(database: Path, pairs: int) -> Iterator[None]:
     """Count the pairs that pycolmap matches in the block."""
     count = Count("pairs matched", pairs)
-    with polled(count, lambda: pairs_done(database)):
+    with polled(count, lambda: count_matched_pairs(database)):
         yield
     count.reach(pairs)
 
 
 def similar_pairs(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
     """Return the pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones."""
-    close = similarity(tables)
-    np.fill_diagonal(close, -1)
-    nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
+    similarities = similarity(tables)
+    np.fill_diagonal(similarities, -1)
+    nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
 
 
@@ -245,7 +245,7 @@ def similarity(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
 
 
 def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Centers of k-means, [at most WORDS, 128]."""
+    """Return the centers of k-means, [at most WORDS, 128]."""
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)
     count, labels = min(WORDS, len(sample)), np.empty(0, np.int32)

@@ -1,4 +1,4 @@
-"""Detect cameras that only rotated in place: their photographs have no parallax, and any depth would be invented.
+"""Detect cameras that only rotated in place: their photographs have no parallax, so that depth is unknown.
 
 Photographs of a camera that rotates by R are related by the homography H = K R K⁻¹ (Hartley and Zisserman 2004, 13.2),
 so K⁻¹ H K is a rotation for all pairs, with one focal length.  A plane that fills the photographs also gives
@@ -16,40 +16,40 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.prepare.database import opened
+from clsplat.prepare.database import open_database
 from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
 MAX_PAIRS = 120  # tested pairs, evenly spaced in the order of their matches
-NEAR = 3.0  # px: largest residual of a match that a homography explains, and motion of a static point
-EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
+MAX_RESIDUAL = 3.0  # px: largest residual of a match that a homography explains, and motion of a static point
+MIN_EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
 FOCALS = np.geomspace(0.4, 4.0, 47)  # focal lengths to try, as fractions of the longer side
 MAX_DEVIATION = 0.1  # of K⁻¹ H K from a rotation, relative to its deviation from the identity
-WALK = "so depth cannot be estimated; walk around the scene, taking a photograph every step"
-ROTATED = f"look as if the camera only rotated in place, {WALK}"
-SAME = f"are all the same, {WALK}"
+REMEDY = "so depth cannot be estimated; walk around the scene, taking a photograph every step"
+ROTATED = f"look as if the camera only rotated in place, {REMEDY}"
+SAME = f"are all the same, {REMEDY}"
 Floats = NDArray[np.float64]
 
 
-def why_no_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
+def no_depth_reason(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
     """Return why depth cannot be estimated from all or the named photographs, in words; "" if it may be possible.
 
     It tests all good pairs, since the best pair of each photograph may come from one of several viewpoints.  It does
-    not test a model, since COLMAP invents one for a rotating camera, whose points have angles of a few degrees.
-    Pairs of less than half of the photographs decide nothing, since further attempts may find more pairs.
+    not test a model, since COLMAP invents one for a rotating camera, whose points have angles of a few degrees.  If the
+    pairs cover less than half of the photographs, it returns "", since further attempts may find more pairs.
     """
-    with opened(pycolmap, database) as rows:
-        images = {image.image_id: image.name for image in rows.read_all_images()}
-        chosen = {number: name for number, name in images.items() if names is None or name in names}
+    with open_database(pycolmap, database) as rows:
+        all_names = {image.image_id: image.name for image in rows.read_all_images()}
+        chosen = {number: name for number, name in all_names.items() if names is None or name in names}
         pairs = _good_pairs(pycolmap, rows, chosen.keys())
         if not chosen or 2 * len({number for pair in pairs for number in pair.photographs}) < len(chosen):
             return ""
         moving = [pair for pair in pairs if not _is_still(*pair.points())]
         if not moving:
-            still = [(chosen[a], chosen[b]) for a, b in (pair.photographs for pair in pairs)]
-            return SAME if len(connected_groups(chosen.values(), still)) == 1 else ""
+            still_pairs = [(chosen[a], chosen[b]) for a, b in (pair.photographs for pair in pairs)]
+            return SAME if len(connected_groups(chosen.values(), still_pairs)) == 1 else ""
         sample = moving[:: -(-len(moving) // MAX_PAIRS)]
         matrices = [matrix for pair in sample if (matrix := _homography(*pair.points())) is not None]
-    if len(matrices) < 2 or len(matrices) < EXPLAINED * len(sample):
+    if len(matrices) < 2 or len(matrices) < MIN_EXPLAINED * len(sample):
         return ""
     return ROTATED if min(_rotation_deviation(matrices, focal) for focal in FOCALS) < MAX_DEVIATION else ""
 
@@ -69,7 +69,7 @@ class _Pair:
 
 
 def _good_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> list[_Pair]:
-    """The pairs of the chosen photographs with enough matches, the most first."""
+    """Return the pairs of the chosen photographs with enough matches, those with the most matches first."""
     sizes = {camera.camera_id: np.array([camera.width, camera.height]) for camera in rows.read_all_cameras()}
 
     @cache
@@ -86,20 +86,20 @@ def _good_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> list[_Pair
 
 
 def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
-    """Whether two photographs show no motion, such as copies, which say nothing about the camera."""
-    return bool(np.median(np.linalg.norm(second - first, axis=1)) < NEAR * pixel)
+    """Return whether two photographs show no motion, as copies, which say nothing about the camera."""
+    return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel)
 
 
 def _homography(first: Floats, second: Floats, pixel: float) -> Floats | None:
-    """The homography that explains nearly all matches of a pair, in units of the longer side from the center."""
-    matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, NEAR * pixel)
-    if matrix is None or explained.mean() < EXPLAINED:
+    """Return the homography that explains nearly all matches of a pair, in units of the longer side from the center."""
+    matrix, inliers = cv2.findHomography(first, second, cv2.RANSAC, MAX_RESIDUAL * pixel)
+    if matrix is None or inliers.mean() < MIN_EXPLAINED:
         return None
     return np.asarray(matrix, np.float64)
 
 
 def _rotation_deviation(homographies: Sequence[Floats], focal: float) -> float:
-    """The median deviation of homographies from rotations for a focal length, relative to that from the identity."""
+    """Return the median deviation of homographies from rotations, relative to their deviation from the identity."""
     scale = np.diag([focal, focal, 1.0])
     deviations = []
     for matrix in homographies:

@@ -10,7 +10,7 @@ from clsplat.scene.images import read_exif_optics, read_header
 
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 Key = Callable[[Path, str], object]
-KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in common besides their size
+KEYS: dict[Cameras, Key] = {  # photographs of the same size share a camera if these keys are equal
     "auto": lambda images, name: read_exif_optics(images / name),
     "one": lambda images, name: None,
     "per_folder": lambda images, name: Path(name).parent,

@@ -12,7 +12,7 @@ from clsplat.prepare.database import require_pycolmap
 from clsplat.prepare.features import CameraModel, FeatureOptions, find_features
 from clsplat.prepare.gather import require_photographs, summarize_placement, warnings_for
 from clsplat.prepare.mapping import MAX_ATTEMPTS, Mapper, map_cameras
-from clsplat.prepare.matching import Matching, match_features, most_pairs
+from clsplat.prepare.matching import Matching, match_features, max_pair_count
 from clsplat.prepare.shared_intrinsics import Cameras
 from clsplat.prepare.undistort import UndefinedPixels, undistort_scene
 from clsplat.scene.detect import is_scene
@@ -24,35 +24,35 @@ class Step(Settings):
     """A step that makes a folder from a folder.  Its inputs, settings and `version` identify the result."""
 
     version: ClassVar[int] = 1  # increase it when the result changes
-    resumes: ClassVar[bool] = False  # whether `make` continues what an interrupted call left in `out`
-    seconds: ClassVar[tuple[float, float] | None] = None  # least and most time per item, a guess for estimates
+    resumes: ClassVar[bool] = False  # whether `make` continues from what an interrupted call left in `out`
+    seconds: ClassVar[tuple[float, float] | None] = None  # smallest and largest time per item, a guess for estimates
 
     stage: str
     """Name of the step."""
 
-    def check(self, source: Path, without: Path) -> None:
-        """Raise the errors of `make` that can be known at once, without writing anything.
+    def check(self, source: Path, excluded: Path) -> None:
+        """Raise the errors of `make` that can be detected before running it, without writing anything.
 
         Only the first step is checked, before any step runs.
         """
 
     def is_done_in(self, source: Path) -> bool:
-        """Return whether `source` needs neither this step nor later ones, as a scene that already has cameras."""
+        """Return whether `source` needs neither this step nor later ones, such as a scene that already has cameras."""
         return False
 
     def pieces(self, photographs: int) -> tuple[int, str]:
-        """Return how many items the step processes for a number of photographs, and what they are called."""
+        """Return how many items the step processes for a number of photographs, and the plural name of the items."""
         return photographs, "photographs"
 
     @abstractmethod
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        """Fill the folder `out` from `source`, without reading below `without`; return figures for the log.
+    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
+        """Fill the folder `out` from `source`, without reading below `excluded`; return figures for the log.
 
-        `out` is empty, or, for a step that `resumes`, holds what an interrupted call with the same inputs left.
+        `out` is empty, or, for a step that `resumes`, contains what an interrupted call with the same inputs left.
         """
 
     def summary(self, figures: dict[str, Any]) -> str:
-        """Return a line of the log about the figures that `make` returned."""
+        """Return a log line about the figures that `make` returned."""
         return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
@@ -76,21 +76,21 @@ class FindFeatures(Step):
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses, EQUIRECTANGULAR for panoramas."""
     cameras: Cameras = "auto"
-    """Which photographs of the same size share a camera; auto: those with the same lens in EXIF, or with none."""
+    """Photographs of the same size that share a camera; auto: those with the same lens in EXIF, or without a lens."""
 
     def is_done_in(self, source: Path) -> bool:
         return is_scene(source)
 
-    def check(self, source: Path, without: Path) -> None:
+    def check(self, source: Path, excluded: Path) -> None:
         if is_scene(source):
             raise DataError(f"{source}: already contains cameras; give a folder that contains only photographs")
-        require_photographs(source, without.resolve())
+        require_photographs(source, excluded.resolve())
         require_pycolmap()
 
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        self.check(source, without)
+    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
+        self.check(source, excluded)
         options = FeatureOptions(self.long_side, self.features)
-        return find_features(source, out, options, self.camera_model, self.cameras, without.resolve())
+        return find_features(source, out, options, self.camera_model, self.cameras, excluded.resolve())
 
     def summary(self, figures: dict[str, Any]) -> str:
         photographs = pluralize(figures["photographs"], "photograph")
@@ -109,16 +109,16 @@ class MatchFeatures(Step):
     stage: Literal["match_features"] = "match_features"
 
     matching: Matching = "auto"
-    """Which pairs of photographs are matched; auto: exhaustive, or vocabulary for more than 200 photographs."""
+    """Pairs of photographs to match; auto: exhaustive, or vocabulary for more than 200 photographs."""
     neighbors: Positive = 10
     """Number of photographs that each is matched with, unless matching is exhaustive."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not always bit-identical."""
 
     def pieces(self, photographs: int) -> tuple[int, str]:
-        return most_pairs(photographs, self.matching, self.neighbors), "pairs"
+        return max_pair_count(photographs, self.matching, self.neighbors), "pairs"
 
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbors, self.threads)
 
     def summary(self, figures: dict[str, Any]) -> str:
@@ -139,7 +139,7 @@ class MapCameras(Step):
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    """How cameras are placed in the first attempt: one after another, or all at once (global)."""
+    """How cameras are placed in the first attempt: one after another (incremental) or all at once (global)."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not bit-identical."""
     attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
@@ -149,7 +149,7 @@ class MapCameras(Step):
     """Number of photographs in which a point must be seen.  COLMAP drops points seen in only two; keeping them gave 2.5
     times as many points on one scene."""
 
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
 
     def summary(self, figures: dict[str, Any]) -> str:
@@ -171,9 +171,9 @@ class Undistort(Step):
     long_side: Positive | None = None
     """Longer side of the undistorted images in px; default: that of the photographs."""
     undefined_pixels: UndefinedPixels = "crop"
-    """Pixels that the photograph does not cover; crop: crop the image; mask: keep all of it and mask them."""
+    """What to do with pixels that the photograph does not cover: `crop` the image, or keep it whole and `mask` them."""
 
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
 
     def summary(self, figures: dict[str, Any]) -> str:

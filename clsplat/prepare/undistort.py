@@ -26,9 +26,9 @@ def undistort_scene(
     """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
 
     Photographs larger than `long_side` px are reduced.  `undefined_pixels: crop` keeps the largest part of a photograph
-    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call has made of
-    the same photographs with the same settings stay unchanged.
-    Raises DataError when the scene cannot be read, or when an image in `out` has another origin.
+    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call made from the
+    same photographs with the same settings stay unchanged.
+    Raises DataError when the scene cannot be read, or when `out` contains other images.
     """
     scene = read_scene(source, holdout=0)
     names, manifest = _png_names([view.name for view in scene.views]), Manifest(out)
@@ -36,12 +36,12 @@ def undistort_scene(
         manifest.require_listed(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
-        pinhole_view = replace(_reduced(_with_lens(view, undefined_pixels), long_side), alpha="mask")
+        pinhole_view = replace(_downscale(_with_lens(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if manifest.needs_writing(image, _source(pinhole_view), mask):
-            counts = load_mask(pinhole_view)
-            if counts is not None and not counts.all():
-                write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
+            unmasked = load_mask(pinhole_view)
+            if unmasked is not None and not unmasked.all():
+                write_image(mask, np.repeat(np.where(unmasked, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, name=name, lens=None))
         count.reach(number)
@@ -49,13 +49,13 @@ def undistort_scene(
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
     tracks = scene.tracks and scene.tracks.renamed({v.name: name for v, name in zip(scene.views, names, strict=True)})
-    world = replace(scene, views=tuple(views), tracks=tracks).in_world()
-    write_model(out / "sparse" / "0", world.views, world.points, world.tracks)
+    world_scene = replace(scene, views=tuple(views), tracks=tracks).in_world()
+    write_model(out / "sparse" / "0", world_scene.views, world_scene.points, world_scene.tracks)
     return len(views)
 
 
 def _source(view: View) -> str:
-    """Return a hash of everything that the pixels of an undistorted image and its mask depend on."""
+    """Return a hash of everything that an undistorted image and its mask depend on."""
     files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
     return hash_values(*files, view.lens, view.camera)
 
@@ -67,17 +67,17 @@ def _with_lens(view: View, undefined_pixels: UndefinedPixels) -> View:
     return replace(view, lens=lens, camera=lens.pinhole)
 
 
-def _reduced(view: View, long_side: int | None) -> View:
+def _downscale(view: View, long_side: int | None) -> View:
     """Return the view with no side longer than `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
     return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """Return the names with .png as their suffix, or appended where two names would be equal."""
-    short = [Path(name).with_suffix(".png").as_posix() for name in names]
-    counts = Counter(short)
-    chosen = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(short, names, strict=True)]
-    if len(set(chosen)) < len(chosen):
-        raise DataError(f"two images would be called '{Counter(chosen).most_common(1)[0][0]}'; rename one")
-    return chosen
+    """Return the names with the suffix .png, which is appended where two names would be equal otherwise."""
+    candidates = [Path(name).with_suffix(".png").as_posix() for name in names]
+    counts = Counter(candidates)
+    unique = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]
+    if len(set(unique)) < len(unique):
+        raise DataError(f"two images would be called '{Counter(unique).most_common(1)[0][0]}'; rename one")
+    return unique

@@ -30,7 +30,7 @@ LOG = logging.getLogger("clsplat")
 class Cleanup(Stage):
     """Remove Gaussians that the training views hardly show and that would be visible from elsewhere, such as floaters.
 
-    All rules see the model before the cleanup.  A Gaussian that two rules remove counts for the first.
+    All rules see the model before the cleanup.  A Gaussian that two rules would remove is counted for the first one.
     """
 
     stage: Literal["cleanup"] = "cleanup"
@@ -57,12 +57,12 @@ class Cleanup(Stage):
             if rule.start:
                 raise ValueError(f"the rule '{name}' has a 'start', but cleanup applies it once; remove 'start'")
             if read := sorted(rule.statistics | rule.tables):
-                raise ValueError(f"the rule '{name}' reads {', '.join(read)} of training steps; use it in densify")
+                raise ValueError(f"the rule '{name}' reads {', '.join(read)} from training; use it in densify")
         return rules
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
-        run.stats = SplatStats(gaussians, ())  # sums over steps do not fit the Gaussians after the cleanup
+        run.stats = SplatStats(gaussians, ())  # sums over earlier steps would not fit the Gaussians after the cleanup
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         step = max(run.step, 1)  # rules act after step 0
         edit = Edit(gaussians, run.stats, scale, step, run.seed, run.survey())
@@ -93,26 +93,28 @@ class Crop(Stage):
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
-        kept = np.flatnonzero(self.inside.shifted(run.scene.origin).contains(gaussians.get("means")))
-        if not len(kept):
-            raise EmptyRegionError(f"crop: none of {gaussians.count:,} Gaussians is inside the box; give a larger one")
-        change = keep_rows(gaussians, kept, self.stage)
+        rows = np.flatnonzero(self.inside.shifted(run.scene.origin).contains(gaussians.get("means")))
+        if not len(rows):
+            raise EmptyRegionError(
+                f"crop: none of the {gaussians.count:,} Gaussians is inside the box; give a larger box"
+            )
+        change = keep_rows(gaussians, rows, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
-        LOG.info("%s Gaussians kept, which are inside", f"{change.after:,} of {change.before:,}")
+        LOG.info("%s Gaussians are inside the box and kept", f"{change.after:,} of {change.before:,}")
 
 
-Part = Annotated[float, Field(gt=0, lt=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 
-def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
-    """Return a score of each Gaussian, [N], summed over the pixels of the training views.
+def score_gaussians(run: Run, score: Score = "weight") -> NDArray[np.float64]:
+    """Return the score of each Gaussian, [N], summed over the pixels of the training views.
 
-    "weight": its blend weight; otherwise the squared derivatives of the image with respect to its parameters.
+    score: "weight" sums blend weights; others sum squared derivatives of the image with respect to the Gaussian.
     """
     views = run.scene.split("train")
-    looks = run.survey().render(run.status.counted(views, "views", len(views)))
-    return SCORES[score](looks, run.model.gaussians.count).astype(np.float64)
+    renders = run.survey().render(run.status.counted(views, "views", len(views)))
+    return SCORES[score](renders, run.model.gaussians.count).astype(np.float64)
 
 
 class PruneLeast(Scheduled):
@@ -126,16 +128,16 @@ class PruneLeast(Scheduled):
     edits: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove", "score"})
 
-    keep: Part | None = None
+    keep: Fraction | None = None
     """Fraction of the Gaussians to keep; give this or `remove`."""
-    remove: Part | None = None
+    remove: Fraction | None = None
     """Fraction of the Gaussians to remove; give this or `keep`."""
     score: Score = "weight"
     """Sum of blend weights, or of squared derivatives of the image with respect to the Gaussian (Hanson et al.
     2025)."""
 
     @model_validator(mode="after")
-    def _one_share(self) -> "PruneLeast":
+    def _exactly_one(self) -> "PruneLeast":
         if (self.keep is None) == (self.remove is None):
             raise ValueError("give either 'keep' or 'remove', a fraction of the Gaussians")
         return self
@@ -144,24 +146,24 @@ class PruneLeast(Scheduled):
         return run.model.gaussians.trained
 
     def run(self, run: Run) -> None:
-        gaussians, score = run.model.gaussians, scores(run, self.score)
-        share = 1 - (self.remove or 0) if self.keep is None else self.keep
-        kept = np.flatnonzero(largest(score, max(1, round(share * len(score)))))
-        change = keep_rows(gaussians, kept, self.stage)
+        gaussians, score = run.model.gaussians, score_gaussians(run, self.score)
+        fraction = 1 - (self.remove or 0) if self.keep is None else self.keep
+        rows = np.flatnonzero(largest(score, max(1, round(fraction * len(score)))))
+        change = keep_rows(gaussians, rows, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
-        lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
+        lost = 100 * (1 - score[rows].sum() / (score.sum() or 1))
         LOG.info(
-            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(kept):,} of {len(score):,}", lost, self.score
+            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(rows):,} of {len(score):,}", lost, self.score
         )
 
 
 class ReduceSh(Scheduled):
-    """Drop bands of spherical harmonics: those above a degree, and the least important others.
+    """Drop bands of spherical harmonics: all bands above a degree, and the least important of the others.
 
     The importance of a Gaussian's band is the mean square of its color over all directions, times the Gaussian's weight
-    in the training views.  Bands dropped by `share` become zeros, which formats store in few bytes; later training
-    changes them again.
+    in the training views.  Bands dropped by `share` are set to zero, which compresses well; later training changes them
+    again.
     """
 
     stage: Literal["reduce_sh"] = "reduce_sh"
@@ -172,7 +174,7 @@ class ReduceSh(Scheduled):
     degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
     """Highest degree to keep, for all Gaussians."""
     share: Share = 0
-    """Fraction of all bands of all Gaussians that become zero, the least important ones."""
+    """Fraction of all bands of all Gaussians to set to zero, the least important ones."""
 
     def stale(self, run: Run) -> Collection[str]:
         return ("sh_rest",)
@@ -184,15 +186,15 @@ class ReduceSh(Scheduled):
         if not self.share or not gaussians.sh_degree:
             return
         rest = gaussians.get("sh_rest")
-        energy = band_energy(rest) * scores(run)[:, None]
+        energy = compute_band_energy(rest) * score_gaussians(run)[:, None]
         dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
-        gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
+        gaussians.set("sh_rest", np.where(expand_bands(dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
         LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
 
 
-def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
+def compute_band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the mean square over the sphere of each band above 0, [N, degree], of coefficients [N, (K-1)*3].
 
     The basis is orthonormal: the mean square of a function is the sum of its squared coefficients divided by 4 pi.
@@ -201,8 +203,8 @@ def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(rest.shape[1])], axis=1)
 
 
-def columns_of(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return for each coefficient whether its band, [N, degree], is set, [N, (K-1)*3]."""
+def expand_bands(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Repeat a flag per band, [N, degree], for each coefficient of the band, [N, (K-1)*3]."""
     widths = [3 * (2 * band + 3) for band in range(bands.shape[1])]
     return np.repeat(bands, widths, axis=1)
 

@@ -49,11 +49,10 @@ class Densify(Scheduled):
     """Box in which Gaussians grow; Gaussians outside are trained and pruned.  Default: everywhere."""
 
     patience: Annotated[int, Field(gt=0)] | None = None
-    """Number of consecutive measurements of the validation views without improvement after which growth ends, in a
-    training with `keep: best`, whose own patience then starts from zero; pruning continues.  Default: growth does not
-    end."""
+    """Number of consecutive measurements of the validation views without improvement after which growth ends; pruning
+    continues, and the patience of the training starts again.  Needs `keep: best`.  Default: growth does not end."""
     grow_until: Annotated[int, Field(gt=0)] | None = None
-    """Global step from which on nothing grows; pruning continues.  Default: growth does not end."""
+    """Global step at which growth ends; pruning continues.  Default: growth does not end."""
 
     @property
     def statistics(self) -> set[str]:
@@ -67,12 +66,12 @@ class Densify(Scheduled):
 
     @model_validator(mode="after")
     def _with_known_statistics(self) -> "Densify":
-        known = variants(Statistic)
+        statistics = variants(Statistic)
         for rule in self.rules:
-            if unknown := sorted(rule.statistics - known.keys()):
+            if unknown := sorted(rule.statistics - statistics.keys()):
                 name = getattr(rule, "type", type(rule).__name__)
                 raise ValueError(
-                    f"the rule '{name}' reads an unknown statistic '{unknown[0]}'; expected {', '.join(known)}"
+                    f"the rule '{name}' reads an unknown statistic '{unknown[0]}'; expected {', '.join(statistics)}"
                 )
         return self
 
@@ -98,23 +97,23 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        wanted = min(self._limits(run, edit), default=math.inf)
-        fits = most_gaussians(run, wanted)
-        limit = int(min(fits, wanted))
+        limit_by_settings = min(self._limits(run, edit), default=math.inf)
+        capacity = most_gaussians(run, limit_by_settings)
+        limit = int(min(capacity, limit_by_settings))
         room = partial(make_room, run)
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self._box(run), room)
         run.refresh_filter()
-        if change.after == fits:
+        if change.after == capacity:
             remedy = f"smaller photos{more_room(run)} leave room for more"
-            most = f"{fits:,} Gaussians, the most that fit in the device's memory; {remedy}"
+            most = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
 
-    def _has_grown(self, run: Run) -> bool:
-        """Return whether growth has ended, by its step or by validation; the run records the step."""
+    def _has_growth_ended(self, run: Run) -> bool:
+        """Return whether growth has ended, by `grow_until` or by `patience`; record the step in the run."""
         if self.grow_until is not None and run.step >= self.grow_until:
             return True
         best = run.best
@@ -130,13 +129,13 @@ class Densify(Scheduled):
         return self.inside and self.inside.shifted(run.scene.origin)
 
     def _outside(self, run: Run, edit: Edit) -> int:
-        """Return the number of Gaussians outside that box."""
+        """Return the number of Gaussians outside the box in which Gaussians grow."""
         box = self._box(run)
         return int((~box.contains(edit.gaussians.get("means"))).sum()) if box else 0
 
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
         """Yield the numbers of Gaussians at which the settings stop growth."""
-        if self._has_grown(run):
+        if self._has_growth_ended(run):
             yield 0
         if self.max_gaussians is not None:
             yield int(edit.at(self.max_gaussians)) + self._outside(run, edit)

@@ -53,7 +53,7 @@ class Evaluate(Scheduled):
     max_views: Annotated[int, Field(gt=0)] | None = None
     """Largest number of views to measure, evenly spaced; default: all."""
     downscales: Annotated[list[Downscale], Field(min_length=1)] | None = None
-    """Divisors of the original image size; default: the smallest one of the training."""
+    """Divisors of the original image size; default: the smallest divisor used in training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
     """Metrics in addition to LPIPS; psnr and ssim are required."""
     lpips: InputPath | None = None
@@ -87,7 +87,9 @@ class Evaluate(Scheduled):
 
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
-            if self.split != "test" or run.pipeline["scene"]["holdout"] != 0:  # no warning if the user wants none
+            if (
+                self.split != "test" or run.pipeline["scene"]["holdout"] != 0
+            ):  # no warning if the user wants no test views
                 key = "holdout" if self.split == "test" else "validation"
                 LOG.warning("no %s views: nothing to evaluate; scene.%s selects them", self.split, key)
             return
@@ -95,7 +97,7 @@ class Evaluate(Scheduled):
         for downscale in self.downscales or [run.downscale]:
             candidates = learned_scene(run).downscaled(downscale).split(self.split)
             views = sample_views(candidates, self.max_views or len(candidates))
-            photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
+            photographs = run.photographs if downscale in run.scene.downscales else run.photographs.empty_copy()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             trained, colors = run.scene.split("train"), color_model(run)
             results = measure(painter, views, photographs, perceptual, colors=colors, counted=counted, trained=trained)

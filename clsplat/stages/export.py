@@ -20,7 +20,7 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 
-WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # files only; SOG may be a folder too
+ENDINGS = tuple(ending for ending in endings() if ending.startswith("."))  # files only; SOG may be a folder too
 LOG = logging.getLogger("clsplat")
 
 
@@ -28,16 +28,16 @@ class Export(Scheduled):
     """Write the model in the format that the file name ends in, by default a PLY, and read it back.
 
     A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
-    in its name, holds the model as trained, with the filter as property `filter_3D`.  A learned sky is written next to
-    them, with `_sky.json` in its name, which only clsplat reads, or as Gaussians of the model.
+    in its name, holds the model as trained, with the filter as property `filter_3D`.  A learned sky is written as
+    Gaussians of the model, or to a file next to it, with `_sky.json` in its name, which only clsplat reads.
     """
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality", "sky"}
 
-    file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
-    """Path inside the run folder; its ending is the format: .ply, .spz, .sog, .glb, .splat, .usda."""
+    file: Annotated[str, path_in_run(*ENDINGS)] = "point_cloud.ply"
+    """Path inside the run folder; its ending selects the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""
     sky: Literal["sidecar", "splats"] = "sidecar"
@@ -70,15 +70,15 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw] = model
         options = Writing(quality=self.quality)
-        for file, saved in files.items():
-            run.model_hashes[_name(file, run)] = saved.save(file, options)
+        for file, written in files.items():
+            run.model_hashes[_name(file, run)] = written.save(file, options)
             try:
                 if writing_format(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
-            of_sky = f" and {sky:,} of the sky" if sky else ""
-            LOG.debug("%s Gaussians%s written to %s", f"{len(saved) - sky:,}", of_sky, file)
+            sky_text = f" and {sky:,} of the sky" if sky else ""
+            LOG.debug("%s Gaussians%s written to %s", f"{len(written) - sky:,}", sky_text, file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)
@@ -114,7 +114,7 @@ class Cameras(Stage):
 
 
 class Checkpoint(Scheduled):
-    """Save everything that a resumed run needs to reach the same bits; also after the last step, to train longer."""
+    """Save everything that a resumed run needs to give the same bits; also after the last step, to train longer."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})

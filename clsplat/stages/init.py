@@ -21,7 +21,7 @@ from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
 from clsplat.scene.viewpoint import random_points, scene_box, scene_center
 from clsplat.scene.visual_hull import hull_points
-from clsplat.stages.init_motion import moving, require_times, with_motion
+from clsplat.stages.init_motion import add_motion, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.modules.sky_choice import start_sky
 from clsplat.training.run import Run
@@ -35,35 +35,35 @@ MIN_USABLE = 100  # with fewer points from a sweep or a hull, random ones are us
 
 
 def scene_points(scene: Scene) -> PointCloud:
-    """Return the points of a scene.  Raises DataError if it has none, or all are behind its cameras."""
+    """Return the points of a scene.  Raises DataError if it has no points, or if all are behind its cameras."""
     if scene.points is None:
         raise DataError(f"{scene.path}: the scene has no points; use init: {{source: sweep}}")
     require_points_in_front(scene.points, scene)
     return scene.points
 
 
-def swept(run: Run, count: int) -> PointCloud:
-    """Return at most `count` points of a sweep over the training photos."""
+def sweep_photos(run: Run, count: int) -> PointCloud:
+    """Return at most `count` points from a plane sweep over the training photos."""
     views = _views(run)
     return swept_points(views, scene_center(views), load_image, count, run.seed)
 
 
-def points_and_sweep(run: Run, count: int) -> PointCloud:
-    """Return the scene's points, and at most `count` points of a sweep that add to them.
+def points_with_sweep(run: Run, count: int) -> PointCloud:
+    """Return the scene's points and at most `count` additional points from a plane sweep.
 
     Transparent and masked pixels give no points.  Raises DataError if the scene has no points.
     """
     points, views = scene_points(run.scene), _views(run)
-    known = points.positions.astype(np.float64)
-    new = swept_points(views, scene_center(views), load_image, count, run.seed, known, opaque_pixels)
+    positions = points.positions.astype(np.float64)
+    new = swept_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
     if not len(new):
         LOG.warning("the plane sweep found no additional points; starting from the scene's points only")
     return points.joined(new)
 
 
-def enough_swept(run: Run, count: int) -> PointCloud | None:
-    """Return the points of `swept`, or None, with a warning, if there are too few."""
-    points = swept(run, count)
+def try_sweep(run: Run, count: int) -> PointCloud | None:
+    """Return the points of `sweep_photos`, or None, with a warning, if there are too few."""
+    points = sweep_photos(run, count)
     if len(points) < MIN_USABLE:
         remedy = "photos taken closer together give more"
         LOG.warning("the plane sweep found only %d points; starting from random ones; %s", len(points), remedy)
@@ -71,7 +71,7 @@ def enough_swept(run: Run, count: int) -> PointCloud | None:
     return points
 
 
-def on_hull(run: Run, count: int) -> PointCloud | None:
+def sample_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the visual hull, or None, with a warning, if there are too few."""
     points = hull_points(_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
@@ -145,7 +145,7 @@ class Init(Stage):
         require_times(run.scene, run.model_settings.time)
         parameters, source = self._parameters(run, degree)
         gaussians = Gaussians(run.device, parameters)
-        run.adam, run.stats, run.metrics = None, None, {}  # they belong to an earlier model
+        run.adam, run.stats, run.metrics = None, None, {}  # those of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source == "model" else 0)
         run.refresh_filter()
         start_sky(run, load(Path(self.file)) if source == "model" and self.file else None)
@@ -160,13 +160,13 @@ class Init(Stage):
         if source == "model":
             return len(self._read(scene)["means"])
         if source in ("points", "points+sweep"):
-            return (0 if scene.points is None else len(scene.points)) + self.sweep_points * self._is_joined(scene)
+            return (0 if scene.points is None else len(scene.points)) + self.sweep_points * self._adds_sweep(scene)
         return self.sweep_points if source == "sweep" else self.count
 
-    def _is_joined(self, scene: Scene) -> bool:
-        """Return whether points of a sweep are added to those of the scene."""
-        few = scene.points is not None and len(scene.points) < self.min_points
-        return self.source == "points+sweep" or (self.source == "auto" and few and not is_transparent(scene))
+    def _adds_sweep(self, scene: Scene) -> bool:
+        """Return whether points from a plane sweep are added to the scene's points."""
+        has_few_points = scene.points is not None and len(scene.points) < self.min_points
+        return self.source == "points+sweep" or (self.source == "auto" and has_few_points and not is_transparent(scene))
 
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
@@ -193,20 +193,22 @@ class Init(Stage):
             parameters = with_degree(self._read(run.scene), degree)
             return with_motion(parameters, run.model_settings.time, str(self.file)), source
         sources: dict[str, Callable[[], PointCloud | None]] = {
-            "sweep": lambda: enough_swept(run, self.sweep_points),
-            "hull": lambda: on_hull(run, self.count),
+            "sweep": lambda: try_sweep(run, self.sweep_points),
+            "hull": lambda: sample_hull(run, self.count),
             "points": lambda: scene_points(run.scene),
-            "points+sweep": lambda: points_and_sweep(run, self.sweep_points),
+            "points+sweep": lambda: points_with_sweep(run, self.sweep_points),
         }
         points = sources[source]() if source in sources else None
         if points is None:
             points, source = self._random(run), "random"
-        if source == "points" and self._is_joined(run.scene):
-            points, source = points.joined(swept(run, self.sweep_points)), "points+sweep"
+        if source == "points" and self._adds_sweep(run.scene):
+            points, source = points.joined(sweep_photos(run, self.sweep_points)), "points+sweep"
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale, run.scene.extent)
-        seen = points.times if self.times == "per_frame" else None
-        return moving(parameters, run.model_settings.time, seen, (self.duration, self.min_duration), run.seed), source
+        times = points.times if self.times == "per_frame" else None
+        return add_motion(
+            parameters, run.model_settings.time, times, (self.duration, self.min_duration), run.seed
+        ), source
 
     def _read(self, scene: Scene) -> Parameters:
         assert self.file is not None  # as `check` requires
@@ -223,6 +225,6 @@ class Init(Stage):
         run.memory_plan(tables, last_place(run.harmonics, run.device.info)).check(count, more_room(run))
 
     def _random(self, run: Run) -> PointCloud:
-        """Return random points.  Raises MemoryLimitError, before making any, if that many do not fit."""
+        """Return random points.  Raises MemoryLimitError, before making any, if they would not fit."""
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)

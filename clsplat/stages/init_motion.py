@@ -10,9 +10,9 @@ from clsplat.gaussians.motion import static_motion
 from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
-STREAM = 4  # of random numbers, apart from that of the points
+STREAM = 4  # of random numbers, different from the stream of the points
 NEIGHBORS = 16  # whose timestamps decide whether a point is static (ours)
-STATIC_SPREAD = 0.18  # of these timestamps, above which a point is static (ours); below, it moves as its neighbors do
+STATIC_SPREAD = 0.18  # of these timestamps, above which a point is static (ours); below, it moves with its neighbors
 
 
 def require_times(scene: Scene, motion: Motion | None) -> None:
@@ -20,21 +20,23 @@ def require_times(scene: Scene, motion: Motion | None) -> None:
     if motion is None:
         return
     if missing := [view.name for view in scene.views if view.time is None]:
-        which = "its views have no timestamps" if len(missing) == len(scene.views) else f"{missing[0]} has no timestamp"
+        problem = (
+            "its views have no timestamps" if len(missing) == len(scene.views) else f"{missing[0]} has no timestamp"
+        )
         raise DataError(
-            f"{scene.path}: {which}, which `model.time` needs; give a timestamp for each photograph "
+            f"{scene.path}: {problem}, which `model.time` needs; give a timestamp for each photograph "
             "(docs/moving.md), or use a pipeline for static scenes, such as splat_7k"
         )
 
 
-def moving(
+def add_motion(
     parameters: Parameters,
     motion: Motion | None,
-    seen: NDArray[np.floating] | None,
+    point_times: NDArray[np.floating] | None,
     durations: tuple[float, float],
     seed: int,
 ) -> Parameters:
-    """Return the tables of Gaussians with an initial motion if `motion` lets them move, or else unchanged.
+    """Return the tables of Gaussians with an initial motion, or unchanged if `motion` is None.
 
     seen: [N] timestamps at which their points were seen; None: random ones.  durations: of static Gaussians, and the
     shortest of moving ones, as fractions of the scene's duration.
@@ -45,9 +47,9 @@ def moving(
     table, fields = static_motion(count, motion.width), motion_fields(motion.width)
     times = np.random.default_rng([seed, count, STREAM]).uniform(0, 1, count)
     duration = np.full(count, np.log(durations[0]))
-    if seen is not None:
-        times = seen.astype(np.float64)
-        spread, velocities = drift(parameters["means"].astype(np.float64), times)
+    if point_times is not None:
+        times = point_times.astype(np.float64)
+        spread, velocities = estimate_motion(parameters["means"].astype(np.float64), times)
         is_static = spread > STATIC_SPREAD
         table[:, fields["velocity"]] = np.where(is_static, 0, velocities.T).T
         duration = np.log(np.where(is_static, durations[0], np.maximum(spread, durations[1])))
@@ -56,22 +58,22 @@ def moving(
     return {**parameters, MOTION: table}
 
 
-def drift(
+def estimate_motion(
     positions: NDArray[np.float64], times: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the spread and the velocity of the neighbors of each point.
 
     The spread is the standard deviation of their timestamps, [N]: 0.29 for static points that are seen at all times,
     less for moving ones.  The velocity is the least-squares slope of their positions over their timestamps, [N, 3],
-    scene units by the scene's duration.
+    scene units per duration of the scene.
     """
     nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
     nearest = nearest.reshape(len(positions), -1)
-    apart = times[nearest] - times[nearest].mean(axis=1, keepdims=True)
-    square = (apart**2).sum(axis=1)
-    along = (apart[:, :, None] * positions[nearest]).sum(axis=1)
-    velocities = np.divide(along, square[:, None], out=np.zeros_like(along), where=square[:, None] > 0)
-    return np.sqrt(square / nearest.shape[1]), velocities
+    offsets = times[nearest] - times[nearest].mean(axis=1, keepdims=True)
+    squares = (offsets**2).sum(axis=1)
+    products = (offsets[:, :, None] * positions[nearest]).sum(axis=1)
+    velocities = np.divide(products, squares[:, None], out=np.zeros_like(products), where=squares[:, None] > 0)
+    return np.sqrt(squares / nearest.shape[1]), velocities
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:

@@ -30,10 +30,10 @@ from clsplat.training.stage import Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
 LOG = logging.getLogger("clsplat")
-MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # of a training; steps from one to the next
+MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # per training; steps between two
 PSNR_AND_SSIM = ("psnr", "ssim")
 ROOMY = 8  # memory for this many times the initial Gaussians: growth rarely reaches the limit
-MAX_TRAINING_VIEWS = 8  # that are measured together with the validation views
+MAX_TRAINING_VIEWS = 8  # measured together with the validation views
 
 
 class ValidatedTraining(Training):
@@ -67,42 +67,44 @@ class ValidatedTraining(Training):
             )
         return self
 
-    def measuring(self, during: Sequence[Scheduled]) -> list[Evaluate]:
-        """Return the measurements that `keep: best` adds to `during`: of training views, then of validation views."""
+    def measurements(self, during: Sequence[Scheduled]) -> list[Evaluate]:
+        """Return the evaluations that `keep: best` adds to `during`: of training views, then of validation views."""
         if self.keep == "last":
             return []
-        listed = next((stage for stage in during if _validates(stage)), None)
-        parts = max(1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL))  # equal: the last step is measured
-        every = listed.every if listed else self.steps // parts
-        start, stop = (listed.start, listed.stop) if listed else (0, None)
+        listed_stage = next((stage for stage in during if _validates(stage)), None)
+        count = max(
+            1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL)
+        )  # equal intervals, so that the last step is measured
+        every = listed_stage.every if listed_stage else self.steps // count
+        start, stop = (listed_stage.start, listed_stage.stop) if listed_stage else (0, None)
         keys = {"metrics": [*PSNR_AND_SSIM], "every": every}
-        of_train = {"split": "train", "max_views": MAX_TRAINING_VIEWS, "start": start, "stop": stop}
-        train = Evaluate.model_validate({**keys, **of_train})
-        return [train] if listed else [train, Evaluate.model_validate({**keys, "split": "validation"})]
+        train_keys = {"split": "train", "max_views": MAX_TRAINING_VIEWS, "start": start, "stop": stop}
+        train = Evaluate.model_validate({**keys, **train_keys})
+        return [train] if listed_stage else [train, Evaluate.model_validate({**keys, "split": "validation"})]
 
     @property
     def min_steps(self) -> int:
-        """Smallest number of steps, including a refit: if no measurement is better than the first."""
+        """Smallest number of steps, including a refit, which is reached if no measurement is better than the first."""
         if self.patience is None:
             return self.steps
-        every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
+        every = self.measurements(getattr(self, "during", ()))[-1].every or self.steps
         return min(self.steps, fire_step(every, 1 + self.patience)) + (fire_step(every, 1) if self.refit else 0)
 
-    def in_order(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+    def order_stages(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return all stages of `during` in the order in which they run.
 
-        The measurements of `keep: best` come first, since they may end the training.
+        The evaluations of `keep: best` come first, since they may end the training.
         """
-        first = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
-        return [*self.measuring(during), *first]
+        ordered = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
+        return [*self.measurements(during), *ordered]
 
-    def begin_to_keep(self, run: Run) -> None:
+    def reset_best(self, run: Run) -> None:
         """Forget the best model of an earlier training.  Raises ConfigError if there are no validation views."""
         if self.keep == "last":
             return
         if not run.scene.split("validation"):
             raise ConfigError("optimize.keep: best needs validation views; set scene.validation=auto")
-        self.require_measured(run.step - run.stage_step)
+        self.require_measurement(run.step - run.stage_step)
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
 
@@ -114,38 +116,41 @@ class ValidatedTraining(Training):
             raise ConfigError(f"optimize.refit: expected a single stage that trains, got {number}")
         before = list(itertools.takewhile(lambda stage: stage is not self, trainings))
         if not any(getattr(stage, "patience", None) for stage in before):  # else the first step is unknown
-            self.require_measured(sum(stage.steps for stage in before))
+            self.require_measurement(sum(stage.steps for stage in before))
 
-    def require_measured(self, first: int) -> None:
-        """Raise ConfigError if `keep: best` measures nothing until the last step; first: global step before it."""
+    def require_measurement(self, first: int) -> None:
+        """Raise ConfigError if `keep: best` measures nothing until the last step.
+
+        first: global step before the training.
+        """
         if self.keep == "last":
             return
         last = first + self.steps
-        stages = [stage for stage in self.in_order(self.during) if _validates(stage)]
+        stages = [stage for stage in self.order_stages(self.during) if _validates(stage)]
         if not any(stage.due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs a measurement of the validation views until the last step; lower "
-                "the `every` of `evaluate` in `during`, or remove it: one is then added"
+                "the `every` of `evaluate` in `during`, or remove it to get a default one"
             )
 
     def after_stage(self, run: Run, stage: Scheduled) -> None:
-        """After a measurement of the validation views, keep the model if it is the best so far."""
+        """After an evaluation of the validation views, keep the model if it is the best so far."""
         if self.keep == "last" or not _validates(stage):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
         measured = [average.get(f"{run.downscale:g}", {}) for average in averages.values()]
-        train, validation = compared(measured)
+        train, validation = comparable_psnr(measured)
         if train is None or validation is None:  # measured at another size, or everything is masked
             return
-        best, now = run.best, Scores(step=run.step, train=train, validation=validation)
+        best, scores = run.best, Scores(step=run.step, train=train, validation=validation)
         if best is not None and not validation > best.measured.validation:
-            run.best = best.with_last(now)
+            run.best = best.with_last(scores)
             return
-        first_overfit = (best and best.first_overfit) or (now if now.is_overfit else None)
+        first_overfit = (best and best.first_overfit) or (scores if scores.is_overfit else None)
         tables, evaluations = copy_model(run), best.evaluations + 1 if best else 1
         copied = {split: dict(average) for split, average in averages.items()}
         run.best = Best(
-            measured=now,
+            measured=scores,
             degree=run.model.degree,
             metrics=copied,
             scalars=dict(run.scalars),
@@ -155,19 +160,19 @@ class ValidatedTraining(Training):
             evaluations=evaluations,
             since_best=0,
             first_overfit=first_overfit,
-            last=now,
+            last=scores,
             growth_ended=best.growth_ended if best else None,
         )
         run.best_tables = tables
 
     def has_ended(self, run: Run) -> bool:
-        """Return whether the training has no step left."""
+        """Return whether the training has no steps left."""
         best = run.best if self.keep == "best" and run.stage_step else None
         ended = best is not None and self.patience is not None and best.since_best >= self.patience
         return ended or run.stage_step >= self.steps
 
     def finish(self, run: Run) -> None:
-        """At the end of the training, replace the last model by the best one."""
+        """Replace the last model by the best one at the end of the training."""
         best = run.best
         if self.keep == "last" or best is None or best.ended is not None:
             return
@@ -182,10 +187,12 @@ class ValidatedTraining(Training):
         LOG.info("%s", run.best.text())
 
 
-def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of each of the averages, dB, or None: in the photographs' colors if all have it for all views."""
-    whole = all(average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured)
-    return [average.get("psnr_color" if whole else "psnr") for average in measured]
+def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
+    """Return the PSNR of each average, dB or None; in the photographs' colors if all averages have it for all views."""
+    has_color = all(
+        average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
+    )
+    return [average.get("psnr_color" if has_color else "psnr") for average in measured]
 
 
 def _validates(stage: Scheduled) -> bool:
@@ -200,8 +207,8 @@ def report(
 ) -> None:
     """Record a step and report it.
 
-    values: its loss, and its PSNR, dB.  seconds: of the steps since the last report.  distribution_every: steps between
-    records of the Gaussians' sizes and opacities.
+    values: loss and PSNR (dB) of the step.  seconds: of the steps since the last report.  distribution_every: steps
+    between records of the Gaussians' sizes and opacities.
     """
     count, (loss, psnr) = run.gaussians, values
     stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # median: the first step loads files
@@ -211,16 +218,16 @@ def report(
         run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
     run.records.write()
     forecast.add(run.step, psnr, count or 1, fmean(seconds))
-    left, known = forecast.seconds_left, forecast.growth_known
-    run.status.note(gaussians=count, seconds_left=round(left, 1))
-    run.on_progress(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))
+    seconds_left, is_known = forecast.seconds_left, forecast.growth_known
+    run.status.note(gaussians=count, seconds_left=round(seconds_left, 1))
+    run.on_progress(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, seconds_left, is_known))
 
 
 DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
 
 
 class Optimize(ValidatedTraining):
-    """Train for a number of steps, one view each (Kerbl et al. 2023).
+    """Train for a number of steps with one view each (Kerbl et al. 2023).
 
     Stages in `during` that edit the model run between two steps, so that other stages see the model before the edit.
     No edit follows the last step.  As in the reference code, a parameter is not updated in the step before its edit.
@@ -287,12 +294,12 @@ class Optimize(ValidatedTraining):
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; yields ViewGradients unless a step is skipped, valid until the next step."""
-        self.begin_to_keep(run)
+        self.reset_best(run)
         views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
-        if run.harmonics != "auto" or memory.host == 0:  # otherwise it was checked before the harmonics moved
+        if run.harmonics != "auto" or memory.host == 0:  # else it was checked before the harmonics moved to the host
             memory.check(count, more_room(run))
         is_tight = memory.host or memory.limit < ROOMY * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
@@ -314,7 +321,7 @@ class Optimize(ValidatedTraining):
                 seconds.clear()
             self.end_step(run)
             yield view
-        self.finish(run)  # a resumed run may have no step left
+        self.finish(run)  # a resumed run may have no steps left
         for module in trainer.modules:
             module.write(run)
 
@@ -333,7 +340,7 @@ class Optimize(ValidatedTraining):
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _trainer(self, run: Run, views: ViewSettings, last: int) -> StepTrainer:
+    def _trainer(self, run: Run, views: ViewSettings, last_step: int) -> StepTrainer:
         """Add moments, statistics and tables to the run's Gaussians, unless a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
@@ -345,8 +352,8 @@ class Optimize(ValidatedTraining):
         place_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates = self.rates.resolve(views.full_size(last))
-        states: list[ModuleState] = attach_modules(self.modules, run, last)
+        rates = self.rates.resolve(views.full_size(last_step))
+        states: list[ModuleState] = attach_modules(self.modules, run, last_step)
         trained = self.losses, rates, run.scene.extent, self.update
         return StepTrainer(*parts, *trained, modules=states)
 
@@ -381,9 +388,9 @@ class Optimize(ValidatedTraining):
         """Return the losses of a view, with gradients unless it is skipped, and the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
-        photograph = run.photographs.of_sizes(sample.view, sample.original, sample.number)
+        photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
-        run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
+        run.photographs.prefetch(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.differentiate(photograph, run.step, sample.transforms)

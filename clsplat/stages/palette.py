@@ -33,8 +33,8 @@ BLOCK = 1 << 16  # points on the device at a time, since they have many componen
 AT_ONCE = 1024  # vectors per launch, which fit in a core's cache
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
-UNSEEN = 0.05  # weight of all directions together next to the observed ones; 0.01 to 0.05 give lego the same errors
-FAINT = 1.0e-3  # share of the mean weight that a Gaussian gets which no view shows
+UNSEEN = 0.05  # weight of all directions together relative to the observed ones; 0.01 to 0.05 give lego the same errors
+FAINT = 1.0e-3  # weight of a Gaussian that no view shows, as a fraction of the mean weight
 ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego by 0.6 %
 
 
@@ -42,9 +42,9 @@ class PaletteSh(Scheduled):
     """Replace the harmonics of each Gaussian by a vector of a palette, as SOG stores them.
 
     Errors are weighted by their visibility in the training views: by the Gaussian's contribution, in the directions
-    from which it is seen, and after the base color, which the stage adapts, has absorbed part of them.  Training with a
-    rate of 0 for `sh_rest` then adapts the other tables, and the SOG stores the harmonics without loss.  Harmonics that
-    already form a palette keep it, rounded to the numbers that SOG can store.
+    from which it is seen, and after the base color has been adapted to absorb part of them.  Training with a rate of 0
+    for `sh_rest` then adapts the other tables, and the SOG stores the harmonics without loss.  Harmonics that already
+    form a palette keep it, rounded to the numbers that SOG can store.
     """
 
     stage: Literal["palette_sh"] = "palette_sh"
@@ -56,8 +56,7 @@ class PaletteSh(Scheduled):
     quality: Quality = "balanced"
     """Quality of the SOG: `small`, `balanced` or `high`, with at most 1,024, 4,096 and 16,384 vectors."""
     step: Annotated[float, Field(gt=0)] | None = None
-    """Step to which the coefficients are rounded, if that leaves at most 256 values; a larger step makes the file
-    smaller."""
+    """Step to which the coefficients are rounded, if at most 256 values result; larger steps make smaller files."""
 
     def stale(self, run: Run) -> Collection[str]:
         return "sh_base", "sh_rest"
@@ -79,11 +78,11 @@ class PaletteSh(Scheduled):
 
 
 class SharePalette(Scheduled):
-    """Move each vector of the palette to the mean of the harmonics of its Gaussians, and assign it to them again.
+    """Move each vector of the palette to the mean of its Gaussians' harmonics, and assign it to them again.
 
-    The mean is weighted by the contributions to the training views when `palette_sh` built the palette.  At a cadence
-    and with a rate for `sh_rest`, this trains the vectors.  Run it right after that training too, since no edit follows
-    the last step.
+    The mean is weighted by the contributions to the training views when `palette_sh` built the palette.  With a cadence
+    and a rate for `sh_rest`, this trains the vectors.  Run it right after that training too, since no edit follows the
+    last step.
     """
 
     stage: Literal["share_palette"] = "share_palette"
@@ -96,11 +95,13 @@ class SharePalette(Scheduled):
 
     def run(self, run: Run) -> None:
         if run.model.gaussians.sh_degree:
-            share(run.model.gaussians, "sh_rest")
+            average_clusters(run.model.gaussians, "sh_rest")
 
 
 def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the index of the vector, [E, c], with the largest dot product for each point, [N, c]; ties: the first."""
+    """Return for each point, [N, c], the index of the vector, [E, c], with the largest dot product, the first of equal
+    ones.
+    """
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     return np.concatenate([_most_alike(device, block, vectors) for block in blocks])
 
@@ -111,7 +112,9 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
     planes = np.zeros((components, stride), np.float32)
     planes[:, :count] = points.T
     entries = -(-len(vectors) // TOGETHER) * TOGETHER
-    padded = np.concatenate([vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)])  # the first counts
+    padded = np.concatenate(
+        [vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)]
+    )  # of equal ones, the first is chosen
     label, largest = device.empty(stride), device.empty(stride)
     uploaded, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(padded, np.float32))
     for first in range(0, entries, AT_ONCE):
@@ -132,7 +135,7 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
 
 @dataclass(frozen=True)
 class VisibleError:
-    """How much errors of the harmonics show in the training views, for N Gaussians with K coefficients above band 0.
+    """The visibility of errors of the harmonics in the training views; N Gaussians with K coefficients above band 0.
 
     A Gaussian is seen only from some directions.  With Y(d) the harmonics above band 0 in direction d, an error e of
     its coefficients changes its color there by Y(d) . e, and band 0 can absorb the mean m . e.  Summed over the views
@@ -185,10 +188,10 @@ class VisibleError:
     def palette(
         self, rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
     ) -> tuple[Floats, NDArray[np.int64]]:
-        """Improve a palette: return vectors, [E, 3 K], whose errors show less, and the index of each Gaussian's, [N].
+        """Improve a palette; return vectors, [E, 3 K], with less visible errors, and the label of each Gaussian, [N].
 
         This is Lloyd's iteration with the quadratic form of each Gaussian as its distance.  nearest: returns for
-        points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors stay as they are.
+        points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors do not change.
         """
         products = self.gradient(rest)
         points = self._points(products)
@@ -213,16 +216,16 @@ class VisibleError:
         """Return the optimal vector for the Gaussians of each label; sums are in the order of the Gaussians."""
         entries, size = len(vectors), self.mean.shape[1]
         i, j = np.triu_indices(size)
-        form, right = np.empty((entries, size, size)), np.empty(vectors.shape)
+        form, right_sides = np.empty((entries, size, size)), np.empty(vectors.shape)
         for index, (row, column) in enumerate(zip(i, j, strict=True)):
             sums = np.bincount(labels, self.form[index], minlength=entries)
             form[:, row, column] = form[:, column, row] = sums
         for component in range(vectors.shape[1]):
-            right[:, component] = np.bincount(labels, products[:, component], minlength=entries)
-        used, moved = np.bincount(labels, minlength=entries) > 0, vectors.copy()
-        solved = np.linalg.solve(form[used], right[used].reshape(-1, size, 3))
-        moved[used] = solved.reshape(-1, 3 * size)
-        return moved
+            right_sides[:, component] = np.bincount(labels, products[:, component], minlength=entries)
+        used, minima = np.bincount(labels, minlength=entries) > 0, vectors.copy()
+        solved = np.linalg.solve(form[used], right_sides[used].reshape(-1, size, 3))
+        minima[used] = solved.reshape(-1, 3 * size)
+        return minima
 
 
 def _with_squares(vectors: Floats) -> NDArray[np.float32]:
@@ -235,10 +238,10 @@ def _with_squares(vectors: Floats) -> NDArray[np.float32]:
 def visible_error(run: Run) -> VisibleError:
     """Return how visible errors of the harmonics are in the training views."""
     views, gaussians = run.scene.split("train"), run.model.gaussians
-    looks = run.survey().render(run.status.counted(views, "views", len(views)))
+    renders = run.survey().render(run.status.counted(views, "views", len(views)))
     positions = (view.position for view in views)
     coefficients = gaussians.tables["sh_rest"].components // 3
-    return VisibleError.from_views(zip(looks, positions, strict=False), gaussians.get("means"), coefficients)
+    return VisibleError.from_views(zip(renders, positions, strict=False), gaussians.get("means"), coefficients)
 
 
 # Clusters of Gaussians that share values: tables hold each Gaussian's cluster and weight.
@@ -254,7 +257,7 @@ def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDA
         gaussians.set(name, column[:, None])
 
 
-def share(gaussians: Gaussians, name: str) -> None:
+def average_clusters(gaussians: Gaussians, name: str) -> None:
     """Replace each row of a table by the weighted mean of its cluster's rows, summed in their order."""
     labels = gaussians.get(LABEL)[:, 0].astype(np.int64)
     order, first = np.argsort(labels, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(labels))])
@@ -300,8 +303,8 @@ class RoundTables(Stage):
         gaussians = run.model.gaussians
         tables = {name: gaussians.get(name) for name in self._changed()}
         if self.means:
-            p = {name: gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
-            tables["means"] = round_means(p["means"], p["log_scales"], log_weights(p), self.means)
+            params = {name: gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
+            tables["means"] = round_means(params["means"], params["log_scales"], log_weights(params), self.means)
         if self.quats:
             tables["quats"], tables["log_scales"] = round_quats(tables["quats"], tables["log_scales"], self.quats)
         if self.log_scales:

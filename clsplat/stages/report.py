@@ -38,10 +38,10 @@ MAX_NAMES = 3  # of photos in a sentence
 OUTLIER_DB = 5.0  # below the median of the views
 MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
 FEW_PHOTOS = 24  # for training
-AIMED_COSINE = 0.8  # between camera axes and the direction of the center, on average: cameras look at one point
-MIN_OFFSET = 0.3  # of the distance to the center, across the upward axis: cameras surround the center
+AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the center: cameras look at one point
+MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
 MIN_GAP = 40.0  # degrees around the center without a photo
-OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was not meant to be seen
+OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
 UNEVEN = 3.0  # times the median gap
 
 
@@ -63,10 +63,10 @@ def advice(run: Run) -> list[str]:
 
 def from_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> Iterator[str]:
     """Yield advice from the metrics of training views.  has_exposures: whether training learns exposures."""
-    if names := far_below({view.view: view.psnr for view in metrics}):
+    if names := find_outliers({view.view: view.psnr for view in metrics}):
         yield (
-            f"{_list(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos: look for blur, "
-            "wrong poses and moving objects; remove these photos, or mask the objects"
+            f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos: look "
+            "for blur, wrong poses and moving objects; remove these photos, or mask the objects"
         )
     gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
     gained = float(np.mean(gains)) if gains else 0.0
@@ -79,8 +79,8 @@ def from_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> 
 
 def from_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
     """Yield advice from the PSNR of test views, dB by name."""
-    if names := far_below(psnr):
-        yield f"{_list(names)}: much worse than the other test views; take more photos of what is visible there"
+    if names := find_outliers(psnr):
+        yield f"{_join_names(names)}: much worse than the other test views; take more photos of what is visible there"
 
 
 def from_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
@@ -88,19 +88,19 @@ def from_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
     number = len({view.name for view in train})
     if number < FEW_PHOTOS:
         yield f"only {pluralize(number, 'training photograph')}; show every part in at least five, from several sides"
-    if gap := widest_gap(views):
+    if gap := find_widest_gap(views):
         degrees, first, second = gap
         yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there"
 
 
-def far_below(psnr: Mapping[str, float]) -> list[str]:
+def find_outliers(psnr: Mapping[str, float]) -> list[str]:
     """Return the names of views far below the median, the worst first; psnr: dB, by name."""
     median = float(np.median(list(psnr.values()))) if psnr else 0.0
     return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - OUTLIER_DB]
 
 
-def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
-    """Return the widest gap between views around the point that they look at, degrees, and the views on its sides.
+def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
+    """Return the widest gap between views around the point that they look at, in degrees, and the views next to it.
 
     None if the views do not surround a point, if no gap stands out, and for an open side.
     """
@@ -108,29 +108,31 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
         return None
     centers = np.stack([view.position for view in views])
     axes = np.stack([view.world_to_camera[2, :3] for view in views])
-    from_middle = centers - nearest_to_axes(centers, axes, centers.mean(axis=0))
-    distances = np.linalg.norm(from_middle, axis=1)
-    angles, aside = _around(from_middle, up_direction(views))
-    aimed = -(axes * from_middle).sum(axis=1) / np.maximum(distances, 1e-12)
-    if aimed.mean() < AIMED_COSINE or np.median(aside / np.maximum(distances, 1e-12)) < MIN_OFFSET:
+    offsets = centers - nearest_to_axes(centers, axes, centers.mean(axis=0))
+    distances = np.linalg.norm(offsets, axis=1)
+    angles, radii = _cylindrical(offsets, up_direction(views))
+    cosines = -(axes * offsets).sum(axis=1) / np.maximum(distances, 1e-12)
+    if cosines.mean() < AIMED_COSINE or np.median(radii / np.maximum(distances, 1e-12)) < MIN_OFFSET:
         return None
     order = np.argsort(angles, kind="stable")
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
-    inner = np.where(gaps < OPEN_SIDE, gaps, 0.0)
-    widest = int(np.argmax(inner))
-    if inner[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
+    inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
+    widest = int(np.argmax(inner_gaps))
+    if inner_gaps[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
         return None
     return float(gaps[widest]), views[order[widest]].name, views[order[(widest + 1) % len(views)]].name
 
 
-def _around(offsets: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the angles around the upward axis, radians, and the distances from it, of offsets, [V, 3]."""
+def _cylindrical(
+    offsets: NDArray[np.floating], up: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return angles around the upward axis, radians, and distances from it, [V] each, of offsets, [V, 3]."""
     ahead = perpendicular(up)
     x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
     return np.arctan2(y, x), np.hypot(x, y)
 
 
-def _list(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     more = len(names) - MAX_NAMES
     return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
@@ -151,13 +153,13 @@ def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, Gaussians and times over the steps."""
     train = run.records.read("train")
     measured, trial = _measured(run), _measured(run, trial=True)
-    running = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
+    dash = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
     psnr = list(zip([r["step"] for r in train], moving_average([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
-    seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], running)
+    running_mean = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], dash)
     return safe_charts(
         [
-            curve("PSNR, dB", [seen, *measured]),
+            curve("PSNR, dB", [running_mean, *measured]),
             *([curve("PSNR before the refit, dB", trial)] if trial else []),
             curve("loss", [Line(line["loss"])], logarithmic=True),
             curve("Gaussians", [Line(line["gaussians"])]),
@@ -169,9 +171,9 @@ def training_charts(run: Run) -> list[Markup]:
 
 
 def _measured(run: Run, trial: bool = False) -> list[Line]:
-    """Return the measured PSNR of each split over steps, the last one if a step was measured twice.
+    """Return the measured PSNR of each split over steps; of a step that was measured twice, the last one.
 
-    trial: of the training before a refit.
+    trial: whether to return that of the training before a refit.
     """
     points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
     for line in run.records.read("evaluate", trial):
@@ -219,24 +221,24 @@ REMEDY = (
 
 
 def overfitting_note(run: Run) -> str:
-    """Compare the model at training views and at others, in words; "" if that is unknown or unremarkable."""
+    """Compare the model at training views and held-out views in words; "" if that is unknown or unremarkable."""
     if run.best:
         return run.best.text()
-    split, now = _psnr_elsewhere(run)
-    if now is None:
+    split, scores = _held_out_scores(run)
+    if scores is None:
         return ""
-    text = now.text(split)
-    return f"{text} {REMEDY}" if now.is_overfit else text if split == "validation" else ""
+    text = scores.text(split)
+    return f"{text} {REMEDY}" if scores.is_overfit else text if split == "validation" else ""
 
 
 def is_overfit(run: Run) -> bool:
     """Return whether the model is known to be overfit."""
-    now = run.best.measured if run.best else _psnr_elsewhere(run)[1]
-    return now is not None and now.is_overfit
+    scores = run.best.measured if run.best else _held_out_scores(run)[1]
+    return scores is not None and scores.is_overfit
 
 
-def _psnr_elsewhere(run: Run) -> tuple[str, Scores | None]:
-    """Return a split that was not trained on, and the last PSNR there and at training views.
+def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
+    """Return a split that was not trained on, and the last PSNR of its views and of training views.
 
     Validation views are preferred to test views; training views that were not measured count as in the log.
     """
@@ -278,16 +280,16 @@ class Times:
 
 
 def times(run: Run) -> Times | None:
-    """Return the times, or None if no step was sampled."""
+    """Return the mean time of each stage of a step, or None if no step was sampled."""
     samples = [r["stages"] for r in run.records.read("train") if r.get("stages")]
     totals: dict[str, float] = defaultdict(float)
     for sample in samples:
         for name, milliseconds in sample.items():
             totals[name] += milliseconds / len(samples)
-    whole = sum(totals.values())
-    if whole == 0:
+    total = sum(totals.values())
+    if total == 0:
         return None
-    return Times(len(samples), whole, [StageTime(name, ms, 100 * ms / whole) for name, ms in totals.items()])
+    return Times(len(samples), total, [StageTime(name, ms, 100 * ms / total) for name, ms in totals.items()])
 
 
 # The best and the worst views, next to their photos.
@@ -307,7 +309,7 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
     """Return the best and the worst views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
-    last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice after the same step
+    last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice at the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]
     best = [r for r in reversed(ranked) if r not in worst][:MAX_VIEWS]
@@ -333,7 +335,7 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 
 LOG = logging.getLogger("clsplat")
-MORE = {  # of clsplat/metrics/views.py: name and unit
+MORE_METRICS = {  # of clsplat/metrics/views.py: name and unit
     "psnr_color": ("PSNR in the photographs' colors", "dB"),
     "psnr_affine": ("PSNR with colors fitted", "dB"),
     "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),
@@ -381,7 +383,7 @@ class HtmlReport(Stage):
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
-    """Return the addresses, relative to the page, of the files that stages of a name write, by path in the run."""
+    """Return the URLs, relative to the page, of the files that stages with a name write, by path in the run."""
     files = [Path(entry[stage]["file"]) for entry in run.pipeline["stages"] if stage in entry]
     return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
@@ -405,10 +407,10 @@ def _figures(run: Run) -> dict[str, str]:
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({pluralize(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
-            for key, (name, unit) in MORE.items():
+            for key, (name, unit) in MORE_METRICS.items():
                 if averages.get(key) is not None:
-                    some = f" ({pluralize(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
-                    values[f"{split} {name}{suffix}{some}"] = f"{averages[key]:.2f} {unit}"
+                    views = f" ({pluralize(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
+                    values[f"{split} {name}{suffix}{views}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
         measured = run.best.measured

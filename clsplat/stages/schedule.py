@@ -40,7 +40,7 @@ class ResetOpacity(Scheduled):
     value: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""
     when_background: Literal["black", "white"] | None = None
-    """Background with which the stage acts; default: with any."""
+    """Background with which the stage acts; default: any."""
 
     def stale(self, run: Run) -> Collection[str]:
         return ("logit_opacity",) if self._acts(run) else ()
@@ -74,9 +74,9 @@ class AverageParameters(Scheduled):
     """Average every parameter over the steps at which this stage runs (Polyak and Juditsky 1992).
 
     While learning rates are large, the parameters oscillate around a better model, which their average approaches.
-    Training continues from the parameters; the average replaces them after its last step.  A new Gaussian is averaged
-    since it exists.  Edits of existing Gaussians, such as a reset of opacities, are averaged with the values before:
-    set `start` after them.
+    Training continues from the parameters; the average replaces them after the last step.  A new Gaussian is averaged
+    from its creation on.  Edits of existing Gaussians, such as a reset of opacities, are averaged with the earlier
+    values; set `start` to a later step.
     """
 
     stage: Literal["average"] = "average"

@@ -67,14 +67,14 @@ class TrainField(Training):
         if self.rays % self.photographs:
             raise ValueError(f"'rays' must be a multiple of 'photographs', {self.photographs}; got {self.rays}")
         if any(stage.edits for stage in self.during):
-            raise ValueError("'during' has a stage that edits Gaussians, and a field has none; remove the stage")
+            raise ValueError("'during' has a stage that edits Gaussians, but a field has none; remove the stage")
         return self
 
     def check_run(self, run: Run) -> None:
         """Check the run before the field is made.
 
-        Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and what the stages
-        in `during` raise.
+        Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and the errors of
+        the stages in `during`.
         """
         super().check_run(run)
         require_seen(self.field, run.scene)
@@ -85,14 +85,14 @@ class TrainField(Training):
     def run(self, run: Run) -> None:
         self.check_run(run)
         field = run.learned_field = self._field(run)
-        last = run.step - run.stage_step + self.steps
-        pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.from_rules(run.step, last, [])
+        last_step = run.step - run.stage_step + self.steps
+        pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.from_rules(run.step, last_step, [])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
             start = clocks()
             self._step(run, field, pool)
-            run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last)
+            run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
             values = self._values(run, field) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
@@ -115,7 +115,7 @@ class TrainField(Training):
         return field
 
     def _step(self, run: Run, field: LearnedField, pool: ViewPool) -> None:
-        """Do one step; a failure before its update leaves the run at the previous step."""
+        """Train for one step; a failure before its update leaves the run at the previous step."""
         step = run.step + 1
         run.device.timings.sampling = step % self.log_every == self.log_every // 2
         photographs = list(self._sample(run, pool, step))
@@ -143,9 +143,9 @@ class TrainField(Training):
         Raises NotFiniteError, after setting the state aside, if the loss or the field is not finite.
         """
         loss, error = field.loss(self.coarse_weight)
-        broken = field.not_finite()
-        if broken or not math.isfinite(loss):
-            raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.save_failed(run, broken)}")
+        damaged_tables = field.not_finite()
+        if damaged_tables or not math.isfinite(loss):
+            raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.save_failed(run, damaged_tables)}")
         return loss, -10 * math.log10(max(error, 1e-12))
 
 

@@ -202,9 +202,9 @@ class Training(Stage):
     @property
     def inner(self) -> list[Scheduled]:
         """The stages that run between steps, in order."""
-        return self.in_order(self.during)
+        return self.order_stages(self.during)
 
-    def in_order(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+    def order_stages(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return the stages of `during` in the order in which they run."""
         return list(during)
 

@@ -17,7 +17,7 @@ from clsplat.losses.base import (
     required_content,
 )
 from clsplat.opencl.device import Array, constants
-from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
+from clsplat.photos.photographs import Photograph, apply_mask, unmasked_gradient
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
@@ -135,7 +135,7 @@ class StepTrainer:
         for module in reversed(data.modules):
             module.backward(data)
         self.rasterizer.device.timings.section = "statistics"
-        texture = known_gradient(workspace, data.camera, data.planes.colors, mask) if count > TEXTURE else None
+        texture = unmasked_gradient(workspace, data.camera, data.planes.colors, mask) if count > TEXTURE else None
         data.pixel_sums = self.rasterizer.pixel_sums(
             data.model, data.frame, data.gradient, count, texture, data.transmittance_gradient
         )

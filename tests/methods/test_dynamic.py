@@ -19,7 +19,7 @@ from clsplat.data_tools.synthetic import write_dataset
 from clsplat.formats.splats import MOTION
 from clsplat.gaussians.model import load
 from clsplat.gaussians.structs import moment_tables
-from clsplat.stages.init_motion import drift, moving
+from clsplat.stages.init_motion import add_motion, estimate_motion
 from clsplat.training import checkpoint
 from clsplat.training.memory import first_tables, plan
 from tests.support.recipes import ONE_THREAD, STEPS, digest, short, train
@@ -152,18 +152,18 @@ def test_points_without_a_time_start_at_rest(rng):
     times = rng.uniform(0, 1, 400)
     positions = rng.normal(0, 0.1, (400, 3))
     positions[200:] += np.array([10, 0, 0]) + 40 * times[200:, None]
-    spread, velocities = drift(positions, times)
+    spread, velocities = estimate_motion(positions, times)
     assert (spread[:200] > 0.2).mean() > 0.95
     assert (spread[200:] < 0.1).mean() > 0.95
     assert np.median(np.abs(velocities[200:] - 40)) < 4
     parameters = {"means": positions.astype(np.float32)}
-    motion = moving(parameters, load_settings(), times, (4.0, 0.1), 0)[MOTION]
+    motion = add_motion(parameters, load_settings(), times, (4.0, 0.1), 0)[MOTION]
     np.testing.assert_allclose(motion[:, 3], times, rtol=1e-6)
     assert (np.exp(motion[:200, 4]) > 3.9).mean() > 0.95
     assert (np.exp(motion[200:, 4]) < 0.2).mean() > 0.95
     np.testing.assert_allclose(motion[spread < 0.18, :3], velocities[spread < 0.18], rtol=1e-4)
     assert not motion[spread > 0.18, :3].any()
-    drawn = moving(parameters, load_settings(), None, (4.0, 0.1), 0)[MOTION]
+    drawn = add_motion(parameters, load_settings(), None, (4.0, 0.1), 0)[MOTION]
     assert np.ptp(drawn[:, 3]) > 0.9
     np.testing.assert_allclose(np.exp(drawn[:, 4]), 4, rtol=1e-5)
 

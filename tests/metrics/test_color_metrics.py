@@ -14,7 +14,7 @@ from clsplat.metrics.views import (
     log_color_figures,
     mean_figures,
 )
-from clsplat.stages.optimize import compared
+from clsplat.stages.optimize import comparable_psnr
 from clsplat.training.modules.exposure import Affine, Gain
 
 GAINS = np.array([1.3, 0.9, 1.1])
@@ -127,9 +127,9 @@ def test_log_reports_the_number_of_averaged_views(caplog):
 
 def test_best_model_is_chosen_by_psnr_without_color_metrics():
     fitted, bare = {"psnr": 20.0, "psnr_color": 24.0}, {"psnr": 21.0, "psnr_color": None}
-    assert compared([fitted, fitted]) == [24.0, 24.0]
-    assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
-    assert compared([fitted, {}]) == [20.0, None]
+    assert comparable_psnr([fitted, fitted]) == [24.0, 24.0]
+    assert comparable_psnr([fitted, bare]) == comparable_psnr([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
+    assert comparable_psnr([fitted, {}]) == [20.0, None]
 
 
 def test_steps_are_compared_by_psnr_if_views_lack_colors():
@@ -138,9 +138,9 @@ def test_steps_are_compared_by_psnr_if_views_lack_colors():
     second = {"psnr": 21.0, **mean_figures([{"psnr_color": 31.0}, {"psnr_color": 22.0}])}
     assert (first["psnr_color"], second["psnr_color"]) == (30.0, 26.5)
     whole = {"psnr": 22.0, "psnr_color": 29.0}
-    assert compared([whole, first]) == [22.0, 20.0]
-    assert compared([first, whole]) == [20.0, 22.0]
-    assert compared([whole, second]) == [29.0, 26.5]
+    assert comparable_psnr([whole, first]) == [22.0, 20.0]
+    assert comparable_psnr([first, whole]) == [20.0, 22.0]
+    assert comparable_psnr([whole, second]) == [29.0, 26.5]
 
 
 def test_render_is_regressed_on_the_photograph(rng):

@@ -62,7 +62,7 @@ def test_inconsistent_depth_maps_are_dropped_and_named(tmp_path, rng, caplog):
     with caplog.at_level(logging.WARNING):
         for name in ("dark.jpg", "plain.jpg"):
             assert DepthMaps(tmp_path).at(name, (40, 30), rows, columns, inverse[rows, columns]) is None
-            assert f"{name}: the depth map does not fit the points" in caplog.text
+            assert f"{name}: ignoring the depth map, which does not fit the points" in caplog.text
     few = slice(0, MIN_POINTS - 1)
     assert fit_scale_and_offset(inverse[rows, columns][few], inverse[rows, columns][few]) is None
     assert DepthMaps(tmp_path).at("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Decay
 from clsplat.density.budget import BudgetContext
 from clsplat.methods.dash import Momentum
-from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
+from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, describe_sizes, knots
 from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load
 from clsplat.training.adam import Rates
@@ -43,21 +43,21 @@ def test_largest_divisor_follows_the_most_detailed_image():
 
 
 def test_size_is_full_from_the_start_without_detail():
-    gray = DetailDivisor(follows="detail", until=900).of([np.full((40, 60, 3), 77, np.uint8)])
+    gray = DetailDivisor(follows="detail", until=900).to_schedule([np.full((40, 60, 3), 77, np.uint8)])
     assert gray.points == [[0, 1]]
-    assert "full size" in course(gray)
+    assert "full size" in describe_sizes(gray)
 
 
 @pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20)])
 def test_spectrum_sums_over_the_centered_window(size):
     image = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
     amplitudes = np.abs(np.fft.fft2(image.astype(np.float64), axes=(0, 1))).sum(axis=2)
-    spectrum = Spectrum.of(image)
+    spectrum = Spectrum.from_image(image)
     assert spectrum.total == pytest.approx(amplitudes.sum(), rel=1e-5)
     down, right = (np.abs(np.fft.fftfreq(n)) * 2 for n in size)
     for divisor in (1.5, 2.0, 4.0):
         inside = np.maximum(down[:, None], right[None, :]) <= 1 / divisor
-        below, above = (spectrum.at(1 / (1 / divisor + shift / LEVELS)) for shift in (-1.001, 1.001))
+        below, above = (spectrum.amplitude(1 / (1 / divisor + shift / LEVELS)) for shift in (-1.001, 1.001))
         assert below * (1 - 1e-5) <= amplitudes[inside].sum() <= above * (1 + 1e-5)
 
 
@@ -66,15 +66,15 @@ def test_size_grows_in_integer_steps_to_full():
     image = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
     smooth = np.repeat(np.repeat(image[::4, ::4], 4, axis=0), 4, axis=1)
     settings = DetailDivisor(follows="detail", until=3000, every=100, start=500)
-    points = settings.of([smooth]).points
+    points = settings.to_schedule([smooth]).points
     assert points[0][0] == 0
     assert points[0][1] > 1
     assert points[-1][1] == 1
     assert points[-1][0] <= 3001
     assert all(step > 500 and step % 100 == 1 for step, _ in points[1:])
     assert all(value == int(value) for _, value in points)
-    steps, divisors = knots([Spectrum.of(smooth)], 3000, 8)
-    sizes = settings.of([smooth])
+    steps, divisors = knots([Spectrum.from_image(smooth)], 3000, 8)
+    sizes = settings.to_schedule([smooth])
     for step in (700, 1500, 2300, 2900):  # the floor of the knots' value, linear in the number of pixels
         assert sizes.at(step + 1) == int(np.interp(step, steps, divisors**-2) ** -0.5)
 

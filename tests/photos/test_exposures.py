@@ -12,7 +12,7 @@ from clsplat.photos.exposure_estimate import (
     _fit,
     complete_exposures,
     measure_exposures,
-    samples,
+    sample_points,
 )
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.colmap import read_images, read_point_table, tracks_of
@@ -34,7 +34,7 @@ def test_gains_are_recovered(rng):
     found = wall.measured()
     assert table(found) == pytest.approx(wall.log_gains, abs=2e-3)
     assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
-    assert found.explained > 0.95
+    assert found.explained_variance > 0.95
     assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
 
 
@@ -54,7 +54,7 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
     assert table(found).mean(axis=0) == pytest.approx(0, abs=1e-12)
     assert found.text.startswith("exposures of 8 photographs differ by")
     assert found.text.endswith(", those of 2 as noted")
-    assert found.explained == shown.explained
+    assert found.explained_variance == shown.explained_variance
 
 
 class Photograph:
@@ -136,7 +136,7 @@ def test_view_dependent_light_is_not_exposure(rng):
         return Wall.photograph(wall, view)
 
     found = measure_exposures(wall.tracks, wall.views, lambda view: (photograph(view), None))
-    assert found.explained < 0.1
+    assert found.explained_variance < 0.1
     assert found.spread < 0.05
 
 
@@ -153,13 +153,13 @@ def test_undetermined_gains_are_omitted(rng):
 def test_points_count_at_their_observations(rng):
     wall, view = Wall(rng), Wall(rng).views[0]
     image, mask = wall.photograph(wall.views[0]), np.zeros((SIZE, SIZE), bool)
-    rows, values = samples(wall.tracks, view, image, None)
+    rows, values = sample_points(wall.tracks, view, image, None)
     assert (rows == np.arange(POINTS)).all()
     assert values == pytest.approx(wall.colors * np.exp(wall.log_gains[0]), abs=3e-3)
     mask[:, : SIZE // 2] = True
-    assert len(samples(wall.tracks, view, image, mask)[0]) == pytest.approx(POINTS / 2, abs=20)
+    assert len(sample_points(wall.tracks, view, image, mask)[0]) == pytest.approx(POINTS / 2, abs=20)
     behind = replace(wall.tracks, positions=-wall.tracks.positions)
-    assert len(samples(behind, view, image, None)[0]) == 0
+    assert len(sample_points(behind, view, image, None)[0]) == 0
 
 
 def test_tracks_are_written_and_read(rng, tmp_path):

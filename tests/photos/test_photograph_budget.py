@@ -38,10 +38,10 @@ def test_images_stay_within_the_budget(any_device, tiny_scene, kept):
     size = 3 * views[0].camera.width * views[0].camera.height
     tight, plenty = Photographs(any_device, "white", budget=kept * size), Photographs(any_device, "white")
     for turn in range(3):
-        tight.announce(views[turn : turn + 2])
+        tight.prefetch(views[turn : turn + 2])
         for view in views:
             np.testing.assert_array_equal(tight.get(view).image(), plenty.get(view).image())
-            assert sum(held.nbytes for held in tight._held.values()) <= max(kept, 1) * size
+            assert sum(held.nbytes for held in tight._cache.values()) <= max(kept, 1) * size
 
 
 @pytest.mark.parametrize("kept", [0, 100])
@@ -64,6 +64,6 @@ def test_prefetched_damaged_image_is_reported_on_request(any_device, tiny_scene,
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
     photographs = Photographs(any_device, "white")
-    photographs.announce([view])
+    photographs.prefetch([view])
     with pytest.raises(DataError, match=r"damaged\.png"):
         photographs.get(view)

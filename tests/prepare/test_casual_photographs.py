@@ -14,13 +14,13 @@ from clsplat.core.errors import DataError, shell_quote
 from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
-from clsplat.prepare.database import image_names, opened
+from clsplat.prepare.database import image_names, open_database
 from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
 from clsplat.prepare.features import FeatureOptions, find_features, sift
 from clsplat.prepare.gather import gather, list_photographs, warnings_for
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features
-from clsplat.prepare.rotation_only import why_no_depth
+from clsplat.prepare.rotation_only import no_depth_reason
 from clsplat.scene.images import copy_exif, read_exif_exposure, read_exif_optics, read_gray, read_header, read_image
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
@@ -106,7 +106,7 @@ def test_photographs_share_cameras_by_size_and_lens(tmp_path, cameras, groups, c
     (tmp_path / "out").mkdir()
     figures = find_features(tmp_path / "p", tmp_path / "out", FeatureOptions(96, 50), cameras=cameras)
     assert figures["cameras"] == groups
-    with opened(pycolmap, tmp_path / "out" / "database.db") as rows:
+    with open_database(pycolmap, tmp_path / "out" / "database.db") as rows:
         images, cameras_found = rows.read_all_images(), rows.read_all_cameras()
     assert [image.name for image in images] == image_names(pycolmap, tmp_path / "out" / "database.db")
     assert {image.camera_id for image in images} == set(range(1, groups + 1))
@@ -359,8 +359,8 @@ def test_copies_do_not_count_as_camera_motion(tmp_path, dense):
     wide = blocks(1, 400, 180)
     matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
     pycolmap = pytest.importorskip("pycolmap")
-    assert why_no_depth(pycolmap, matches / "database.db") == ""
-    assert "all the same" in why_no_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
+    assert no_depth_reason(pycolmap, matches / "database.db") == ""
+    assert "all the same" in no_depth_reason(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
 
 
 def test_model_counts_only_photographs_outside_larger_models(tmp_path):

@@ -13,7 +13,7 @@ from clsplat.core.errors import DataError
 from clsplat.prepare import mapping
 from clsplat.prepare.features import FeatureOptions, find_features
 from clsplat.prepare.mapping import map_cameras
-from clsplat.prepare.matching import match_features, match_pairs, more_pairs
+from clsplat.prepare.matching import expand_pairs, match_features, match_pairs
 from clsplat.scene.detect import read_scene
 from tests.support.data_sets import data_set
 from tests.support.pictures import blocks
@@ -44,12 +44,12 @@ def matches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_unmatched_pairs_are_proposed(matches):
     every = [(f"{number}.jpg", LAST) for number in range(7)]
-    assert more_pairs(matches / "database.db", {LAST}) == every, "no more than the 17 that were looked at"
-    strangers = more_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST})
+    assert expand_pairs(matches / "database.db", {LAST}) == every, "no more than the 17 that were looked at"
+    strangers = expand_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST})
     assert {"2.jpg", "3.jpg"} <= {a for a, b in strangers if b == LAST}, "18 would be more: the most similar ones"
     assert len(strangers) <= 17
     assert all(sum(name in pair for pair in strangers) <= 17 // 3 for name in ("7.jpg", "8.jpg", LAST))
-    assert more_pairs(matches / "database.db", set()) == []
+    assert expand_pairs(matches / "database.db", set()) == []
 
 
 def test_exhaustive_matching_leaves_no_pairs(matches, tmp_path):
@@ -57,7 +57,7 @@ def test_exhaustive_matching_leaves_no_pairs(matches, tmp_path):
     names = [f"{number}.jpg" for number in range(10)]
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     match_pairs(tmp_path / "database.db", pairs, 1)
-    assert more_pairs(tmp_path / "database.db", set(names)) == []
+    assert expand_pairs(tmp_path / "database.db", set(names)) == []
 
 
 def test_names_with_spaces_get_no_pairs(matches, tmp_path, caplog):
@@ -68,7 +68,7 @@ def test_names_with_spaces_get_no_pairs(matches, tmp_path, caplog):
     image.name = "3 .5.jpg"
     rows.update_image(image)
     rows.close()
-    assert [a for a, _ in more_pairs(tmp_path / "database.db", {LAST})] == [
+    assert [a for a, _ in expand_pairs(tmp_path / "database.db", {LAST})] == [
         f"{number}.jpg" for number in range(7) if number != 3
     ]
     assert "'3 .5.jpg': COLMAP's lists of pairs allow no spaces" in caplog.text
@@ -76,7 +76,7 @@ def test_names_with_spaces_get_no_pairs(matches, tmp_path, caplog):
 
 @pytest.mark.parametrize(
     ("step", "error"),
-    [("more_pairs", cv2.error("K > 0")), ("match_pairs", DataError("cannot match"))],
+    [("expand_pairs", cv2.error("K > 0")), ("match_pairs", DataError("cannot match"))],
     ids=["looking for pairs", "matching them"],
 )
 def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, monkeypatch, caplog, step, error):
@@ -87,7 +87,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
     caplog.set_level("INFO")
     monkeypatch.setattr(mapping, step, fail)
     monkeypatch.setattr(mapping, "DENSER", FeatureOptions(480, 1400))
-    figures = map_cameras(matches, tmp_path, attempts=3 if step == "more_pairs" else 4)
+    figures = map_cameras(matches, tmp_path, attempts=3 if step == "expand_pairs" else 4)
     assert figures["registered"] >= 7
     assert f"skipping an attempt that failed: {error}" in caplog.text
     assert [text for text in caplog.messages if text.endswith("trying again with denser features")]
@@ -106,7 +106,7 @@ from clsplat.prepare import mapping
 from clsplat.prepare import matching
 out = Path({str(tmp_path / "half")!r})
 def kill():
-    while not (out / mapping.WIDER).exists() or matching.pairs_done(out / mapping.WIDER) < 20:
+    while not (out / mapping.WIDER).exists() or matching.count_matched_pairs(out / mapping.WIDER) < 20:
         time.sleep(0.01)
     os.kill(os.getpid(), signal.SIGKILL)
 threading.Thread(target=kill, daemon=True).start()
@@ -116,7 +116,7 @@ mapping.map_cameras(Path({str(matches)!r}), out, attempts=3)
     caplog.set_level("INFO")
     caplog.clear()
     map_cameras(matches, tmp_path / "half", attempts=3)
-    more = len(more_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST}))
+    more = len(expand_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST}))
     (told,) = [text for text in caplog.messages if "of photographs that are not placed yet" in text]
     assert int(told.split()[1]) < more, "what was matched before the kill is kept"
     for name in MODEL:

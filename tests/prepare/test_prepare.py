@@ -140,7 +140,7 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     if fault in ("no JSON", "a list", "an empty file"):
         (last / damaged).write_text({"no JSON": "{", "a list": "[]"}.get(fault, ""))
     why = {"a file less": "x.txt is missing", "an empty file": "x.txt was changed", "a folder": "x.txt is missing"}
-    why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is made again"
+    why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is recomputed"
     assert [one.why for one in plan(steps, photos, root)] == ["", why]
     assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
     assert run_steps(steps, photos, root) == ("pab", ["b"])
@@ -172,7 +172,7 @@ def test_result_without_its_images_is_redone(photos, tmp_path):
     assert [one.why for one in plan(steps, photos, root)] == ["", ""]
     shutil.rmtree(plan(steps, photos, root)[0].folder)
     planned = plan(steps, photos, root)
-    assert [one.why for one in planned] == ["letter is a, was b", "images/p.txt is missing; the result is made again"]
+    assert [one.why for one in planned] == ["letter is a, was b", "images/p.txt is missing; the result is recomputed"]
     assert (prepare(planned, photos, root) / "images" / "p.txt").read_text() == "p"
     assert Linked.calls == ["a", "b", "a"], "the link of the second leads to images again"
 

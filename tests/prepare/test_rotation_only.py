@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.prepare.database import opened
-from clsplat.prepare.rotation_only import why_no_depth
+from clsplat.prepare.database import open_database
+from clsplat.prepare.rotation_only import no_depth_reason
 
 WIDTH, HEIGHT, FOCAL = 1000, 750, 800.0
 
@@ -19,7 +19,7 @@ def matches_of(folder: Path, cameras: Sequence[tuple[float, float]]) -> Path:
     rng = np.random.default_rng(0)
     points = rng.uniform((-6, -3, 4), (6, 3, 10), (1200, 3))
     seen = []
-    with opened(pycolmap, folder / "database.db") as rows:
+    with open_database(pycolmap, folder / "database.db") as rows:
         lens = {"model": "SIMPLE_PINHOLE", "width": WIDTH, "height": HEIGHT, "params": [FOCAL, WIDTH / 2, HEIGHT / 2]}
         camera = rows.write_camera(pycolmap.Camera(**lens))
         for number, (place, angle) in enumerate(cameras):
@@ -41,22 +41,22 @@ def matches_of(folder: Path, cameras: Sequence[tuple[float, float]]) -> Path:
     return folder / "database.db"
 
 
-def no_depth_reason(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
-    return why_no_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
+def reason_for(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
+    return no_depth_reason(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
 
 
 def test_rotating_camera_gives_no_depth(tmp_path):
-    assert "only rotated in place" in no_depth_reason(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
+    assert "only rotated in place" in reason_for(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
 
 
 def test_camera_rotating_at_several_positions_gives_depth(tmp_path):
     """Each photograph matches those of its own spot best."""
-    assert no_depth_reason(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
+    assert reason_for(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
 
 
 def test_copies_of_one_photograph_are_duplicates(tmp_path):
-    assert "are all the same" in no_depth_reason(tmp_path, [(0, 0)] * 4)
+    assert "are all the same" in reason_for(tmp_path, [(0, 0)] * 4)
 
 
 def test_copies_of_two_photographs_are_not_all_duplicates(tmp_path):
-    assert no_depth_reason(tmp_path, [(0, -60), (0, -60), (0, 60), (0, 60)]) == "", "different places, twice each"
+    assert reason_for(tmp_path, [(0, -60), (0, -60), (0, 60), (0, 60)]) == "", "different places, twice each"

@@ -273,7 +273,7 @@ import os, signal, threading, time
 from pathlib import Path
 from clsplat.prepare import matching
 def kill():
-    while matching.pairs_done(Path({str(database)!r})) < 5:
+    while matching.count_matched_pairs(Path({str(database)!r})) < 5:
         time.sleep(0.01)
     os.kill(os.getpid(), signal.SIGKILL)
 threading.Thread(target=kill, daemon=True).start()

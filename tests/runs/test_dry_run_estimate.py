@@ -10,7 +10,7 @@ import pytest
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
-from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
+from clsplat.prepare.matching import MAX_EXHAUSTIVE, max_pair_count
 from clsplat.runs import estimate as module
 from clsplat.runs.describe import describe
 from clsplat.runs.opening import check_preparation, expected_measures, photo_names
@@ -167,9 +167,9 @@ def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])
 def test_pairs_are_exhaustive_or_sequential(count):
     every = count * (count - 1) // 2
-    assert most_pairs(count, "exhaustive", 10) == every
-    assert most_pairs(count, "auto", 10) == (every if count <= MAX_EXHAUSTIVE else 20 * count)
-    assert most_pairs(count, "sequential", 10) == min(every, 20 * count)
+    assert max_pair_count(count, "exhaustive", 10) == every
+    assert max_pair_count(count, "auto", 10) == (every if count <= MAX_EXHAUSTIVE else 20 * count)
+    assert max_pair_count(count, "sequential", 10) == min(every, 20 * count)
 
 
 @pytest.mark.parametrize(

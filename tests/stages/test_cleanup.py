@@ -189,7 +189,7 @@ def test_refused_cleanup_saves_the_trained_state(finished, tiny_scene, tmp_path,
             "[{type: prune_faint, start: 9}]",
             "the rule 'prune_faint' has a 'start', but cleanup applies it once; remove",
         ),
-        ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad of training steps; use it in densify"),
+        ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad from training; use it in densify"),
     ],
 )
 def test_rules_that_do_more_than_remove_are_refused(tmp_path, rules, complaint):

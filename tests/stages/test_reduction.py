@@ -15,7 +15,7 @@ from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs import opening, runner
-from clsplat.stages.cleanup import PruneLeast, band_energy, columns_of, scores
+from clsplat.stages.cleanup import PruneLeast, compute_band_energy, expand_bands, score_gaussians
 from clsplat.training.run import Run
 from tests.support.runs import train
 
@@ -72,18 +72,18 @@ def opened(scene: Path, pipeline: str, out: Path, *overrides: str) -> Run:
 
 def test_least_important_gaussians_are_removed(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
-    score, before = scores(run), run.model.gaussians.get("means")
+    score, before = score_gaussians(run), run.model.gaussians.get("means")
     load_pipeline(pipeline).stages[1].act(run)
     kept = run.model.gaussians.get("means")
     assert len(kept) == round(len(before) / 2)
     order = np.argsort(-score, kind="stable")[: len(kept)]
     np.testing.assert_array_equal(kept, before[np.sort(order)])
-    assert scores(run).sum() > 0.8 * score.sum(), "the others had little weight"
+    assert score_gaussians(run).sum() > 0.8 * score.sum(), "the others had little weight"
 
 
 def test_image_change_can_be_the_score(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
-    by_weight = scores(run)
+    by_weight = score_gaussians(run)
     score = sensitivities(run.survey().render(run.scene.split("train")), run.model.gaussians.count)
     before = run.model.gaussians.get("means")
     PruneLeast(stage="prune_least", remove=0.8, score="sensitivity").act(run)
@@ -102,10 +102,10 @@ def test_energy_of_bands_is_the_mean_square_over_directions(rng, degree):
     rest = rng.normal(size=(4, columns)).astype(np.float32)
     directions = rng.normal(size=(200_000, 3))
     basis = ref.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True), degree)[:, 1:]
-    found = band_energy(rest)
+    found = compute_band_energy(rest)
     assert found.shape == (4, degree)
     for band in range(degree):
-        only = np.where(columns_of(np.arange(degree)[None].repeat(4, axis=0) == band), rest, 0)
+        only = np.where(expand_bands(np.arange(degree)[None].repeat(4, axis=0) == band), rest, 0)
         colors = np.einsum("dk,nkc->dnc", basis, only.reshape(4, -1, 3).astype(np.float64))
         np.testing.assert_allclose(found[:, band], np.square(colors).sum(axis=2).mean(axis=0), rtol=0.03)
 
@@ -123,9 +123,9 @@ def test_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
 
 def test_least_important_bands_become_zero(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
-    energy = band_energy(run.model.gaussians.get("sh_rest")) * scores(run)[:, None]
+    energy = compute_band_energy(run.model.gaussians.get("sh_rest")) * score_gaussians(run)[:, None]
     load_pipeline(pipeline, ["reduce_sh.degree=2", "reduce_sh.share=0.25"]).stages[3].act(run)
-    zero = band_energy(run.model.gaussians.get("sh_rest")) == 0
+    zero = compute_band_energy(run.model.gaussians.get("sh_rest")) == 0
     assert zero.sum() == round(0.25 * energy.size)
     assert energy[zero].max() <= energy[~zero].min()
 

@@ -10,7 +10,14 @@ from clsplat.metrics.views import ViewMetrics
 from clsplat.render.backdrops import Auto, Backdrop, EnvironmentMap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.stages.report import FEW_PHOTOS, far_below, from_capture, from_test_views, from_training_views, widest_gap
+from clsplat.stages.report import (
+    FEW_PHOTOS,
+    find_outliers,
+    find_widest_gap,
+    from_capture,
+    from_test_views,
+    from_training_views,
+)
 from clsplat.training.modules.sky_choice import sky_advice
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
@@ -31,9 +38,9 @@ def measured(psnr: list[float], gained: float = 0.0) -> list[ViewMetrics]:
 
 
 def test_views_far_below_the_median_are_named_worst_first():
-    assert far_below({}) == []
-    assert far_below({"a": 30.0, "b": 25.0, "c": 31.0}) == []
-    assert far_below({"a": 30.0, "b": 24.9, "c": 31.0, "d": 12.0, "e": 30.0}) == ["d", "b"]
+    assert find_outliers({}) == []
+    assert find_outliers({"a": 30.0, "b": 25.0, "c": 31.0}) == []
+    assert find_outliers({"a": 30.0, "b": 24.9, "c": 31.0, "d": 12.0, "e": 30.0}) == ["d", "b"]
 
 
 def test_training_photographs_that_disagree_are_named():
@@ -83,7 +90,7 @@ def test_few_images_are_reported():
 @pytest.mark.parametrize("turn", [0, 250])
 def test_widest_gap_around_a_scene_is_reported(turn):
     angles = [turn + 12 * i for i in range(26)]  # 300 degrees, and 60 without any
-    degrees, one, other = widest_gap(views_around(angles))
+    degrees, one, other = find_widest_gap(views_around(angles))
     assert degrees == pytest.approx(60, abs=1)
     assert (one, other) == (f"at {angles[-1]:g}", f"at {angles[0]:g}")
 
@@ -100,8 +107,8 @@ def test_widest_gap_around_a_scene_is_reported(turn):
     ids=["two", "all around", "one side", "evenly", "outward"],
 )
 def test_even_coverage_has_no_gap(views):
-    assert widest_gap(views) is None
+    assert find_widest_gap(views) is None
 
 
 def test_coincident_cameras_have_no_gap():
-    assert widest_gap([views_around([0])[0]] * 5) is None
+    assert find_widest_gap([views_around([0])[0]] * 5) is None

@@ -5,7 +5,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.stages.palette import most_alike, set_clusters, share
+from clsplat.stages.palette import average_clusters, most_alike, set_clusters
 from tests.support.devices import each_once, on_devices, on_one_setting
 
 
@@ -36,7 +36,7 @@ def test_each_row_becomes_the_weighted_mean_of_its_cluster(device, rng, count, c
     gaussians, labels, weights = clustered(device, rng, count, clusters)
     expected = ref.shared_means(gaussians.get(name), labels, weights)
     others = gaussians.get("means")
-    share(gaussians, name)
+    average_clusters(gaussians, name)
     np.testing.assert_allclose(gaussians.get(name), expected, rtol=1e-5, atol=1e-6)
     assert len(np.unique(gaussians.get(name), axis=0)) == len(np.unique(labels))
     np.testing.assert_array_equal(gaussians.get("means"), others)
@@ -45,9 +45,9 @@ def test_each_row_becomes_the_weighted_mean_of_its_cluster(device, rng, count, c
 @on_one_setting
 def test_equal_rows_do_not_change(device, rng):
     gaussians, _, _ = clustered(device, rng, 70, 6)
-    share(gaussians, "sh_rest")
+    average_clusters(gaussians, "sh_rest")
     before = gaussians.get("sh_rest")
-    share(gaussians, "sh_rest")
+    average_clusters(gaussians, "sh_rest")
     np.testing.assert_array_equal(gaussians.get("sh_rest"), before)
 
 
@@ -57,7 +57,7 @@ def test_cluster_without_weight_gets_its_first_row(device, rng):
     weights[labels == 2] = 0
     set_clusters(gaussians, labels, weights)
     before = gaussians.get("sh_rest")[labels == 2]
-    share(gaussians, "sh_rest")
+    average_clusters(gaussians, "sh_rest")
     np.testing.assert_array_equal(gaussians.get("sh_rest")[labels == 2], np.broadcast_to(before[0], before.shape))
 
 
@@ -66,6 +66,6 @@ def test_cluster_of_a_gaussian_moves_with_it(device, rng):
     gaussians, labels, _ = clustered(device, rng, 50, 5)
     source = rng.permutation(50)[:30]
     gaussians.rearrange(device.upload(source.astype(np.uint32)), device.zeros(30, np.uint32), 30)
-    share(gaussians, "sh_rest")
+    average_clusters(gaussians, "sh_rest")
     for label in np.unique(labels[source]):
         assert len(np.unique(gaussians.get("sh_rest")[labels[source] == label], axis=0)) == 1

@@ -349,7 +349,7 @@ def test_other_models_at_the_end_are_refused(tmp_path):
 def test_training_is_measured_near_its_end(pipeline, steps, every):
     """A refit of a short one would be up to 99 steps shorter than it."""
     training = load(pipeline).settings.training.model_copy(update={"steps": steps, "keep": "best"})
-    assert {one.every for one in training.measuring([])} == {every}
+    assert {one.every for one in training.measurements([])} == {every}
     assert steps % every < 20
 
 

@@ -102,7 +102,7 @@ def test_sky_ends_at_the_horizon(pitch, rows, share):
     mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
     down = np.sin(np.radians(-pitch))
     view = View.looking_at(np.zeros(3), np.array([0, down, np.cos(np.radians(pitch))]), UP, CAMERA)
-    assert SkyEvidence(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
+    assert SkyEvidence(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).sky_fraction == share
 
 
 def test_decision_is_recorded_with_its_reason(sky_run):

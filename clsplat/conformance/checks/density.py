@@ -25,7 +25,7 @@ from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
 from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.stages.palette import most_alike, set_clusters, share
+from clsplat.stages.palette import average_clusters, most_alike, set_clusters
 from clsplat.training.adam import Adam
 
 CHECKS = Checks()
@@ -281,8 +281,8 @@ def shared_means(device: Device, rng: np.random.Generator) -> Results:
         values, labels = gaussians.get("sh_rest"), rng.integers(0, clusters, count)
         weights = rng.random(count).astype(np.float32) * (labels != 0)  # one cluster has no weight
         set_clusters(gaussians, labels, weights)
-        share(gaussians, "sh_rest")
+        average_clusters(gaussians, "sh_rest")
         label, actual = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
         yield by_element("share_mean", label, actual, ref.shared_means(values, labels, weights), SUM, floor=0.1)
-        share(gaussians, "sh_rest")
+        average_clusters(gaussians, "sh_rest")
         yield equal("share_mean", f"{label}, a second time", gaussians.get("sh_rest"), actual)

@@ -12,7 +12,7 @@ from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
 from clsplat.opencl.device import Array, Device
-from clsplat.photos.photographs import apply_mask, change_background, known_gradient, unpack
+from clsplat.photos.photographs import apply_mask, change_background, unmasked_gradient, unpack
 from clsplat.photos.transforms import Blur, Planes
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -212,7 +212,7 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
         expected = sobel_magnitude(image)
         for counted in (None, mask):
             uploaded = None if counted is None else to_planes(device, camera, counted[None])
-            actual = known_gradient(workspace, camera, to_planes(device, camera, image), uploaded).get()
+            actual = unmasked_gradient(workspace, camera, to_planes(device, camera, image), uploaded).get()
             if counted is not None:
                 expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
             kernel = "image_gradient" if counted is None else "hide_masked"

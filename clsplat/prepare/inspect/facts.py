@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.progress import captured_log, counted, log_level
-from clsplat.prepare.gather import MIN_PHOTOGRAPHS, list_photographs, why_unreadable
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, failure_reason, list_photographs
 from clsplat.scene.camera import BORDER_POINTS, Lens
 from clsplat.scene.detect import find_dataset, read_scene
 from clsplat.scene.identity import ImageFile, decode_all, require_content
@@ -102,7 +102,7 @@ def compare_photos(
             {name: photo.brightness for name, photo in photos.items()}, {name for name, _ in values}
         ),
         unreadable={
-            name: why_unreadable(files[name], error) for name, error in measured.items() if isinstance(error, DataError)
+            name: failure_reason(files[name], error) for name, error in measured.items() if isinstance(error, DataError)
         },
         blank=[name for name, photo in photos.items() if photo.is_blank],
     )

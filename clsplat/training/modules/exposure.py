@@ -122,7 +122,7 @@ class Appearance(TrainingModule):
         exposures = estimate_exposures(run)
         if not exposures.log_gains:
             return self._choose("off", exposures.text)
-        is_small = exposures.spread <= self.min_spread, exposures.explained <= self.min_explained_variance
+        is_small = exposures.spread <= self.min_spread, exposures.explained_variance <= self.min_explained_variance
         bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of the variance"
         if not any(is_small):
             return self._choose("on", f"{exposures.text}; more than {bounds[0]} and {bounds[1]}")

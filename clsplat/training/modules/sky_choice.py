@@ -90,7 +90,7 @@ def _reason_unknown(run: Run) -> str:
 def _count(run: Run, share: float) -> tuple[int, int]:
     """Count the photographs with at least this fraction of sky in their upper third, and all photographs."""
     evidence = _evidence(run, run.scene.merge_validation())
-    return sum(photo.share >= share for photo in evidence), len(evidence)
+    return sum(photo.sky_fraction >= share for photo in evidence), len(evidence)
 
 
 def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
