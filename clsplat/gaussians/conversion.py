@@ -45,7 +45,7 @@ SHARED = ("near", "screen_variance", "background", "alpha")  # taken from the fi
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Merge all Gaussians into one model, with the rendering numbers of the first and the largest SH degree.
 
-    World filters are baked unless all models have one; if some models move, the others become static in time.
+    World filters are baked unless all models have one; if some models move, the others get a static motion.
     Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
@@ -91,7 +91,7 @@ class Changes:
     world: bool = False  # write world coordinates instead of an origin
 
     def apply(self, model: Model) -> Model:
-        """Return the changed model.  Raises DataError if nothing is left, and ConfigError for an extreme transform."""
+        """Return the changed model.  Raises DataError if no Gaussian is left, ConfigError for an extreme transform."""
         model = model if self.time is None else _extract_frame(model, self.time)
         changed = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
@@ -176,7 +176,7 @@ def parse_transform(text: str) -> NDArray[np.float64]:
             for part in text.split():
                 word, _, values = part.partition("=")
                 with np.errstate(over="ignore", invalid="ignore"):  # checked below
-                    matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
+                    matrix = _operation_matrix(word, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
         raise ConfigError(expected) from error
     linear = matrix[:3, :3]
@@ -195,8 +195,8 @@ def parse_transform(text: str) -> NDArray[np.float64]:
     return matrix
 
 
-def _step(word: str, values: list[float]) -> NDArray[np.float64]:
-    """Return the matrix of one step of a transform.  Raises ValueError."""
+def _operation_matrix(word: str, values: list[float]) -> NDArray[np.float64]:
+    """Return the matrix, [4, 4], of one operation of a transform.  Raises ValueError."""
     from scipy.spatial.transform import Rotation
 
     if word not in OPERATIONS or len(values) != (1 if word == "scale" else 3):
@@ -223,7 +223,7 @@ def parse_crop(text: str) -> tuple[float, ...]:
 
 
 def check_degree(degree: int | None) -> int | None:
-    """Validate an SH degree and return it.  Raises ConfigError."""
+    """Return an SH degree.  Raises ConfigError if it is invalid."""
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
     return degree
@@ -253,7 +253,7 @@ MAX_FRAMES = 10_000  # files
 
 
 def check_time(time: float | None) -> float | None:
-    """Validate a timestamp and return it.  Raises ConfigError."""
+    """Return a timestamp.  Raises ConfigError if it is invalid."""
     if time is not None and not is_timestamp(time):
         raise ConfigError(f"--time {time:g}: {EXPECTED_TIME}")
     return time
@@ -285,21 +285,21 @@ def convert_frames(
             change.apply(model)
         except DataError as error:
             raise DataError(f"--frames {frames}: time {change.time:g}: {error}; nothing was written") from error
-    done: list[dict[str, Any]] = []
-    with _restored_on_failure([*files, *map(sky_path, files)]):
+    results: list[dict[str, Any]] = []
+    with _restore_on_failure([*files, *map(sky_path, files)]):
         for file, change in zip(files, changes_by_frame, strict=True):
-            done.append(write_model(sources, change.apply(model), file, replace(writing, quiet=bool(done))))
+            results.append(write_model(sources, change.apply(model), file, replace(writing, quiet=bool(results))))
     return {
-        **done[0],
+        **results[0],
         "file": str(out),
         "files": [str(file) for file in files],
-        "gaussians": max(result["gaussians"] for result in done),
-        "bytes": sum(result["bytes"] for result in done),
+        "gaussians": max(result["gaussians"] for result in results),
+        "bytes": sum(result["bytes"] for result in results),
     }
 
 
 @contextmanager
-def _restored_on_failure(files: Sequence[Path]) -> Iterator[None]:
+def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
     """Restore files in one folder if the block fails, as on a full disk, and remove a new folder.
 
     Raises OutputError.
@@ -308,14 +308,14 @@ def _restored_on_failure(files: Sequence[Path]) -> Iterator[None]:
     existed = path_exists(folder)
     try:
         with scratch_folder(folder / "series") as backup, raising_output_error(folder):
-            before = [file for file in files if file.is_file()]
-            for file in before:
+            existing = [file for file in files if file.is_file()]
+            for file in existing:
                 _link_or_copy(file, backup / file.name)
             try:
                 yield
             except BaseException:
                 for file in files:
-                    if file in before:
+                    if file in existing:
                         os.replace(backup / file.name, file)
                     elif file.is_file():
                         file.unlink()
@@ -327,7 +327,7 @@ def _restored_on_failure(files: Sequence[Path]) -> Iterator[None]:
 
 
 def _link_or_copy(file: Path, other: Path) -> None:
-    """Link a file, or copy it on a file system without links; writing replaces files and never changes them."""
+    """Link a file, or copy it on a file system without links; files are replaced and never changed in place."""
     try:
         os.link(file, other)
     except OSError:
@@ -335,11 +335,11 @@ def _link_or_copy(file: Path, other: Path) -> None:
 
 
 def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
-    """Raise ConfigError if a folder has frames of another series, which a player would show too."""
-    frames = {file.name for file in files}
+    """Raise ConfigError if a folder has frames of another series, since players would show them too."""
+    expected = {file.name for file in files}
     with raising_output_error(folder):
         existing = sorted(os.listdir(folder)) if folder.is_dir() else []
-    if others := [name for name in existing if names.fullmatch(name) and name not in frames]:
+    if others := [name for name in existing if names.fullmatch(name) and name not in expected]:
         raise ConfigError(
             f"{folder / others[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
         )
@@ -359,7 +359,7 @@ def _split_name(out: Path) -> tuple[Path, str, str]:
 # A sky as Gaussians on a distant sphere, for programs without environment maps.
 
 COUNT = 10_000  # Gaussians, 2 degrees apart
-RADIUS = 10.0  # of the sphere, relative to this QUANTILE of distances from the center (WildGaussians, 2024)
+RADIUS = 10.0  # of the sphere, relative to the QUANTILE of distances from the center (WildGaussians, 2024)
 QUANTILE = 0.97
 WIDTH = 0.65  # standard deviation, relative to the distance of neighbors; gaps let 2 % of the light through
 FLAT = 0.1  # standard deviation along the ray, relative to that across
@@ -414,7 +414,7 @@ MIN_DISTANCE2 = 4.0e-9  # extents², so that coincident points still get a size:
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0, extent: float = 1.0) -> Parameters:
     """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors.
 
-    extent: of the scene, scene units, for points without a distance.
+    extent: of the scene, scene units; used for a single point.
     """
     count = len(points)
     log_scales = 0.5 * np.log(neighbor_distance2(points.positions, extent)) + math.log(scale)
@@ -433,7 +433,7 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
     """Return the exact mean squared distance to the three nearest neighbors, [N] scene units².
 
-    extent: of the scene, the distance if there is one point, scene units.
+    extent: of the scene, scene units; used for a single point.
     """
     neighbors = min(4, len(positions))
     if neighbors < 2:

@@ -63,9 +63,9 @@ class DropoutMask:
 
 
 HIDDEN = "hidden"  # which training views hide a Gaussian
-INTERVAL2 = "sampling_interval2"  # scene units², smallest over training views; only exists if needed
+INTERVAL2 = "sampling_interval2"  # scene units², smallest over training views; exists only if needed
 ALIGNMENT = 64  # capacity is a multiple of this, so that wide kernels need no tail
-GROWTH = 1.125  # of the capacity; small, since every edit copies all tables anyway
+GROWTH = 1.125  # factor on the capacity; small, since every edit copies all tables anyway
 
 
 @dataclass
@@ -84,7 +84,7 @@ class Gaussians:
         """Upload `parameters`, each [N, components] by the names of PARAMETERS; also filter_variance and motion."""
         self.device = device
         self.count = len(parameters["means"])
-        self.capacity = _aligned(self.count)
+        self.capacity = _align(self.count)
         self.sh_degree = sh_degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
         self.deferred: DeferredUpdates | None = None  # deferred Adam updates
@@ -233,8 +233,8 @@ class Gaussians:
         if count > capacity:
             row_bytes = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             grown = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
-            capacity = _aligned(max(count, grown))
-        on_host = self.on_host.rearranged(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
+            capacity = _align(max(count, grown))
+        on_host = self.on_host.rearrange(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
         for table in (table for name, table in self.tables.items() if name not in on_host):
             moved = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(
@@ -273,7 +273,7 @@ class DeviceModel:
         return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | slot_defines(self.gaussians)
 
 
-def _aligned(count: int) -> int:
+def _align(count: int) -> int:
     return max(ALIGNMENT, -(-count // ALIGNMENT) * ALIGNMENT)
 
 
@@ -321,10 +321,7 @@ def visibility_arguments(model: DeviceModel, view: int | None, mask: Array) -> d
 
 def _hidden(gaussians: Gaussians, view: int | None) -> dict[str, Any]:
     if view is None or HIDDEN not in gaussians.tables:
-        return {
-            "hidden": gaussians["filter_variance"],
-            "hidden_plane": 0,
-            "hidden_bit": 0,
-        }  # any table, since no bit is set
+        any_table = gaussians["filter_variance"]  # its bits are masked out
+        return {"hidden": any_table, "hidden_plane": 0, "hidden_bit": 0}
     plane, bit = divmod(view, HIDDEN_VIEWS)
     return {"hidden": gaussians[HIDDEN], "hidden_plane": plane, "hidden_bit": 1 << bit}

@@ -36,7 +36,7 @@ from clsplat.formats.splats import (
 )
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
-from clsplat.gaussians.motion import evaluate_at, transformed_motion
+from clsplat.gaussians.motion import evaluate_at, transform_motion
 from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.quality import near_plane
@@ -49,7 +49,7 @@ from clsplat.scene.scene import Scene, far_origin, position_text
 class Rendering:
     """The numbers for rendering a model."""
 
-    near: float = 0.0  # scene units; nearer Gaussians are not rendered; 0: as the scene or the model gives it
+    near: float = 0.0  # scene units; nearer Gaussians are not rendered; 0: chosen for the scene or model
     screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: opacities are reduced to conserve energy under that variance
     background: Literal["black", "white"] | None = None  # None: the background of the scene
@@ -139,7 +139,7 @@ class Model:
     rendering: Rendering = NUMBERS
     sky: Sky | None = None  # behind the Gaussians, instead of a background color
     motion: Floats | None = None  # [N, 5 or more] of moving Gaussians, see clsplat/formats/splats.py
-    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of the zero
+    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of zero
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -191,7 +191,7 @@ class Model:
 
     @property
     def near(self) -> float:
-        """The near plane, scene units: that of `rendering`, or else a share of the size of the model."""
+        """The near plane, scene units: that of `rendering`, or else a fraction of the size of the model."""
         return self.rendering.near or usual_near(self.means)
 
     @property
@@ -209,9 +209,9 @@ class Model:
         """Colors of band 0, [N, 3]; values in [0, 1] can be displayed."""
         return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
 
-    def __getitem__(self, chosen: Any) -> "Model":
+    def __getitem__(self, index: Any) -> "Model":
         """Select Gaussians by a mask [N], an array of indices, a slice, or one index."""
-        tables: dict[str, Any] = {name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()}
+        tables: dict[str, Any] = {name: np.atleast_2d(table[index]) for name, table in self.tables().items()}
         return replace(self, **tables)
 
     def transformed(
@@ -231,7 +231,7 @@ class Model:
                 origin, shift = scale * turn @ origin + shift, np.zeros(3)
             changed: dict[str, Any] = transform(self.tables(), scale, turn, shift)
             if self.motion is not None:
-                changed["motion"] = transformed_motion(self.motion, scale, turn)
+                changed["motion"] = transform_motion(self.motion, scale, turn)
             if self.filter_variance is not None:
                 changed["filter_variance"] = self.filter_variance * scale**2
             tables = {name: table.astype(np.float32) for name, table in changed.items()}

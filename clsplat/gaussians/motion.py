@@ -12,8 +12,8 @@ from clsplat.core.errors import DataError
 from clsplat.core.quaternions import multiply, unit_quaternions
 from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, Parameters, motion_fields
 
-FAINTEST = 1 / 255  # opacity factor below which a Gaussian is invisible
-LOGIT = 80.0  # largest logit that fades
+MIN_PRESENCE = 1 / 255  # opacity factor below which a Gaussian is invisible
+MAX_LOGIT = 80.0  # larger logits are clamped before they fade
 
 
 def static_motion(count: int, width: int) -> NDArray[np.float32]:
@@ -29,40 +29,40 @@ def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) ->
     fields, table = motion_fields(motion.shape[1]), motion.astype(np.float64)
     dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):
-        return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
+        return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], MAX_LOGIT))))[:, 0]
 
 
 def evaluate_at(parameters: Parameters, time: float) -> Parameters:
     """Return the Gaussians that are visible at a time as static Gaussians."""
     motion = parameters[MOTION].astype(np.float64)
     fields, factor = motion_fields(motion.shape[1]), presence(motion, time)
-    is_visible = factor >= FAINTEST
+    is_visible = factor >= MIN_PRESENCE
     tables = {name: table[is_visible] for name, table in parameters.items() if name != MOTION}
     motion, factor = motion[is_visible], factor[is_visible, None]
     dt = time - motion[:, fields["time_center"]]
-    moved = tables["means"].astype(np.float64)
+    means = tables["means"].astype(np.float64)
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         if name in fields:
-            moved = moved + motion[:, fields[name]] * dt**order
+            means = means + motion[:, fields[name]] * dt**order
     with np.errstate(over="ignore", invalid="ignore"):  # Model.at rejects such values
-        tables["means"] = moved.astype(np.float32)
+        tables["means"] = means.astype(np.float32)
     if "turn" in fields:
         tables["quats"] = (tables["quats"] + motion[:, fields["turn"]] * dt).astype(np.float32)
     logit = tables["logit_opacity"].astype(np.float64)
-    bounded = np.minimum(logit, LOGIT)
+    bounded = np.minimum(logit, MAX_LOGIT)
     faded = bounded + np.log(factor) - np.log1p(np.exp(bounded) * (1 - factor))
     tables["logit_opacity"] = np.where(factor < 1, faded, logit).astype(np.float32)
     return tables
 
 
-def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the motion after x -> scale · turn x, with a rotation `turn`, [3, 3]."""
-    fields, moved = motion_fields(motion.shape[1]), motion.astype(np.float64)
+def transform_motion(motion: NDArray[np.floating], scale: float, rotation: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the motion after x -> scale · rotation x.  rotation: [3, 3]."""
+    fields, result = motion_fields(motion.shape[1]), motion.astype(np.float64)
     for name in fields.keys() & {"velocity", "acceleration", "jerk"}:
-        moved[:, fields[name]] = scale * moved[:, fields[name]] @ turn.T
+        result[:, fields[name]] = scale * result[:, fields[name]] @ rotation.T
     if "turn" in fields:
-        moved[:, fields["turn"]] = multiply(unit_quaternions(turn.astype(np.float64)), moved[:, fields["turn"]])
-    return moved
+        result[:, fields["turn"]] = multiply(unit_quaternions(rotation.astype(np.float64)), result[:, fields["turn"]])
+    return result
 
 
 def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
@@ -84,18 +84,18 @@ def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Para
 
 
 def shift_time_center(
-    tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]
+    tables: Mapping[str, NDArray[np.float64]], shift: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Shift time centers by `by`, [N]; return means, quaternions, and motion of the same paths."""
-    motion, dt = tables[MOTION].copy(), by[:, None]
-    fields, zeros = motion_fields(motion.shape[1]), np.zeros((len(by), 3))
-    first, second, third = (
+    """Shift time centers by `shift`, [N]; return means, quaternions, and motion of the same paths."""
+    motion, dt = tables[MOTION].copy(), shift[:, None]
+    fields, zeros = motion_fields(motion.shape[1]), np.zeros((len(shift), 3))
+    velocity, acceleration, jerk = (
         motion[:, fields[name]].copy() if name in fields else zeros for name in ("velocity", "acceleration", "jerk")
     )
-    means = tables["means"] + first * dt + second * dt**2 + third * dt**3
+    means = tables["means"] + velocity * dt + acceleration * dt**2 + jerk * dt**3
     motion[:, fields["time_center"]] += dt
-    motion[:, fields["velocity"]] = first + 2 * second * dt + 3 * third * dt**2
+    motion[:, fields["velocity"]] = velocity + 2 * acceleration * dt + 3 * jerk * dt**2
     if "acceleration" in fields:
-        motion[:, fields["acceleration"]] = second + 3 * third * dt
+        motion[:, fields["acceleration"]] = acceleration + 3 * jerk * dt
     quats = tables["quats"] + (motion[:, fields["turn"]] * dt if "turn" in fields else 0)
     return {"means": means, "quats": quats, MOTION: motion}

@@ -15,8 +15,8 @@ from clsplat.gaussians.structs import Struct
 from clsplat.opencl.device import Array
 
 NO_SLOT = 0xFFFFFFFF  # slots.h
-GROWTH = 1.25  # of the number of slots, when a view needs more
-MIN_ROWS = 4096  # of all slots together; also the rows per upload when all blocks are needed
+GROWTH = 1.25  # factor on the number of slots, when a view needs more
+MIN_ROWS = 4096  # rows in all slots; also the rows per upload when all blocks are needed
 
 
 class HostTables:
@@ -81,11 +81,11 @@ class HostTables:
         if len(blocks) > self._slots:
             self._slots = max(int(GROWTH * len(blocks)), MIN_ROWS // self.lanes)
             for name, table in self.tables.items():
-                slots_of_table = self.gaussians.tables[name]
-                slots_of_table.array = self.device.empty(0)  # frees the old slots before new ones are allocated
-                slots_of_table.array = self.device.empty((self._slots, table.shape[1], self.lanes))
+                table_slots = self.gaussians.tables[name]
+                table_slots.array = self.device.empty(0)  # frees the old slots before new ones are allocated
+                table_slots.array = self.device.empty((self._slots, table.shape[1], self.lanes))
         for name, table in self.tables.items():
-            self._part(name, len(blocks)).set(table[blocks])
+            self._first_slots(name, len(blocks)).set(table[blocks])
         slots = np.full(self.slot.shape, NO_SLOT, np.uint32)
         slots[blocks] = np.arange(len(blocks))
         self.slot.set(slots)
@@ -93,7 +93,7 @@ class HostTables:
 
     def start_download(self) -> None:
         """Start downloading the slots, after the commands enqueued so far."""
-        self._downloads = {name: self._part(name, len(self.loaded)).get_later() for name in self.tables}
+        self._downloads = {name: self._first_slots(name, len(self.loaded)).get_later() for name in self.tables}
 
     def finish_download(self) -> None:
         """Wait for the download and write it into the tables."""
@@ -102,7 +102,7 @@ class HostTables:
         self._downloads = {}
 
     def parts(self) -> Iterator[None]:
-        """Load all blocks into the slots, some at a time, and finally the blocks that were loaded before."""
+        """Load all blocks into the slots, part by part, and finally the blocks that were loaded before."""
         before, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
         for first in range(0, self._blocks, size):
             self.load(np.arange(first, min(first + size, self._blocks)))
@@ -115,7 +115,7 @@ class HostTables:
         table[rows] = values
         self.set(name, table)
 
-    def rearranged(self, source: NDArray[np.uint32], fresh: NDArray[np.uint32]) -> dict[str, NDArray[np.float32]]:
+    def rearrange(self, source: NDArray[np.uint32], fresh: NDArray[np.uint32]) -> dict[str, NDArray[np.float32]]:
         """Return the tables after `Gaussians.rearrange`, [rows, components]."""
         tables = {name: self.get(name)[source] for name in self.tables}
         for name, table in tables.items():
@@ -123,7 +123,7 @@ class HostTables:
                 table[fresh > 0] = 0
         return tables
 
-    def _part(self, name: str, count: int) -> Array:
+    def _first_slots(self, name: str, count: int) -> Array:
         """Return the first slots of a table."""
         slots = self.gaussians.tables[name].array
         return Array(self.device, slots.buffer, (count, *slots.shape[1:]), slots.dtype)

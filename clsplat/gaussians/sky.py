@@ -14,7 +14,7 @@ from clsplat.core.files import write_error, write_text
 from clsplat.core.reading import read_json, sha256
 from clsplat.opencl.device import Array, Device
 
-# The octahedral map of all directions to a square (Meyer et al. 2010), as in cl_kernels/sky.cl.
+# The octahedral map from directions to a square (Meyer et al. 2010), as in cl_kernels/sky.cl.
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -45,7 +45,7 @@ def texel_directions(side: int) -> Floats:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float64)
 
 
-def texel_at(i: Integers, j: Integers, side: int) -> Integers:
+def texel_indices(i: Integers, j: Integers, side: int) -> Integers:
     """Return the indices of texels in columns i and rows j, from -1 to `side`.
 
     Beyond an edge, the map continues at the mirrored position of the same edge.
@@ -60,12 +60,12 @@ def texel_at(i: Integers, j: Integers, side: int) -> Integers:
 def neighbor_texels(side: int) -> Integers:
     """Return each texel's 3x3 neighborhood, [side * side, 9]."""
     j, i = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
-    return np.stack([texel_at(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
+    return np.stack([texel_indices(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
 
 
 def bilinear_texels(i: Integers, j: Integers, side: int) -> Integers:
     """Return the four texels around coordinates with integer parts i and j, from -1 to side - 1, [..., 4]."""
-    return np.stack([texel_at(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
+    return np.stack([texel_indices(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
 
 
 def bilinear_weights(fractions: Floats) -> Floats:
@@ -95,7 +95,7 @@ MEANING = (
 
 @dataclass(frozen=True)
 class DeviceSky:
-    """A map on the device."""
+    """A sky on the device."""
 
     texels: Array  # [3, side * side]
     side: int
@@ -107,7 +107,7 @@ class DeviceSky:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """A map of the colors behind a model."""
+    """An octahedral map of the colors behind a model."""
 
     texels: NDArray[np.float32]  # [side * side, 3], row by row
 
@@ -141,7 +141,7 @@ def sky_path(model: Path) -> Path:
 
 
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
-    """Write a sky next to its model file, whose SHA-256 is `digest`; if `sky` is None, remove the model from the file.
+    """Write a sky next to its model file with SHA-256 `digest`; if `sky` is None, remove the model from that file.
 
     Other models with the same stem keep an identical sky.  Raises OutputError.
     """

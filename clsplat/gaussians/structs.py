@@ -1,4 +1,4 @@
-"""Define protocols and helpers shared by the parts of `Gaussians`."""
+"""Define protocols and helpers that the parts of `Gaussians` share."""
 
 import copy
 from typing import Any, ClassVar, Protocol
@@ -74,9 +74,9 @@ class GaussianGradients:
 
     def without_deferred(self) -> "GaussianGradients":
         """Return the same arrays, but raise ConfigError for those with deferred updates."""
-        other = copy.copy(self)
-        other._withheld = ("sh_rest",)
-        return other
+        gradients = copy.copy(self)
+        gradients._withheld = ("sh_rest",)
+        return gradients
 
     def fits(self, gaussians: Struct) -> bool:
         """Return whether the shapes match the parameters of these Gaussians."""
@@ -118,4 +118,4 @@ def moment_tables(parameter: str) -> tuple[str, str]:
     return f"adam/{parameter}/moment1", f"adam/{parameter}/moment2"
 
 
-HARMONICS = ("sh_rest", *moment_tables("sh_rest"))  # bands above 0: most of a Gaussian's memory
+HARMONICS = ("sh_rest", *moment_tables("sh_rest"))  # bands above 0: most of the memory of a Gaussian

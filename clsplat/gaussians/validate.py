@@ -12,11 +12,11 @@ from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
 from clsplat.scene.scene import position_text
 
-OTHERS = (".usd", ".usdc", ".usdz", ".obj", ".fbx", ".las", ".laz", ".rad", ".lcc")  # models that cannot be read
+UNSUPPORTED = (".usd", ".usdc", ".usdz", ".obj", ".fbx", ".las", ".laz", ".rad", ".lcc")  # models that cannot be read
 MIN_COUNT = 16  # Gaussians needed for statistics
-FLAT = 1e-6  # relative to the typical size; smaller scales are those of discs or needles
+FLAT = 1e-6  # relative to the typical size; Gaussians with smaller scales are discs or needles
 FAINT = 0.999 / 255  # opacities below are not rendered
-LARGE = 0.05  # relative to the extent; linear scales misread as logarithms exceed it
+LARGE = 0.05  # relative to the extent; exceeded by linear scales that are read as logarithms
 NEARLY_ALL = 0.99
 DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "flat": "flat", "invisible": "invisible"}
 
@@ -26,7 +26,7 @@ def is_model(path: Path) -> bool:
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
-    return bool(format_of_name(file) or file.suffix.lower() in OTHERS or (file.is_file() and detect(file)))
+    return bool(format_of_name(file) or file.suffix.lower() in UNSUPPORTED or (file.is_file() and detect(file)))
 
 
 def examine(path: Path) -> dict[str, Any]:
@@ -43,8 +43,8 @@ def examine(path: Path) -> dict[str, Any]:
     findings += [message] if (message := too_large_message(finite.tables())) else []
     findings += _find_activated(finite)
     length = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
-    if zero := int((length == 0).sum()):
-        findings.append(f"{zero} quaternions have length 0")
+    if no_rotation := int((length == 0).sum()):
+        findings.append(f"{no_rotation} quaternions have length 0")
     if not len(model):
         findings.append("it has no Gaussians")
     if model_file(path).name == LOD_META:
@@ -62,7 +62,7 @@ def examine(path: Path) -> dict[str, Any]:
         **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
             "not_finite": int(bad.sum()),
-            "no_rotation": zero,
+            "no_rotation": no_rotation,
             "flat": int((finite.log_scales < np.log(FLAT * typical_size(finite.means))).any(axis=1).sum()),
             "invisible": int((finite.opacities < FAINT).sum()),
         },
@@ -78,8 +78,8 @@ def lines(report: dict[str, Any]) -> str:
     )
     degree = f"SH degree {report['sh_degree']}{marks}"
     rows = [f"{report['model']}: {report['format']}, {report['gaussians']:,} Gaussians, {degree}"]
-    for name, (low, middle, high) in report["ranges"].items():
-        rows.append(f"  {name:<12} {low:.4g} to {high:.4g}, median {middle:.4g}")
+    for name, (low, median, high) in report["ranges"].items():
+        rows.append(f"  {name:<12} {low:.4g} to {high:.4g}, median {median:.4g}")
     for low, high in [report["bounds"]] if report["bounds"] else []:
         text = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
         rows.append(f"  {'bounds':<12} ({next(text)}) to ({next(text)})")
@@ -103,7 +103,7 @@ def verdict(report: dict[str, Any]) -> str:
 
 
 def _find_activated(model: Model) -> list[str]:
-    """Return findings about values that look already activated."""
+    """Return findings about values that seem to be activated already."""
     if len(model) < MIN_COUNT:
         return []
     findings = []

@@ -1,4 +1,4 @@
-"""Upload the camera of a view, and size its image planes."""
+"""Upload the camera of a view, and compute the size of its image planes."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -59,7 +59,7 @@ class DeviceCamera:
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
-def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
+def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
     """Return a camera with another pose, [3, 4], and focal lengths times `zoom`; the size of planes does not change."""
     values = camera.values.copy()
     for name in ("fx", "fy"):
@@ -72,7 +72,7 @@ def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zo
 
 
 def update_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
-    """Upload the camera of a view with the same size as `camera`; return `camera` itself if its values are equal."""
+    """Upload the camera of a view of the same size as `camera`; return `camera` if its values are equal."""
     values = camera_values(view, camera.tile)
     if values == camera.values:
         return camera

@@ -114,7 +114,7 @@ class ScreenFilter(Settings):
             raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.numbers")
 
     def numbers(self) -> tuple[float, float, float]:
-        """Return what rendering reads: variance, compensate, and 1 to integrate over the pixel's box."""
+        """Return the numbers for rendering: variance, compensate, and 1 to integrate over the pixel's box."""
         return self.variance, float(self.compensate), float(self.pixel_box)
 
 
@@ -196,10 +196,10 @@ class ModelSettings(Settings):
         Literal["auto"] | Annotated[float, Field(gt=0, lt=MAX_NUMBER)],
         in_one_sentence(f"expected 'auto' or a depth above 0 and below {MAX_NUMBER:g}"),
     ] = "auto"
-    """Smallest depth in scene units that is drawn; `auto`: 4% of the scene's extent, or half of the depth that 1% of
-    the observed points are nearer than, if that is less.  A run writes the number."""
+    """Smallest depth in scene units that is rendered; `auto`: 4% of the scene's extent, or half of the 1% quantile of
+    the depths of observed points, if that is less.  A run writes the number."""
     near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
-    """Written by a run: the number that `auto` chose.  Other photos choose again while `near` is that number."""
+    """Written by a run: the number that `auto` chose.  While `near` is that number, other photos choose again."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()

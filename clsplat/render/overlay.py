@@ -26,21 +26,21 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
     scale: weight of the loss on the layer's alpha, the sum of 1 - T over pixels.
     """
     camera = frame.camera
-    both, sums = workspace.array("image and layer", image.shape), workspace.array("layer sums", camera.rows)
+    composite, sums = workspace.array("image and layer", image.shape), workspace.array("layer sums", camera.rows)
     behind = workspace.array("behind a layer", (1, camera.rows, camera.stride))
     workspace.device.program("layer.cl").lay_over(
         groups=(1, camera.rows),
         layer=frame.image,
         transmittance=frame.transmittance,
         image=image,
-        both=both,
+        both=composite,
         behind=behind,
         row_sums=sums,
         scale=scale,
         channels=image.shape[0],
         **camera.plane_arguments(),
     )
-    return OverlayLayer(frame, both, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
+    return OverlayLayer(frame, composite, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
 
 
 def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:

@@ -160,7 +160,7 @@ class Frame:
     depth_key: Array  # [S] bits of the depth; all ones if the splat was culled
     radius: Array  # [S] px, 3 standard deviations; 0 if not visible
     lists: TileLists
-    tile_last: Array  # [T] pairs of each tile up to the last one that any pixel blends
+    tile_last: Array  # [T] number of pairs of each tile up to the last one that a pixel blends
     image: Array  # [3, rows, stride], zero outside the image; with a fourth plane [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
@@ -188,7 +188,7 @@ class Rasterizer:
         self.tiler = Tiler(device, self.workspace, sort)
         self.skies = Skies(device, self.workspace)
         self._black = device.zeros(3)
-        device.program("project.cl")  # builds the program now, like the others
+        device.program("project.cl")  # built now, like the other programs
         self._blend("color")
         self._lanes = int(device.tuning["LANES"])
         self._gradients: GaussianGradients | None = None  # allocated at first use
@@ -219,7 +219,7 @@ class Rasterizer:
                     raise
 
     def _narrow(self, camera: DeviceCamera) -> bool:
-        """Halve the height of the bands; return whether they had more than one row."""
+        """Halve the height of the bands; return whether they had more than one row of tiles."""
         bands = self._bands.get(camera.tiles_y, 1)
         self._bands[camera.tiles_y] = 2 * bands
         return bands < camera.tiles_y
@@ -248,8 +248,8 @@ class Rasterizer:
                     tile_last=tile_last,
                     first_tile=first_tile,
                 )
-        seen = splats, array("depth_key", model.gaussians.capacity, np.uint32), radius, lists, tile_last
-        return Frame(camera, *seen, image, transmittance, bands, content, model)
+        buffers = splats, array("depth_key", model.gaussians.capacity, np.uint32), radius, lists, tile_last
+        return Frame(camera, *buffers, image, transmittance, bands, content, model)
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """Return the blending kernels, with a fourth plane only if the content needs it."""
@@ -261,7 +261,7 @@ class Rasterizer:
         return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
-        """Return the first tile and the number of tiles of each launch, which display watchdogs may limit in time."""
+        """Return the first tile and the number of tiles of each launch; watchdogs may limit the time of a launch."""
         step = self.budget.tiles or band.tiles_inside
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]

@@ -12,9 +12,9 @@ from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import CAMERA, DeviceCamera
 from clsplat.render.workspace import Workspace
 
-NUMBERS = constants("sky.cl")
+CONSTANTS = constants("sky.cl")
 RUN_WORDS, CORNERS, RUN_SUMS, PLACE_BITS, BORDER = (
-    int(NUMBERS[name]) for name in ("RUN_WORDS", "CORNERS", "RUN_SUMS", "PLACE_BITS", "BORDER")
+    int(CONSTANTS[name]) for name in ("RUN_WORDS", "CORNERS", "RUN_SUMS", "PLACE_BITS", "BORDER")
 )
 CACHE_SIZE = 1 << 28  # bytes of runs on the device
 Integers = NDArray[np.int64]
@@ -64,7 +64,7 @@ def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> I
 
 
 class Skies:
-    """Renders skies and computes their gradients; caches the runs of recently used cameras."""
+    """Renders skies and computes their gradients; caches the runs of recent cameras."""
 
     def __init__(self, device: Device, workspace: Workspace, cache_size: int = CACHE_SIZE) -> None:
         self.device, self.workspace = device, workspace
@@ -125,10 +125,10 @@ class Skies:
         """Return T dL/dT of the loss on splats in front of the sky, [1, rows, stride], and row sums of 1 - T, [rows].
 
         free: [1, side * side], 1 for trained texels, otherwise 0; photograph: [3, rows, stride]; difference: largest
-        for a pixel that counts as sky; scale: factor of the loss.
+        for a pixel that counts as sky; scale: factor on the loss.
         """
-        runs, wide = self.runs(camera, sky.side), camera.stride + 2 * BORDER
-        matches = self.workspace.array("sky matches", (camera.rows + 2, wide))
+        runs, padded_stride = self.runs(camera, sky.side), camera.stride + 2 * BORDER
+        matches = self.workspace.array("sky matches", (camera.rows + 2, padded_stride))
         behind = self.workspace.array("behind", (1, camera.rows, camera.stride))
         sums = self.workspace.array("sky sums", camera.rows)
         matches.fill(0)

@@ -15,10 +15,10 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
-Defines = dict[str, int] | None  # those of the projection
-TRIALS = 3  # of each sort, to choose for `auto`
+Defines = dict[str, int] | None  # macros of the projection
+TRIALS = 3  # of each sort, before `auto` chooses
 MAX_SINGLE_GROUP_RUN = 32  # values per item up to which one group scans everything
-MAX_SCAN_BLOCKS = 1024  # each block adds the sums of all blocks before it
+MAX_SCAN_BLOCKS = 1024  # each block adds up the sums of all previous blocks
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def resolve_sort(device: Device, sort: Sort) -> Sort:
 
 
 class Tiler:
-    """Builds tile lists.  sort: auto is radix on CPUs; on GPUs, it is the sort that is faster in the first frame."""
+    """Builds tile lists.  sort: auto is radix on CPUs, and the faster sort in the first frame on GPUs."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace
@@ -133,7 +133,7 @@ class Tiler:
         return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
-        """Return the arguments of both kernels for large splats; on GPUs, each item checks one splat."""
+        """Return the arguments of both kernels for large splats; on GPUs, each work-item checks one splat."""
         run = self._team if self._team > 1 else self._runs(count, shortest=1 << 8)[0]
         size = {"groups": -(-count // run), "run": run, "count": count}
         size |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
@@ -212,12 +212,12 @@ class Tiler:
     def _sort_in_tiles(
         self, pair_tile: Array, pair_splat: Array, depth_key: Array, pairs: int, tiles: int
     ) -> tuple[Array, Array]:
-        filled = self.workspace.array("tile_fill", tiles, np.uint32)
-        filled.fill(0)
+        tile_fill = self.workspace.array("tile_fill", tiles, np.uint32)
+        tile_fill.fill(0)
         bitonic = self.device.program("sort_bitonic.cl")
-        bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=filled, count=pairs)
-        tile_offset = self.scan(filled, tiles, "tile_offset")
-        filled.fill(0)
+        bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=tile_fill, count=pairs)
+        tile_offset = self.scan(tile_fill, tiles, "tile_offset")
+        tile_fill.fill(0)
         tile_depth = self.workspace.array("tile_depth", pairs, np.uint32)
         tile_pairs = self.workspace.array("tile_pairs", pairs, np.uint32)
         bitonic.fill_tiles(
@@ -226,7 +226,7 @@ class Tiler:
             pair_splat=pair_splat,
             depth_key=depth_key,
             tile_offset=tile_offset,
-            tile_fill=filled,
+            tile_fill=tile_fill,
             tile_depth=tile_depth,
             tile_pairs=tile_pairs,
             count=pairs,

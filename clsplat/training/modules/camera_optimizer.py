@@ -20,7 +20,7 @@ from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, explain
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ViewTable, adam_step
-from clsplat.render.camera import moved_camera
+from clsplat.render.camera import move_camera
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.render.workspace import Workspace
 from clsplat.scene.quality import points_in_image
@@ -206,7 +206,7 @@ class CameraState(ModuleState):
     def before_render(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:
             zoom, pose = self.factor(self.views[step.view].name), self.pose(step.view)
-            step.photograph = replace(step.photograph, camera=moved_camera(step.camera, pose, zoom))
+            step.photograph = replace(step.photograph, camera=move_camera(step.camera, pose, zoom))
 
     def after_backward(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:

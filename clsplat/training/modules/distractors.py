@@ -19,7 +19,7 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import LossValue
 from clsplat.opencl.device import Device
-from clsplat.render.camera import moved_camera
+from clsplat.render.camera import move_camera
 from clsplat.render.overlay import lay_over, look_behind
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
@@ -108,7 +108,7 @@ class DistractorsState(ModuleState):
             return
         camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
         model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
-        frame = self.rasterizer.forward(model, moved_camera(camera, np.eye(3, 4)), self._black)
+        frame = self.rasterizer.forward(model, move_camera(camera, np.eye(3, 4)), self._black)
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
         layer = lay_over(step.workspace, frame, step.image, scale)
         step.image = layer.image
