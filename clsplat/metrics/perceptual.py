@@ -28,9 +28,9 @@ INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 class Lpips:
     """Learned perceptual distance (Zhang et al. 2018); 0 for equal images.
 
-    The file contains a network with two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output:
-    the result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")`, with dynamic height and width.  That network expects
-    values in [-1, 1]; the tables of 3DGS and Mip-Splatting used values in [0, 1], which give smaller distances.
+    The file is that of `clsplat data lpips`, or the result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")` with
+    dynamic height and width: two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output.  That
+    network expects values in [-1, 1]; the tables of 3DGS and Mip-Splatting used values in [0, 1] with the same network.
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:

@@ -57,9 +57,9 @@ class Evaluate(Scheduled):
     metrics: list[Metric] = Field(["psnr", "ssim"])
     """Metrics in addition to LPIPS; psnr and ssim are required."""
     lpips: InputPath | None = None
-    """ONNX file of LPIPS."""
+    """ONNX file of LPIPS, which `clsplat data lpips` writes."""
     lpips_input: InputRange = "-1..1"
-    """Range of the values that LPIPS gets; the tables of 3DGS and Mip-Splatting use 0..1."""
+    """Range of the values that LPIPS gets; the tables of 3DGS and Mip-Splatting use 0..1 and the network vgg."""
     file: Annotated[str, AfterValidator(_inside)] | None = None
     """Model file in the run folder to measure; default: the model in training."""
 
@@ -110,6 +110,7 @@ class Evaluate(Scheduled):
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             views_text = f"{f'{self.file}, ' if self.file else ''}{self.split} views at 1/{downscale:g}"
             quality = f"PSNR {averages['psnr']:.2f} dB  SSIM {averages['ssim']:.4f}"
+            quality += f"  LPIPS {averages['lpips']:.4f}" if averages["lpips"] is not None else ""
             line = f"step {run.model_step}  {views_text}: {quality}  ({pluralize(len(results), 'view')})"
             if run.cache.get("evaluated") != line:  # the last evaluation of a training may be the same
                 run.cache["evaluated"] = line

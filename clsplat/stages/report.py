@@ -412,6 +412,8 @@ def _figures(run: Run) -> dict[str, str]:
                     views = f" ({pluralize(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
                     values[f"{split} {name}{suffix}{views}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
+            if averages.get("lpips") is not None:
+                values[f"{split} LPIPS{suffix}"] = f"{averages['lpips']:.4f}"
     if run.is_refit and run.best:
         measured = run.best.measured
         values["validation PSNR before the refit"] = f"{measured.validation:.2f} dB"
