@@ -96,9 +96,9 @@ def status(folder: PathLike) -> dict[str, Any]:
     if the process is gone.  `advice` says how to continue.  The store of a sweep has `cells`, `counts` of their states,
     and `events`; a scene in blocks has `state` and `parts`.
     """
-    from clsplat.workflows.folder import status_of
+    from clsplat.workflows.folder import parse_status
 
-    return status_of(Path(folder))
+    return parse_status(Path(folder))
 
 
 def status_schema() -> dict[str, Any]:

@@ -35,7 +35,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
-from clsplat.training.checkpoint import saved_on_failure
+from clsplat.training.checkpoint import save_on_failure
 from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import host_model
 from clsplat.training.status import StatusFile
@@ -117,7 +117,7 @@ class Trainer:
                 (self.out / CHECKSUMS).unlink(
                     missing_ok=True
                 )  # the list includes files of stages that a trainer does not run
-                with saved_on_failure(self._run):
+                with save_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
             stack.callback(_record_closed, status)
             self._resources = stack.pop_all()
@@ -161,7 +161,7 @@ class Trainer:
             with (
                 recording_failures(self._run.status, as_raised=True),
                 stopping_on_signals(finish_step),
-                saved_on_failure(self._run),
+                save_on_failure(self._run),
             ):
                 view = next(self._steps, None)
                 self._record_end()

@@ -98,7 +98,7 @@ class Box(Settings):
         if not origin.any():
             return self
         low, high = (
-            [None if value is None else float(value - by) for value, by in zip(corner, origin, strict=True)]
+            [None if value is None else float(value - offset) for value, offset in zip(corner, origin, strict=True)]
             for corner in (self.low, self.high)
         )
         return self.model_copy(update={"low": low, "high": high})

@@ -56,8 +56,10 @@ MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that every value excep
 
 
 class Edit:
-    """The outcome of each Gaussian: how many rows it becomes, how many of them are the old row, the factor on the
-    scales of fresh rows, and whether they share its opacity.
+    """The outcome of each Gaussian.
+
+    This is the number of rows that it becomes, how many of them are the old row, the factor on the scales of fresh
+    rows, and whether they share its opacity.
 
     Random numbers depend only on `seed`, `step`, and the rule.
     """
@@ -143,7 +145,7 @@ class Edit:
         )
 
     def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
+        """Return a threshold on `statistic` that the same number of Gaussians reach as `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
@@ -234,7 +236,7 @@ class Edit:
 
 
 class Rule(Settings):
-    """A condition on Gaussians, and the outcome of those that meet it."""
+    """A condition on Gaussians, and the outcome of the Gaussians that meet it."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})

@@ -31,8 +31,8 @@ def weights(
 ) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
-    weight_per_view: the fraction of a view's weight to which its useful Gaussians, the heaviest first, add up; None to
-    not count views.  dtype: type of the total.
+    weight_per_view: fraction of a view's weight that its useful Gaussians, the heaviest ones, add up to; None skips the
+    count of views.  dtype: type of the total.
     """
     total, useful_views = np.zeros(count, dtype), np.zeros(count, np.int64)
     for view in views:
@@ -44,7 +44,7 @@ def weights(
 
 
 def heaviest(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
-    """Return the mask, [N], of the fewest Gaussians that add up to this fraction of the weight; none of weight 0."""
+    """Return the mask, [N], of the smallest set of Gaussians with this fraction of the weight; none have weight 0."""
     order = np.argsort(-weight, kind="stable")
     before = np.cumsum(weight[order]) - weight[order]
     chosen = np.zeros(len(weight), bool)
@@ -113,7 +113,7 @@ class SampledPruning(Rule):
 
     @abstractmethod
     def weights(self, edit: Edit) -> NDArray[np.float64]:
-        """Return the odds that each Gaussian is removed, [N], 0 to infinity."""
+        """Return the odds of removing each Gaussian, [N], 0 to infinity."""
 
     def mark(self, edit: Edit) -> None:
         """Mark a sample for removal; the size of a split Gaussian is that of its children."""

@@ -37,7 +37,7 @@ class PruneFar(Rule):
 
 
 def largest_on_screen(survey: Survey) -> NDArray[np.float64]:
-    """Return the largest size of each Gaussian on the screen in any training view that shows it, [N]; 0 without one.
+    """Return the largest size of each Gaussian on the screen over the training views that show it, [N]; 0 if none does.
 
     The size is the largest standard deviation as a fraction of the image width.
     """

@@ -26,7 +26,7 @@ from clsplat.scene.quality import Measures
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
 from clsplat.stages.render import Render
-from clsplat.training.memory import first_tables, last_place
+from clsplat.training.memory import offload_target, table_widths
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, Training
 
@@ -100,10 +100,10 @@ def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
     if first is None:
         return []
     motion, count = run.model_settings.time, first.expected_count(run.scene)
-    tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
+    tables = table_widths(run.model_settings.sh_degree, motion.width if motion else 0)
     if run.harmonics == "auto" and count <= run.memory_plan(tables, "device").limit:
         return []
-    planned = run.memory_plan(tables, last_place(run.harmonics, run.device.info))
+    planned = run.memory_plan(tables, offload_target(run.harmonics, run.device.info))
     return [f"  {planned.text(count)}"] if planned.host else []
 
 

@@ -24,7 +24,7 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.report import overfitting_note
 from clsplat.training import checkpoint
 from clsplat.training.best_model import Best
-from clsplat.training.checkpoint import saved_on_failure
+from clsplat.training.checkpoint import save_on_failure
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 
@@ -138,7 +138,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     """
     run.on_progress = show
     previous = begin(pipeline, run, start)
-    with finishing_on_interrupt(run), saved_on_failure(run):
+    with finishing_on_interrupt(run), save_on_failure(run):
         run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
         LOG.warning("%s", finding.text)

@@ -16,7 +16,7 @@ from clsplat.runs.results import read_metrics
 from clsplat.runs.state import RunState
 from clsplat.training.modules.base import TrainingModule
 from clsplat.training.records import Records
-from clsplat.training.status import status_of
+from clsplat.training.status import parse_status
 
 LOG = logging.getLogger("clsplat")
 
@@ -34,7 +34,7 @@ def run_status(state: RunState) -> dict[str, Any]:
     if not (status := dict(state.status)):
         raise DataError(f"{out}: has no readable status.json; expected a run folder")
     try:
-        known = status_of(status)
+        known = parse_status(status)
     except DataError as error:
         raise DataError(
             f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` checks the other files"

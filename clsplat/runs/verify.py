@@ -38,7 +38,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import status_of
+from clsplat.training.status import parse_status
 
 # Checks of each kind of file: they return a description, or raise DataError.
 
@@ -63,7 +63,7 @@ def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
 
 def status_file(path: Path) -> str:
     content = read_json(path)
-    status = status_of(content)
+    status = parse_status(content)
     return status.state if status else f"not checked further: format {content['format']} of a newer version"
 
 

@@ -19,7 +19,7 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import Statistic
 from clsplat.density.thresholds import SceneScale
 from clsplat.training.run import Run
-from clsplat.training.sh_offload import make_room, more_room, most_gaussians
+from clsplat.training.sh_offload import device_capacity, make_room, offload_advice
 from clsplat.training.stage import Scheduled
 
 LOG = logging.getLogger("clsplat")
@@ -98,13 +98,13 @@ class Densify(Scheduled):
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         limit_by_settings = min(self._limits(run, edit), default=math.inf)
-        capacity = most_gaussians(run, limit_by_settings)
+        capacity = device_capacity(run, limit_by_settings)
         limit = int(min(capacity, limit_by_settings))
         room = partial(make_room, run)
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self._box(run), room)
         run.refresh_filter()
         if change.after == capacity:
-            remedy = f"smaller photos{more_room(run)} leave room for more"
+            remedy = f"smaller photos{offload_advice(run)} leave room for more"
             most = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))

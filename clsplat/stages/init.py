@@ -22,10 +22,10 @@ from clsplat.scene.view import View, load_image, load_rgba
 from clsplat.scene.viewpoint import random_points, scene_box, scene_center
 from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import add_motion, require_times, with_motion
-from clsplat.training.memory import first_tables, last_place
+from clsplat.training.memory import offload_target, table_widths
 from clsplat.training.modules.sky_choice import start_sky
 from clsplat.training.run import Run
-from clsplat.training.sh_offload import more_room
+from clsplat.training.sh_offload import offload_advice
 from clsplat.training.stage import Stage
 
 # Sources of points: the scene, a plane sweep over the photos, the visual hull.
@@ -221,8 +221,8 @@ class Init(Stage):
     def _require_memory(run: Run, count: int) -> None:
         """Raise MemoryLimitError if `count` Gaussians do not fit."""
         motion = run.model_settings.time
-        tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
-        run.memory_plan(tables, last_place(run.harmonics, run.device.info)).check(count, more_room(run))
+        tables = table_widths(run.model_settings.sh_degree, motion.width if motion else 0)
+        run.memory_plan(tables, offload_target(run.harmonics, run.device.info)).check(count, offload_advice(run))
 
     def _random(self, run: Run) -> PointCloud:
         """Return random points.  Raises MemoryLimitError, before making any, if they would not fit."""

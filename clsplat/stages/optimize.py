@@ -25,7 +25,7 @@ from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
-from clsplat.training.sh_offload import more_room, place_harmonics
+from clsplat.training.sh_offload import offload_advice, place_harmonics
 from clsplat.training.stage import Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
@@ -300,7 +300,7 @@ class Optimize(ValidatedTraining):
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
         if run.harmonics != "auto" or memory.host == 0:  # else it was checked before the harmonics moved to the host
-            memory.check(count, more_room(run))
+            memory.check(count, offload_advice(run))
         is_tight = memory.host or memory.limit < ROOMY * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
         forecast = Forecast.from_rules(run.step, last_step, [stage.due for stage in self._density])

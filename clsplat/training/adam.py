@@ -1,4 +1,4 @@
-"""Optimize the tables of Gaussians by Adam, with one learning rate per table, and average them over steps."""
+"""Optimize the tables of Gaussians with Adam, one learning rate per table, and average them over steps."""
 
 from collections.abc import Collection
 from typing import Annotated, Any, ClassVar, Literal
@@ -40,7 +40,7 @@ class FullSizeDecay(Settings):
         return Decay(initial=self.initial, final=self.final, start=start, over=self.until - start)
 
 
-def _times(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay | Schedule:
+def _scale_rate(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay | Schedule:
     if isinstance(rate, FullSizeDecay):
         return rate.model_copy(update={"initial": rate.initial * factor, "final": rate.final * factor})
     return divide(rate, 1 / factor)
@@ -69,7 +69,7 @@ class Rates(Settings):
     def times(self, factor: float) -> "Rates":
         """Return all rates multiplied by a factor."""
         values = {name: getattr(self, name) for name in PARAMETERS}
-        scaled = {name: _times(value, factor) for name, value in values.items()}
+        scaled = {name: _scale_rate(value, factor) for name, value in values.items()}
         return self.model_copy(update={**scaled, "motion": self.motion.times(factor)})
 
     def resolve(self, full_size: int) -> "Rates":
@@ -92,7 +92,7 @@ class Rates(Settings):
         return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
-Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, but some of them later
+Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, some of them later
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
@@ -274,7 +274,7 @@ def add_to_average(gaussians: Gaussians) -> None:
 
 
 def take_average(gaussians: Gaussians) -> None:
-    """Replace the parameters of rows that have an average by it, and remove the averages."""
+    """Replace parameters by their averages, in rows that have one, and remove the averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

@@ -1,10 +1,10 @@
-"""Write and read named arrays and notes in an .npz file in which each object has a SHA-256, to detect damage.
+"""Write and read named arrays and notes in an .npz file that has a SHA-256 for each, to detect damage.
 
     NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the notes
     meta.npy          the notes: JSON, with the hashes of arrays by name under the key `sha256`
     meta_sha256.npy   the SHA-256 of meta.npy
 
-NumPy can read the arrays.  A changed byte is detected, unless it is unused, such as those of time stamps.
+NumPy can read the arrays.  A changed byte is detected, unless it is unused, such as in time stamps.
 """
 
 import errno
@@ -52,7 +52,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
             return notes, {name: _array(_member(archive, name, digest)) for name, digest in digests.items()}
     except MemoryError:
         raise
-    except Exception as error:  # zipfile and NumPy raise a dozen kinds for damaged bytes, EOFError and TokenError too
+    except Exception as error:  # zipfile and NumPy raise many types for damaged bytes, such as EOFError and TokenError
         if isinstance(error, OSError) and error.errno not in DAMAGE:
             raise OutputError(f"{path}: cannot be read ({error.strerror}); check disk and permissions") from error
         if isinstance(error, DataError):
@@ -65,7 +65,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
-    """Split arrays into those whose names start with `folder`, without that prefix, and the others."""
+    """Split arrays into those with the prefix `folder`, which is removed from their names, and the others."""
     part = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
     return part, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 

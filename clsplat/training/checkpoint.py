@@ -119,11 +119,11 @@ def check_tables(state: State, tables: Arrays) -> None:
 MODULES = "modules/"  # prefix of module names, which are prefixes of table names
 
 
-def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables of modules with their keys in the file.  whole: include tables that only training needs."""
+def module_tables(run: Run, full: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield the tables of modules with their keys in the file.  full: include tables that only training needs."""
     for module, state in run.modules.items():
-        if whole or state.after_training != "dropped":
-            yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())
+        if full or state.after_training != "dropped":
+            yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(full).items())
 
 
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
@@ -147,7 +147,7 @@ def reload_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> 
 
 def copy_model(run: Run) -> Tables:
     """Copy to the host the tables that are needed to render the run's model and to train it further."""
-    return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
+    return {**model_tables(run.model), **dict(module_tables(run, full=False))}
 
 
 def restore_best(run: Run, tables: Tables, best: Best) -> None:
@@ -233,7 +233,7 @@ def _key(table: str) -> str:
     return table if "/" in table else f"gaussians/{table}"
 
 
-# A remedy for values that are not finite.
+# A remedy for parameters that are not finite.
 
 RATE_FACTOR = 0.1  # by which a rate is lowered
 VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
@@ -432,7 +432,7 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
         if difference.kind == "output" or difference.is_moved_file(state.file_hashes, run.file_hashes):
             continue
         if difference.key_path == "model.near" and state.inputs != run.inputs:
-            continue  # the scene's; its change is an error of its own
+            continue  # follows from the scene, whose change is a separate error
         if difference.kind is None:
             raise ConfigError(f"{path} was saved with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:
@@ -463,8 +463,8 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
 
 
 @contextmanager
-def saved_on_failure(run: Run) -> Iterator[None]:
-    """If the block fails, save the last complete step, log where it is, and raise the error again."""
+def save_on_failure(run: Run) -> Iterator[None]:
+    """If the block fails, save the last complete step, log its path, and raise the error again."""
     try:
         yield
     except (Interrupted, NotFiniteError):  # already saved
@@ -492,7 +492,7 @@ def _save_if_consistent(run: Run) -> str:
         if run.is_consistent and not run.not_finite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"
         reason = "the failed step was incomplete" if not run.is_consistent else "the model is not finite"
-    except Exception as error:  # must not hide the failure itself
+    except Exception as error:  # must not hide the original failure
         reason = f"the state could not be saved ({one_line(error)})"
     files = list_files(run.out)
     return f"{reason}; {f'the last good state is {files[-1]}' if files else 'no earlier state was saved'}"

@@ -15,16 +15,16 @@ from clsplat.gaussians.structs import HARMONICS, moment_tables
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 from clsplat.scene.view import View
 
-SEEN_SHARE = 0.5  # fraction of Gaussians visible in one view, an estimate; only their harmonics are on the device
+VISIBLE_FRACTION = 0.5  # fraction of Gaussians visible in one view, an estimate; only their harmonics are on the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
-MOVED = 4 * (3 + 4 + 1)  # means, quaternions, and logits at the view's time
+MOVED_GAUSSIAN = 4 * (3 + 4 + 1)  # means, quaternions, and logits at the time of a view
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
 FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
 # image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur; the
 # entropy of weights and its gradient
 
-Where = Literal["device", "host"]
+Location = Literal["device", "host"]
 Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; auto: the host if the device is full
 
 
@@ -91,12 +91,12 @@ class DeviceLimits(Protocol):
         """Whether the device shares the memory of the host."""
 
 
-def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
-    """Return the memory to which harmonics may move.  A device that shares the host's memory cannot offload them."""
+def offload_target(harmonics: Harmonics, limits: DeviceLimits) -> Location:
+    """Return the memory to which harmonics may move; a device that shares the host's memory cannot offload them."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
 
 
-def most_pixels(views: Sequence[View], tile: int) -> int:
+def max_pixels(views: Sequence[View], tile: int) -> int:
     """Return the number of pixels of the largest view, rounded up to whole tiles.  tile: side, px."""
     return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
 
@@ -107,7 +107,7 @@ def module_bytes(stages: Iterable[Any], views: Sequence[View], tile: int) -> int
     return max((sum(module.device_bytes(views, tile) for module in modules) for modules in lists), default=0)
 
 
-def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
+def table_widths(degree: int, motion: int = 0) -> dict[str, int]:
     """Return the number of components of each parameter and moment.  motion: its columns; 0 for static models."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
@@ -120,8 +120,8 @@ def plan(
     photographs: int,
     pixels: int,
     pixel_sums: int = PIXEL_SUMS,
-    harmonics: Where = "device",
-    visible: float = SEEN_SHARE,
+    harmonics: Location = "device",
+    visible: float = VISIBLE_FRACTION,
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
@@ -133,7 +133,7 @@ def plan(
     bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}
     sizes = list(bytes_by_table.values())
     gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # for penalties and edits
-    moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
+    moving = 4 * components[MOTION] + MOVED_GAUSSIAN if MOTION in components else 0
     gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
     host = sum(4 * components.get(name, 0) for name in fractions)

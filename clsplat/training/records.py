@@ -20,11 +20,11 @@ from clsplat.core.reading import read_file
 from clsplat.opencl.device import Timings
 
 LOG = logging.getLogger("clsplat")
-_MEASURED: dict[str, type | tuple[type, ...]] = {"split": str, "downscale": (int, float), "psnr": (int, float)}
+_METRIC_FIELDS: dict[str, type | tuple[type, ...]] = {"split": str, "downscale": (int, float), "psnr": (int, float)}
 FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # what pages and `clsplat status` read, by kind
     "train": {"loss": (int, float), "psnr": (int, float)},
-    "evaluate": _MEASURED,
-    "view": {"view": str, **_MEASURED},
+    "evaluate": _METRIC_FIELDS,
+    "view": {"view": str, **_METRIC_FIELDS},
     "densify": {"causes": dict},
     "distribution": {"size": list, "anisotropy": list, "opacity": list},
     "snapshot": {"file": str},
@@ -34,7 +34,7 @@ FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # what pages and `cls
 class Records:
     """The records in a run folder; each line of metrics.jsonl has its step.
 
-    Lines are held back until their stage is done, because a failed stage is repeated on resume.
+    Lines are buffered until their stage is done, because a failed stage is repeated on resume.
     """
 
     def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None) -> None:
@@ -42,7 +42,7 @@ class Records:
         self.out = out
         self._require_held = require_held
         self.path, self.trial = out / RECORDS, out / TRIAL
-        self.lines = 0  # of metrics.jsonl in the state of the run, including those held back
+        self.lines = 0  # of metrics.jsonl in the state of the run, including buffered ones
         self.lines_at_stage = 0  # of them at the start of the stage, which a resumed run repeats
         self._pending: list[str] = []
 
@@ -81,9 +81,9 @@ class Records:
         self.lines += 1
 
     def write(self) -> None:
-        """Append the lines held back, and sync the file, because a checkpoint counts them.
+        """Append the buffered lines, and sync the file, because a checkpoint counts them.
 
-        If it raises OutputError, the lines are still held back, and the file is unchanged.
+        If this raises OutputError, the lines stay buffered, and the file is unchanged.
         """
         if not self._pending:
             return
@@ -106,7 +106,7 @@ class Records:
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
         """Return the lines, of one kind or all, without an incomplete last line from a crash.
 
-        Lines of a kind in FIELDS that lack one of its fields are left out: a stage of a plug-in has recorded them.
+        Lines of a kind in FIELDS that lack one of its fields are skipped: a stage of a plug-in has recorded them.
         trial: return the lines from before a refit.  Raises DataError, with file and line, for any other damage.
         """
         fields = FIELDS.get(kind or "", {})
@@ -185,13 +185,13 @@ def clocks() -> tuple[float, float]:
 VIEWS = 5  # reports over which PSNR is averaged
 LATEST = 3  # reports over which step time is averaged
 TREND = 4  # reports from which growth is extrapolated
-MIN_RATIO = 2.0  # of Gaussian counts, so that their cost can be fitted
-DEFAULT_COST = 0.6  # of one more Gaussian, relative to the mean time per Gaussian, if it cannot be fitted
-MIN_COST = 0.4  # likewise; on a busy machine fits are unreliable
+MIN_RATIO = 2.0  # between Gaussian counts, so that the cost of one can be fitted
+DEFAULT_COST = 0.6  # of an additional Gaussian, relative to the mean time per Gaussian, if it cannot be fitted
+MIN_COST = 0.4  # likewise; fits are unreliable on a busy machine
 
 
 def moving_average(psnrs: Sequence[float]) -> list[float]:
-    """Average PSNR over the last VIEWS reports, since each report is of one view and views differ by many dB."""
+    """Average PSNR over the last VIEWS reports, since a report covers one view and views differ by many dB."""
     return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
@@ -234,13 +234,13 @@ class Forecast:
         """
         steps, counts, seconds = (np.array(column, np.float64) for column in zip(*self._reports, strict=True))
         cost, left = self._cost(counts, seconds), self.last_step - steps[-1]
-        now = float(seconds[-LATEST:].mean() + cost * (counts[-1] - counts[-LATEST:].mean()))
+        current = float(seconds[-LATEST:].mean() + cost * (counts[-1] - counts[-LATEST:].mean()))
         growing = min(max(0.0, self.growth_end - steps[-1]), left)
         if growing == 0 or len(steps) < 2:
-            return now * float(left)
+            return current * float(left)
         growth = (counts[-1] - counts[-TREND:][0]) / (steps[-1] - steps[-TREND:][0])
-        later = now + max(0.0, cost * growth * growing)
-        return float(growing * (now + later) / 2 + (left - growing) * later)
+        later = current + max(0.0, cost * growth * growing)
+        return float(growing * (current + later) / 2 + (left - growing) * later)
 
     @staticmethod
     def _cost(counts: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:

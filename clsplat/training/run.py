@@ -28,7 +28,7 @@ from clsplat.scene.scene import Scene, scene_name
 from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
-from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, module_bytes, most_pixels, plan
+from clsplat.training.memory import VISIBLE_FRACTION, Harmonics, Location, MemoryPlan, max_pixels, module_bytes, plan
 from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
@@ -40,7 +40,7 @@ class Run:
     """The mutable state of a pipeline run; stages read and change it."""
 
     device: Device
-    scene: Scene  # as trained on, at one size or several
+    scene: Scene  # for training, at one size or several
     original: Scene  # as read from the dataset, at full size
     out: Path
     name: str
@@ -60,7 +60,7 @@ class Run:
     adam: Adam | None = None
     stats: SplatStats | None = None
     modules: dict[str, Any] = field(default_factory=dict)  # states of training modules, by type
-    learned_field: TrainedField | None = None  # instead of a model
+    learned_field: TrainedField | None = None  # trained instead of a model
     step: int = 0  # global step that is done or in progress
     stage_index: int = 0  # current stage
     stage_step: int = 0  # steps done in that stage
@@ -80,9 +80,8 @@ class Run:
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     on_progress: Callable[[Progress], None] = lambda progress: None
-    on_step: Callable[[], None] = lambda: (
-        None
-    )  # called between steps, or items of a long stage; must not change the run
+    # called between steps, or items of a long stage; must not change the run
+    on_step: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self.records = Records(self.out, self.status.require_held)
@@ -119,7 +118,7 @@ class Run:
         return self.learned_field.not_finite() if self.learned_field else self.model.gaussians.not_finite()
 
     def next_stage(self, index: int) -> None:
-        """Go to the start of a stage."""
+        """Move to the start of a stage."""
         self.stage_index, self.stage_step, self.during_index, self.edited = index, 0, 0, False
         self.records.lines_at_stage = self.records.lines
         self.modules = {name: state for name, state in self.modules.items() if state.after_training != "dropped"}
@@ -203,8 +202,8 @@ class Run:
     def memory_plan(
         self,
         components: Mapping[str, int] | None = None,
-        harmonics: Where | None = None,
-        visible: float = SEEN_SHARE,
+        harmonics: Location | None = None,
+        visible: float = VISIBLE_FRACTION,
     ) -> MemoryPlan:
         """Plan the device memory for training with the current tables, or those in `components`.
 
@@ -216,7 +215,7 @@ class Run:
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         image_bytes = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         image_bytes += module_bytes(getattr(self.settings, "stages", ()), views, tile)
-        pixels = most_pixels(views, tile)
+        pixels = max_pixels(views, tile)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, image_bytes, pixels, pixel_sums, harmonics, visible)
 

@@ -42,7 +42,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
 
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
-    """Return the marks in metadata, and in that of the arguments of a type."""
+    """Return the marks in metadata, and in the metadata of a type's arguments."""
     marks = [mark for mark in metadata if isinstance(mark, PathInRun)]
     return marks + [mark for part in get_args(kind) for mark in _marks(part, getattr(part, "__metadata__", ()))]
 
@@ -117,7 +117,7 @@ class Scheduled(Stage):
         """Add the tables that the stage needs, before the first step; a resumed run already has them."""
 
     def finish(self, run: Run) -> None:
-        """Do what follows the last step of the training; a resumed run may do it again."""
+        """Finish after the last step of the training; a resumed run may call this again."""
 
     def due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step.  is_last: whether it is the last of the training."""
@@ -135,7 +135,7 @@ class Scheduled(Stage):
 
 
 def find_output_conflict(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write as a file, or one as a file and one as a folder; None without one.
+    """Return a path that two stages would write as a file, or one as a file and one as a folder; None if there is none.
 
     Stages may share a folder.  Names are compared without case, since some file systems ignore it.
     """
@@ -213,7 +213,7 @@ class Training(Stage):
         return run.stage_step >= self.steps
 
     def after_stage(self, run: Run, stage: Scheduled) -> None:
-        """React to a stage of `during` that has run."""
+        """Called after a stage of `during` has run."""
 
     def finish(self, run: Run) -> None:
         """Finish the training after its last step."""

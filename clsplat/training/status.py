@@ -97,7 +97,7 @@ class Status(BaseModel):
     """Heartbeat: when this file was written; at least every 10 s while the process lives."""
 
 
-def status_of(content: Any) -> Status | None:
+def parse_status(content: Any) -> Status | None:
     """Validate the contents of a status.json; return None if a newer version wrote it.
 
     Raises DataError with the first wrong field.
@@ -162,7 +162,7 @@ class StatusFile:
     def begin(self) -> None:
         """Write the first status and start the thread.  Raises OutputError."""
         self.write()
-        self._beat()
+        self._start_heartbeat()
 
     def require_held(self) -> None:
         """Raise OutputError if the run no longer holds its folder; called before each write there."""
@@ -185,7 +185,7 @@ class StatusFile:
         self.note(state=state, stage=None, progress=None, seconds_left=None, **values)
         self.has_run |= state == "running"
         self.refresh()
-        self._beat()
+        self._start_heartbeat()
 
     def end(self, state: Literal["done", "failed", "interrupted"], exit_code: int, message: str | None = None) -> None:
         """Write the last status.  Raises OutputError."""
@@ -251,7 +251,7 @@ class StatusFile:
         now = self.now.model_copy(update={"time": time.time()})
         write_text(self.out / STATUS, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
 
-    def _beat(self) -> None:
+    def _start_heartbeat(self) -> None:
         if self._thread is None and not self._ended.is_set():
             self._thread = threading.Thread(
                 target=_refresh_until, args=(self._ended, weakref.ref(self)), name="status", daemon=True

@@ -26,7 +26,7 @@ def is_in_blocks(folder: Path) -> bool:
     return (folder / RECORD).is_file()
 
 
-def status_of(folder: Path) -> dict[str, Any]:
+def parse_status(folder: Path) -> dict[str, Any]:
     """Return the state of a folder: a scene in blocks, a sweep store, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)

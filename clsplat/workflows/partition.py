@@ -20,7 +20,7 @@ from clsplat.photos.photographs import BUDGET_SHARE, Photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.training.memory import first_tables, plan
+from clsplat.training.memory import plan, table_widths
 from clsplat.workflows.folder import MANIFEST, block_name
 
 # Cells: the leaves of a kd-tree over the Gaussians of a coarse model, with equal shares of a weight.
@@ -311,5 +311,5 @@ class Partitioner:
         sizes = [4 * camera.width * camera.height for camera in cameras]
         cached = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
         motion = self.model.motion
-        tables = first_tables(self.model.sh_degree, 0 if motion is None else motion.shape[1])
+        tables = table_widths(self.model.sh_degree, 0 if motion is None else motion.shape[1])
         return plan(self.device.info, tables, cached, max(sizes) // 4).needed(gaussians)

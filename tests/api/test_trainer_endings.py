@@ -20,7 +20,7 @@ from tests.support.models import equal
 pytestmark = pytest.mark.slow
 
 
-def status_of(out: Path) -> dict:
+def parse_status(out: Path) -> dict:
     return json.loads((out / "status.json").read_text())
 
 
@@ -28,9 +28,9 @@ def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
     trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run")
     trainer.run(2)
     trainer.checkpoint()
-    assert status_of(tmp_path / "run")["state"] == "running"
+    assert parse_status(tmp_path / "run")["state"] == "running"
     trainer.close()
-    found = status_of(tmp_path / "run")
+    found = parse_status(tmp_path / "run")
     assert (found["state"], found["exit_code"], found["step"]) == ("interrupted", 130, 2)
     assert found["message"] == "the trainer was closed before its last step"
     assert clsplat.status(tmp_path / "run")["state"] == "interrupted"
@@ -38,11 +38,11 @@ def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
     assert again.step().step == 3
     del again
     gc.collect()
-    assert status_of(tmp_path / "run")["state"] == "interrupted"
+    assert parse_status(tmp_path / "run")["state"] == "interrupted"
     last = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", start="resume")
     assert last.run().step == 4
     last.close()
-    assert status_of(tmp_path / "run")["state"] == "done"
+    assert parse_status(tmp_path / "run")["state"] == "done"
     anew = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", start="restart")
     assert not list((tmp_path / "run" / "checkpoints").iterdir())
     shutil.rmtree(tmp_path / "run")

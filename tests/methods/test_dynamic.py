@@ -21,7 +21,7 @@ from clsplat.gaussians.model import load
 from clsplat.gaussians.structs import moment_tables
 from clsplat.stages.init_motion import add_motion, estimate_motion
 from clsplat.training import checkpoint
-from clsplat.training.memory import first_tables, plan
+from clsplat.training.memory import plan, table_widths
 from tests.support.recipes import ONE_THREAD, STEPS, digest, short, train
 from tests.support.runs import train as train_overridden
 
@@ -143,7 +143,7 @@ def test_motion_penalties_and_rules_need_motion(tiny_scene, tmp_path):
 
 
 def test_memory_plan_includes_motion(info):
-    static, moves = first_tables(1), first_tables(1, 5)
+    static, moves = table_widths(1), table_widths(1, 5)
     more = plan(info, moves, 0, 100).gaussian - plan(info, static, 0, 100).gaussian
     assert more == 4 * (3 * 5 + 5 + 3 + 4 + 1)  # table and moments, gradient, means, quaternions and logits
 

@@ -78,17 +78,17 @@ def test_view_has_one_row_at_all_its_sizes():
 
 
 def test_rates_follow_how_often_a_photograph_is_visited():
-    few, many = Exposure().rate_of(7000, 50), Exposure().rate_of(30_000, 50)
+    few, many = Exposure().rate_schedule(7000, 50), Exposure().rate_schedule(30_000, 50)
     assert [at_step(few, step) for step in (0, 7000)] == pytest.approx([1e-2, 1e-3])
     assert [at_step(many, step) for step in (0, 30_000)] == pytest.approx([2e-3, 2e-5])
-    unknown = [Exposure().rate_of(steps, 50, known=False) for steps in (500, 7000, 30_000)]
+    unknown = [Exposure().rate_schedule(steps, 50, is_warm_start=False) for steps in (500, 7000, 30_000)]
     assert [at_step(rate, 0) for rate in unknown] == pytest.approx([0.05, 0.0183, 0.00426], rel=0.01)
     reach = [
         sum(at_step(rate, step) for step in range(1, steps, 50))
         for steps, rate in zip((7000, 30_000), unknown[1:], strict=True)
     ]
     assert reach == pytest.approx([1, 1], rel=0.05), "as far as a gain of e"
-    assert Exposure(rate=0.5).rate_of(7000, 50) == 0.5
+    assert Exposure(rate=0.5).rate_schedule(7000, 50) == 0.5
 
 
 @pytest.mark.parametrize("rate", ["1000", "{initial: 0.1, final: 2, over: 9}", "-1"])

@@ -70,7 +70,7 @@ class Capture:
         """Train from other colors; return the trainer, whose module is the state."""
         gaussians = self.model.gaussians
         gaussians.set("sh_base", self.colors + rng.normal(0, 0.3, self.colors.shape).astype(np.float32))
-        state.rate = state.settings.rate_of(STEPS, VIEWS, False)
+        state.rate = state.settings.rate_schedule(STEPS, VIEWS, False)
         state.start_from({})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
         trainer = StepTrainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, modules=[state])

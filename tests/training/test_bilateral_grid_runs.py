@@ -89,13 +89,13 @@ def test_key_accepts_cells_per_axis():
 def test_rate_warms_up_and_decays():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
-        for known, expected in ((True, published), (False, Exposure().rate_of(steps, 50, False))):
-            found = BilateralGrid().rate_of(steps, 50, known)
+        for known, expected in ((True, published), (False, Exposure().rate_schedule(steps, 50, False))):
+            found = BilateralGrid().rate_schedule(steps, 50, known)
             assert at_step(found, 0) == pytest.approx(at_step(expected, 0) / 100)
             for step in range(warm_up, steps + 1, 50):
                 assert at_step(found, step) == pytest.approx(at_step(expected, step), rel=0.03)
-    assert BilateralGrid(rate=0.02).rate_of(7000, 50) == 0.02
-    assert at_step(BilateralGrid().rate_of(1, 1), 1) > 0
+    assert BilateralGrid(rate=0.02).rate_schedule(7000, 50) == 0.02
+    assert at_step(BilateralGrid().rate_schedule(1, 1), 1) > 0
 
 
 @pytest.mark.slow
@@ -185,7 +185,7 @@ def test_memory_plan_counts_grids_first(finished):
         run, training = copy(finished), finished.settings.training.model_copy(update={"modules": [*modules]})
         stages = [training if one.stage == "optimize" else one for one in run.settings.stages]
         run.settings = run.settings.model_copy(update={"stages": stages})
-        return run.memory_plan(memory.first_tables(0)).fixed
+        return run.memory_plan(memory.table_widths(0)).fixed
 
     wide = BilateralGrid(grid_shape=[16, 16, 8])
     more = fixed(wide) - fixed(Exposure())

@@ -21,8 +21,8 @@ from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.memory import last_place
-from clsplat.training.sh_offload import most_gaussians
+from clsplat.training.memory import offload_target
+from clsplat.training.sh_offload import device_capacity
 from tests.support.runs import FEW, digest, killed, train
 
 pytestmark = pytest.mark.slow
@@ -173,7 +173,7 @@ def test_harmonics_stay_on_the_device_if_views_see_all(tiny_scene, tmp_path, inf
     run.device.info = replace(info, memory=own.needed(run.model.gaussians.count), unified=False)
     held = run.memory_plan(harmonics="device").limit
     assert run.harmonics == "auto"
-    assert most_gaussians(run) == held < run.memory_plan(harmonics="host").limit
+    assert device_capacity(run) == held < run.memory_plan(harmonics="host").limit
 
 
 def test_harmonics_stay_on_the_device_if_the_host_is_no_help(tiny_scene, info):
@@ -183,7 +183,7 @@ def test_harmonics_stay_on_the_device_if_the_host_is_no_help(tiny_scene, info):
     found = [load("smoke", [own, *more]).settings.harmonics for more in ([], [average], ["model.sh_degree=0"])]
     assert found == ["auto", "device", "device"]
     apart, shared = (replace(info, unified=unified) for unified in (False, True))
-    found = [last_place("auto", apart), last_place("auto", shared), last_place("host", shared)]
+    found = [offload_target("auto", apart), offload_target("auto", shared), offload_target("host", shared)]
     assert found == ["host", "device", "host"]
 
 

@@ -75,7 +75,7 @@ def test_too_many_points_are_refused_before_neighbor_search(tiny_scene, tmp_path
 def test_first_plan_has_the_tables_that_training_adds(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", "optimize.steps=1")
     present = run.model.gaussians.components
-    first = memory.first_tables(run.model_settings.sh_degree)
+    first = memory.table_widths(run.model_settings.sh_degree)
     assert first == {name: present[name] for name in first}
     assert run.memory_plan(first).limit >= run.memory_plan().limit
 

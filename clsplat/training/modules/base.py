@@ -22,7 +22,7 @@ from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.training.memory import most_pixels
+from clsplat.training.memory import max_pixels
 from clsplat.training.run import Run
 
 Tables = dict[str, NDArray[np.float32]]
@@ -94,8 +94,8 @@ class ModuleState:
         self.scalars: Scalars = {}  # on the host, by name, with their Adam moments
 
     # saved in a checkpoint, next to `scalars`
-    def tables(self, whole: bool = True) -> Tables:
-        """Copy the tables to the host.  whole: include tables that only training needs, such as Adam moments."""
+    def tables(self, full: bool = True) -> Tables:
+        """Copy the tables to the host.  full: include tables that only training needs, such as Adam moments."""
         return {}
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
@@ -185,7 +185,7 @@ class TrainingModule(Settings):
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         """Return an upper bound of the device memory that the module needs, bytes.  tile: side of a tile, px."""
-        return 4 * self.device_planes * most_pixels(views, tile) if self.device_planes else 0
+        return 4 * self.device_planes * max_pixels(views, tile) if self.device_planes else 0
 
     def check_run(self, run: Run) -> None:
         """Raise errors that can be detected before the first stage."""

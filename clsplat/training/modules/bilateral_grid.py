@@ -83,11 +83,11 @@ class BilateralGrid(Appearance):
         if rows != list(range(count)):
             raise DataError(f"it has color grids for {count} photographs, but scalars for other rows")
 
-    def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
+    def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
         if self.rate != "auto":
             return self.rate
-        exposure_rate = super().rate_of(steps, photographs, known)
-        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else exposure_rate
+        exposure_rate = super().rate_schedule(steps, photographs, is_warm_start)
+        rate = Decay(initial=2e-3, final=2e-5, over=steps) if is_warm_start else exposure_rate
         warm_up = max(1, min(WARM_UP, steps // 10))
         later = [warm_up + round((steps - warm_up) * t) for t in np.linspace(0, 1, 11)]
         points = {step: [float(step), at_step(rate, step)] for step in later}
@@ -108,8 +108,8 @@ class GridState(ColorState):
         self.device, self.shape = device, (len(self.names), ENTRIES, *reversed(settings.grid_shape))
         self.arrays: dict[str, Array] = {name: device.zeros(self.shape) for name in TABLES}
 
-    def tables(self, whole: bool = True) -> Tables:
-        return {name: self.arrays[name].get() for name in (TABLES if whole else TABLES[:1])}
+    def tables(self, full: bool = True) -> Tables:
+        return {name: self.arrays[name].get() for name in (TABLES if full else TABLES[:1])}
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
         return "values" in tables and tables["values"].shape == self.shape

@@ -96,9 +96,9 @@ class DistractorsState(ModuleState):
         return len(tables[UPDATES]) == len(self._names)
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        self.adams = [_adam(self.rasterizer.device, tables, row) for row in range(len(tables[UPDATES]))]
+        self.adams = [_restore_adam(self.rasterizer.device, tables, row) for row in range(len(tables[UPDATES]))]
 
-    def tables(self, whole: bool = True) -> Tables:
+    def tables(self, full: bool = True) -> Tables:
         names = [name for key in WIDTHS for name in (key, *moment_tables(key))]
         tables = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
         return {**tables, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
@@ -134,13 +134,13 @@ def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint
 
     photographs: views and pixels, [height, width, 3].
     """
-    parts = [_spread(count, view, pixels) for view, pixels in photographs]
+    parts = [_spread_gaussians(count, view, pixels) for view, pixels in photographs]
     values = {name: np.concatenate([part[name] for part in parts]).astype(np.float32) for name in WIDTHS}
     moments = {moment: np.zeros_like(table) for name, table in values.items() for moment in moment_tables(name)}
     return {**values, **moments, UPDATES: np.zeros((len(parts), 1), np.float32)}
 
 
-def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+def _spread_gaussians(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Return Gaussians on a Fibonacci lattice, one unit of length in front of a camera."""
     camera, index = view.camera, np.arange(count) + 0.5
     x, y = camera.width * index / count, camera.height * ((index * GOLDEN) % 1)
@@ -155,7 +155,7 @@ def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDAr
     }
 
 
-def _adam(device: Device, tables: Tables, number: int) -> Adam:
+def _restore_adam(device: Device, tables: Tables, number: int) -> Adam:
     """Return the Adam of one photograph's Gaussians, with their moments."""
     count = len(tables["means"]) // len(tables[UPDATES])
     rows = slice(number * count, (number + 1) * count)

@@ -104,13 +104,13 @@ class Appearance(TrainingModule):
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         return 0 if self.chosen == "off" else super().device_bytes(views, tile)
 
-    def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
-        """Return the learning rate schedule of a training.  known: whether parameters start near their final values."""
+    def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
+        """Return the learning rate schedule.  is_warm_start: whether parameters start near the solution."""
         if self.rate != "auto":
             return self.rate
         visits = steps / photographs
         initial, final = (1e-2, 1e-3) if visits < MIN_VISITS else (2e-3, 2e-5)
-        if not known:
+        if not is_warm_start:
             needed = min(math.log(10) / (0.9 * visits), MAX_RATE)  # so that decaying rates sum to 1
             initial, final = max(initial, needed), max(final, needed / 10)
         return Decay(initial=initial, final=final, over=steps)
@@ -198,8 +198,8 @@ class Gain(Gains, ColorModel):
 
     def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
         red, green, blue = np.diag(grad_matrix) * np.diag(self.matrix(row))
-        by_green = green * LUMINANCE / LUMINANCE[1]
-        return np.array([red + green + blue, red - by_green[0], blue - by_green[2]])
+        grad_green = green * LUMINANCE / LUMINANCE[1]
+        return np.array([red + green + blue, red - grad_green[0], blue - grad_green[2]])
 
     def from_gains(self, log_gains: Floats) -> Floats:
         exposure = LUMINANCE @ log_gains
@@ -276,7 +276,7 @@ class ColorState(ModuleState):
         LOG.info("colors of photographs: %s", exposures.text)
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        self.rate = self.settings.rate_of(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
+        self.rate = self.settings.rate_schedule(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, if known."""

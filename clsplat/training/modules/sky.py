@@ -72,7 +72,7 @@ class LearnedSky(ModuleState):
         for name, array in self._arrays.items():
             array.set(np.ascontiguousarray(tables[name].T))
 
-    def tables(self, whole: bool = True) -> Tables:
+    def tables(self, full: bool = True) -> Tables:
         """Copy the tables to the host, each [side * side, components]."""
         arrays = {TEXELS: self.sky.texels, **self._arrays}
         return {name: np.ascontiguousarray(array.get().T) for name, array in arrays.items()}
