@@ -81,6 +81,7 @@ def test_more_metrics_are_recorded(tiny_scene, tmp_path):
     views = run.records.read("view")
     for name in ("psnr", "ssim", "ms_ssim", "lpips"):
         assert averages[name] == pytest.approx(np.mean([view[name] for view in views]))
+    assert f"{averages['lpips']:.4f}" in (tmp_path / "run" / "report.html").read_text()
     with pytest.raises(DataError, match="nowhere"):
         train(tiny_scene, tmp_path / "early", "evaluate.lpips=nowhere.onnx")
     assert not (tmp_path / "early" / "metrics.jsonl").exists(), "refused before training"
