@@ -23,7 +23,7 @@ from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Layers, layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.render.tiles import Sort
-from clsplat.scene.view import View, color_of
+from clsplat.scene.view import View, to_color
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
@@ -187,7 +187,7 @@ class Renderer:
     def _color(self, background: Color | None) -> Floats:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
-        return np.ascontiguousarray(color_of(background), np.float32)
+        return np.ascontiguousarray(to_color(background), np.float32)
 
 
 def _check_shape(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:

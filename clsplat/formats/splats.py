@@ -80,7 +80,7 @@ PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_re
 STORED_DEGREE = 4  # of some formats; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
-NEAR_SHARE = 0.04  # of the median distance of the means from their middle: the near plane without a file or scene
+NEAR_FRACTION = 0.04  # of the median distance of the means from their middle: the near plane without a file or scene
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
@@ -261,7 +261,7 @@ def typical_size(means: NDArray[np.floating]) -> float:
 
 def usual_near(means: NDArray[np.floating]) -> float:
     """Return the near plane of Gaussians with these means, [N, 3], if no file or scene gives one, scene units."""
-    return NEAR_SHARE * typical_size(means)
+    return NEAR_FRACTION * typical_size(means)
 
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:

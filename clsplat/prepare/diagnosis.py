@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import first_few, pluralize
 from clsplat.prepare.database import feature_counts, verified_pairs
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
-from clsplat.scene.quality import is_blurred, sharpness_of
+from clsplat.scene.quality import is_blurred, measure_sharpness
 
 FEW_FEATURES = 300  # per photograph: a plain wall has tens, a garden thousands
 MIN_TEXTURED = 1000  # features of a photograph with enough texture
@@ -56,10 +56,10 @@ class MatchGraph:
         is_textured = median(self.features.values()) >= MIN_TEXTURED
         return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
 
-    def sharpness_of(self, name: str) -> NDArray[np.float64]:
+    def measure_sharpness(self, name: str) -> NDArray[np.float64]:
         """Return both sharpness values of a photograph, measured once."""
         if name not in self.sharpness:
-            self.sharpness[name] = sharpness_of(self.images / name)
+            self.sharpness[name] = measure_sharpness(self.images / name)
         return self.sharpness[name]
 
 
@@ -106,7 +106,7 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
     """Return the likely reason why each photograph is not in the first of the models."""
     placed = models[0]
     sample = sorted(placed)[:: max(1, len(placed) // MAX_COMPARED)]
-    typical_sharpness = np.median([graph.sharpness_of(name) for name in sample], axis=0)
+    typical_sharpness = np.median([graph.measure_sharpness(name) for name in sample], axis=0)
     reasons = {}
     for name in sorted(set(graph.features) - placed):
         model = next((model for model in models[1:] if name in model), None)
@@ -123,7 +123,7 @@ def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpn
     placed = {other: count for other, count in matches.items() if other in placed_names}
     if graph.features[name] < FEW_FEATURES:
         return f"only {pluralize(graph.features[name], 'feature')}: blurred, dark, or a plain surface"
-    is_soft = is_blurred(graph.sharpness_of(name), typical_sharpness)
+    is_soft = is_blurred(graph.measure_sharpness(name), typical_sharpness)
     note = "; it may be blurred" if is_soft else ""
     if not matches:  # only a guess: a photograph without fine detail measures like a blurred one
         return f"matches no other photograph{note}"

@@ -28,7 +28,7 @@ from clsplat.scene.images import (
     write_exposures,
 )
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
-from clsplat.scene.quality import shows_nothing
+from clsplat.scene.quality import is_blank
 from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
@@ -179,7 +179,7 @@ def _gather_one(source: Path, target: Path) -> bool:
         _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
         with open_atomic(target) as file:
             file.write(copy_exif(data, encoded.tobytes()))
-    return shows_nothing(pixels)
+    return is_blank(pixels)
 
 
 def link(source: Path, target: Path) -> None:

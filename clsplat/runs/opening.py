@@ -201,7 +201,7 @@ def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
     with log_level(logging.ERROR):
-        return split.apply(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
+        return split.apply(make_scene(folder, views, every_nth(names, split.reader_holdout), None, "black"))
 
 
 def undistorted_folder(out: Path) -> Path:

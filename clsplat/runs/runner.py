@@ -14,7 +14,7 @@ from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import map_trainings
-from clsplat.prepare.inspect.findings import few_views
+from clsplat.prepare.inspect.findings import check_view_count
 from clsplat.runs.outputs import check_outputs, previous_sums, save_checksums, write_checksums, write_metrics
 from clsplat.runs.run_folder import RESOLVED, Start, clear
 from clsplat.runs.state import damaged_files
@@ -140,7 +140,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     previous = begin(pipeline, run, start)
     with finishing_on_interrupt(run), save_on_failure(run):
         run_stages(pipeline, run)
-    for finding in few_views(len(run.original.train)):
+    for finding in check_view_count(len(run.original.train)):
         LOG.warning("%s", finding.text)
     if run.best is None and (text := overfitting_note(run)):
         LOG.info("%s", text)

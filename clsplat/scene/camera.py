@@ -163,16 +163,16 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and th
     "EQUIRECTANGULAR": (2, _equirectangular),  # focal lengths in px per radian, instead of COLMAP's image size
 }
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models of directions next to and behind the camera, too
+WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover directions beside and behind the camera
 
 # Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
-MIN_WIDE = math.radians(80)  # to a side of the image: a pinhole image would be 3.6 times as wide
+MIN_WIDE = math.radians(80)  # to one side of the image: a pinhole image would be 3.6 times as wide
 MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
-RIM = 1.5  # px: a sample at the edge of a fisheye's circle would mix with the dark beyond it
+RIM = 1.5  # px: samples at the edge of a fisheye's circle would mix with the dark pixels around it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
-FACE_GRID = 128  # directions to a side, at which the visible part of a face is measured
-MIN_SHOWN = 0.02  # visible fraction of a face; one with less is left out
+FACE_GRID = 128  # directions along a side at which the visible part of a face is measured
+MIN_SHOWN = 0.02  # visible fraction of a face; faces with less are left out
 ANGLES = 1801  # from 0 to 180 degrees
 BLOCK = 1 << 20  # samples at a time
 # rotations from the camera of the photograph to that of the face: its right, down, forward
@@ -220,13 +220,13 @@ class Lens:
                 radius = x * u + y * v
                 rises = np.diff(radius) > 0
             folds.append(angle[np.argmin(rises)] if not rises.all() else np.pi)
-            beyond = radius > size
-            sides.append(min(folds[-1], angle[np.argmax(beyond)] if beyond.any() else np.pi))
+            is_outside = radius > size
+            sides.append(min(folds[-1], angle[np.argmax(is_outside)] if is_outside.any() else np.pi))
         return np.array(sides), min(folds)
 
     @cached_property
     def is_wide(self) -> bool:
-        """Whether the photograph shows too much for one pinhole image, and is cut into faces."""
+        """Whether the field of view is too wide for one pinhole image, so that the photograph is cut into faces."""
         is_panorama = self.model == "EQUIRECTANGULAR"
         return is_panorama or (self.model in WIDE and bool(self._angles[0].max() > MIN_WIDE))
 
@@ -234,19 +234,19 @@ class Lens:
     def faces(self) -> tuple["Lens", ...]:
         """The front of a wide photograph, and the other faces that show MIN_SHOWN or more.  Raises DataError."""
         lenses = [intern_lens(replace(self, face=face, whole=self.model != "EQUIRECTANGULAR")) for face in FACES]
-        return tuple(lens for lens in lenses if lens.face == "front" or lens._grid_shown.mean() >= MIN_SHOWN)
+        return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_SHOWN)
 
     @cached_property
-    def _grid_shown(self) -> NDArray[np.bool_]:
+    def _visible_grid(self) -> NDArray[np.bool_]:
         """Which points of `_face_grid` the photograph shows, [FACE_GRID, FACE_GRID]."""
-        return self._shows(*_face_grid())
+        return self._sees(*_face_grid())
 
     def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the directions x, y, z in the camera of the photograph, from normalized coordinates of the face."""
         x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
         return x, y, z
 
-    def _shows(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
+    def _sees(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
         """Return which rays, in normalized coordinates of the face, the wide photograph shows."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
@@ -260,16 +260,16 @@ class Lens:
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
         """Return whether a face shows a white pixel of a mask, [H, W, C], of the photograph."""
-        u, v = np.stack(_face_grid())[:, self._grid_shown]
+        u, v = np.stack(_face_grid())[:, self._visible_grid]
         x, y = self.distort(*self._directions(u, v))
         height, width = mask.shape[:2]
         rows, columns = (y * height / self.height).astype(int), (x * width / self.width).astype(int)
         return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
 
     def _face_camera(self) -> Camera:
-        """Return the camera of the smallest part of a face that contains all that the photograph shows.
+        """Return the camera of the smallest part of a face that contains everything visible in the photograph.
 
-        In the center, its pixels are as large as those of the photograph.  Raises DataError.
+        In the center, its pixels are as large as those of the photograph.  Raises DataError for an implausible camera.
         """
         focal = max(self._split[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
@@ -279,9 +279,9 @@ class Lens:
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
                 f"at most {MAX_SOURCE} px to a side and focal lengths that fit: calibrate the camera again"
             )
-        if not self._grid_shown.any():
+        if not self._visible_grid.any():
             raise self._error("shows nothing")
-        spans = [np.flatnonzero(self._grid_shown.any(axis=axis)) for axis in (0, 1)]  # columns, rows
+        spans = [np.flatnonzero(self._visible_grid.any(axis=axis)) for axis in (0, 1)]  # columns, rows
         (x0, x1), (y0, y1) = (
             (max(0, int((i[0] - 1) / FACE_GRID * side)), min(side, int((i[-1] + 2) / FACE_GRID * side))) for i in spans
         )
@@ -294,10 +294,10 @@ class Lens:
             rows = slice(row, row + step)
             yield rows, *_rays(self.pinhole, rows, samples)
 
-    def _cut(self, pixels: NDArray[Any]) -> NDArray[Any]:
+    def _extract_face(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the face of a wide photograph, [H, W, C]; each pixel is the mean of 2 x 2 rays."""
         camera, border = self.pinhole, int(self.model == "EQUIRECTANGULAR")
-        if border:  # a column from the other side, where the two sides of a panorama meet
+        if border:  # add a column from the opposite side, which a panorama continues on
             pixels = np.concatenate([pixels[:, -1:], pixels, pixels[:, :1]], axis=1)
         face = np.empty((camera.height, camera.width, pixels.shape[2]), pixels.dtype)
         for rows, u, v in self._blocks(2):
@@ -324,14 +324,14 @@ class Lens:
         fx, fy, cx, cy, rest = self._split
         distortion = MODELS[self.model][1]
         goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
-        point, moving = goal.copy(), np.arange(x.size)
+        point, active = goal.copy(), np.arange(x.size)
         with np.errstate(all="ignore"):
             for _ in range(MAX_ROUNDS):
-                before = point[:, moving]
-                point[:, moving] = after = _newton_step(distortion, rest, before, goal[:, moving])
-                # a point that repeats its bits never moves again
-                moving = moving[(before.view(np.int64) != after.view(np.int64)).any(axis=0)]
-                if not moving.size:
+                previous = point[:, active]
+                point[:, active] = current = _newton_step(distortion, rest, previous, goal[:, active])
+                # a point whose bits did not change will never change
+                active = active[(previous.view(np.int64) != current.view(np.int64)).any(axis=0)]
+                if not active.size:
                     break
             error = np.abs(np.stack(distortion(point[0], point[1], rest)) - goal)
             u, v = np.where((error < MAX_ERROR).all(axis=0), point, np.nan)
@@ -346,26 +346,26 @@ class Lens:
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph, with the same focal lengths.
 
-        It shows the largest rectangle in which all pixels are defined.  With `whole`, it shows the smallest rectangle
-        that contains the photograph, up to 60 degrees to each side and twice the size.  Raises DataError when there is
-        no such rectangle.  For a wide photograph, it is the camera of the face.
+        It shows the largest rectangle in which all pixels are defined.  With `whole`, it shows the smallest
+        rectangle that contains the photograph, up to 60 degrees to each side and twice the size.  Raises DataError when
+        there is no such rectangle.  For a wide photograph, it is the camera of the face.
         """
         if self.is_wide:
             return self._face_camera()
         fx, fy, _, _, _ = self._split
-        along_x, along_y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
-        left = self.undistort(np.zeros(BORDER_POINTS), along_y)[0]
-        right = self.undistort(np.full(BORDER_POINTS, float(self.width)), along_y)[0]
-        top = self.undistort(along_x, np.zeros(BORDER_POINTS))[1]
-        bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
+        x, y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
+        left = self.undistort(np.zeros(BORDER_POINTS), y)[0]
+        right = self.undistort(np.full(BORDER_POINTS, float(self.width)), y)[0]
+        top = self.undistort(x, np.zeros(BORDER_POINTS))[1]
+        bottom = self.undistort(x, np.full(BORDER_POINTS, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise self._error("cannot be inverted")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
         if self.whole:
-            across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
-            wide, high = self.width * (MAX_GROWTH / 2) / fx, self.height * (MAX_GROWTH / 2) / fy
-            u0, u1 = max(np.nanmin(across), -MAX_TANGENT, -wide), min(np.nanmax(across), MAX_TANGENT, wide)
-            v0, v1 = max(np.nanmin(down), -MAX_TANGENT, -high), min(np.nanmax(down), MAX_TANGENT, high)
+            border_u, border_v = np.concatenate([left, right]), np.concatenate([top, bottom])
+            max_u, max_v = self.width * (MAX_GROWTH / 2) / fx, self.height * (MAX_GROWTH / 2) / fy
+            u0, u1 = max(np.nanmin(border_u), -MAX_TANGENT, -max_u), min(np.nanmax(border_u), MAX_TANGENT, max_u)
+            v0, v1 = max(np.nanmin(border_v), -MAX_TANGENT, -max_v), min(np.nanmax(border_v), MAX_TANGENT, max_v)
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise self._error("leaves no pixel undistorted")
@@ -377,15 +377,15 @@ class Lens:
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
         if self.is_wide:
-            return self._cut(pixels)
+            return self._extract_face(pixels)
         undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return undistorted.reshape(self.pinhole.height, self.pinhole.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph covers, because their rays distort into it and back."""
+        """Which pixels of `pinhole`, [H, W], the photograph covers: their rays distort into it and back."""
         if self.is_wide:
-            return np.concatenate([self._shows(u, v) for _, u, v in self._blocks(1)])
+            return np.concatenate([self._sees(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
@@ -395,16 +395,16 @@ class Lens:
 
 def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) -> tuple[Floats, Floats]:
     """Return the normalized coordinates of samples x samples rays in each pixel of some rows, [H, W] each."""
-    across, down = ((np.arange(size * samples) + 0.5) / samples for size in (camera.width, camera.height))
-    down = down[rows.start * samples : rows.stop * samples]
-    u, v = np.meshgrid((across - camera.cx) / camera.fx, (down - camera.cy) / camera.fy)
+    x, y = ((np.arange(size * samples) + 0.5) / samples for size in (camera.width, camera.height))
+    y = y[rows.start * samples : rows.stop * samples]
+    u, v = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
     return u, v
 
 
 def _face_grid() -> tuple[Floats, Floats]:
     """Return the normalized coordinates of FACE_GRID x FACE_GRID points of a face."""
-    along = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
-    u, v = np.meshgrid(along, along)
+    positions = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
+    u, v = np.meshgrid(positions, positions)
     return u, v
 
 
@@ -425,7 +425,7 @@ def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal
     return np.stack([u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det])
 
 
-@lru_cache(maxsize=2)  # a phone held upright and sideways; each takes 8 bytes per pixel
+@lru_cache(maxsize=2)  # for portrait and landscape photographs of a phone; 8 bytes per pixel each
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the position in the photograph of each pixel of `pinhole`, [H, W] each, for OpenCV's integer centers."""
     x, y = lens.distort(*_rays(lens.pinhole))

@@ -27,7 +27,7 @@ IMAGES = "images"  # the folder of the photographs, as in COLMAP and nerfstudio
 
 
 def posed_views(scene: Scene) -> list[PosedView]:
-    """Return the views in their order.  Raises DataError for names that do not fit a line of text, or that repeat."""
+    """Return the views in order.  Raises DataError for duplicate names and for names that are not one line of text."""
     names = []
     for view in scene.views:  # with the suffix of the file, which some formats leave out
         has_suffix = is_image(PurePosixPath(view.name)) or view.image_path == NO_FILE
@@ -49,11 +49,11 @@ def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
     """Return the photograph of each view, by its path below `folder`.  Raises DataError without a photograph."""
     for posed in views:
         if posed.view.image_path == NO_FILE:
-            raise DataError(f"the view {quote(posed.name)} has no photograph to copy; write the cameras alone")
+            raise DataError(f"the view {quote(posed.name)} has no photograph to copy; write only the cameras")
         if posed.view.lens is not None and posed.view.lens.is_wide:
             raise DataError(
-                f"the view {quote(posed.name)} is a part of a wide photograph; `clsplat data undistort` first, "
-                "or write the cameras alone"
+                f"the view {quote(posed.name)} is a part of a wide photograph; run `clsplat data undistort` first, "
+                "or write only the cameras"
             )
     return {folder / posed.name: posed.view.image_path for posed in views}
 
@@ -78,7 +78,7 @@ def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tr
     offset = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if offset > TOLERANCE:
         LOG.warning(
-            "%s: other programs take the middle of the image for the principal point, which is up to %.1f px away",
+            "%s: other programs assume the principal point at the center of the image; it is up to %.1f px away",
             *(out / INRIA_FILE, offset),
         )
     return [out / INRIA_FILE]
@@ -149,7 +149,7 @@ DISTORTION = {  # by COLMAP's model: nerfstudio's model, and the names of the di
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
 
-REMEDY = "write colmap, or `clsplat data undistort` first"
+REMEDY = "write colmap, or run `clsplat data undistort` first"
 
 
 def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
@@ -173,13 +173,13 @@ def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | Non
     if any(posed.test for posed in views):
         train, test = ([f"{IMAGES}/{posed.name}" for posed in views if posed.test is test] for test in (False, True))
         table |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
-    written = [out / TRANSFORMS_FILE]
+    files = [out / TRANSFORMS_FILE]
     if points is not None:
         table["ply_file_path"] = POINTS
         write_points_ply(out / POINTS, points)
-        written.append(out / POINTS)
+        files.append(out / POINTS)
     write_text(out / TRANSFORMS_FILE, json.dumps(table, indent=1) + "\n")
-    return written
+    return files
 
 
 def _lens(posed: PosedView) -> dict[str, Any]:
@@ -212,8 +212,8 @@ OUTPUTS = {  # files that each writes
 }
 UNDISTORTED = ("inria",)  # formats of cameras without lenses
 COPIES = ("none", "copy")  # of the photographs
-SPLIT = "nerfstudio"  # the format that keeps the split, and times
-TRACKS = "colmap"  # the format that keeps which points the photographs show
+SPLIT = "nerfstudio"  # the format that stores the split and times
+TRACKS = "colmap"  # the format that stores which points the photographs show
 
 
 def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
@@ -232,9 +232,9 @@ def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
-    """Write the cameras of a scene, and copies of the photographs, with their exposures, if `images` is copy.
+    """Write the cameras of a scene and, with `images="copy"`, copies of the photographs and their exposures.
 
-    Returns the files of cameras.  The views have the size of the dataset.  over: whether to replace existing files.
+    Returns the camera files.  The views have the size of the dataset.  over: whether to replace existing files.
     Raises ConfigError for an unknown format and for an existing file, DataError if the format cannot hold the scene.
     """
     for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
@@ -244,26 +244,26 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     views = check_cameras(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(posed.view.lens is not None for posed in views):
         raise DataError(
-            f"{scene.path}: {format_} holds cameras of undistorted photographs, and these are distorted; "
-            "`clsplat data undistort` first, or write the cameras alone"
+            f"{scene.path}: {format_} has no lens distortion, and these photographs are distorted; "
+            "run `clsplat data undistort` first, or write only the cameras"
         )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if over else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
-    written = WRITERS[format_](out, views, scene.points, scene.tracks)
+    files = WRITERS[format_](out, views, scene.points, scene.tracks)
     if format_ != SPLIT and scene.test:
-        lost = f"{len(scene.test)} of {len(views)}"
-        LOG.warning("%s: %s does not keep which views are for testing, %s; %s does", out, format_, lost, SPLIT)
+        test_views = f"{len(scene.test)} of {len(views)}"
+        LOG.warning("%s: %s does not store which views are for testing, %s; %s does", out, format_, test_views, SPLIT)
     if format_ != SPLIT and any(posed.view.time is not None for posed in views):
-        LOG.warning("%s: %s does not keep the times of the views; %s does", out, format_, SPLIT)
+        LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT)
     if format_ != TRACKS and copies and scene.tracks is not None:
-        LOG.warning("%s: %s does not keep which points the photographs show; %s does", out, format_, TRACKS)
+        LOG.warning("%s: %s does not store which points the photographs show; %s does", out, format_, TRACKS)
     for path, source in counted(copies.items(), "photographs copied", len(copies)):
         with open_file(source, "an image") as old, open_atomic(path) as new:
             shutil.copyfileobj(old, new)
     if copies:
         exposures = load_exposures([posed.view for posed in views])
         write_exposures(out / IMAGES, dict(zip((posed.name for posed in views), exposures, strict=True)))
-    return written
+    return files

@@ -65,7 +65,7 @@ class ImageRecord(NamedTuple):
 
 
 def parameter_count(where: str, model: str) -> int:
-    """Return the number of parameters of a camera model.  Raises DataError, with `where`, for others."""
+    """Return the number of parameters of a camera model.  Raises DataError, with `where`, for an unknown model."""
     if model not in PARAMETERS:
         raise DataError(f"{where}: unknown camera model {quote(model)}; expected one of {', '.join(PARAMETERS)}")
     return PARAMETERS[model]
@@ -123,9 +123,9 @@ def _is_points2d(line: str) -> bool:
 def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the ids of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
     words = line.split()
-    named = [i for i in range(2, len(words), 3) if words[i].isdecimal()]
-    pixels = [(_number(words[i - 2]), _number(words[i - 1])) for i in named]
-    return np.array([_id(words[i]) for i in named], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+    indices = [i for i in range(2, len(words), 3) if words[i].isdecimal()]
+    pixels = [(_number(words[i - 2]), _number(words[i - 1])) for i in indices]
+    return np.array([_id(words[i]) for i in indices], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
 
 
 def _number(word: str) -> float:
@@ -194,10 +194,10 @@ class _Binary:
 
     def skip(self, size: int, label: str) -> int:
         """Skip `size` bytes and return the offset of the first."""
-        left = len(self.data) - self.offset
-        if size > left:
+        available = len(self.data) - self.offset
+        if size > available:
             raise DataError(
-                f"{self.where}: expected {size} bytes of {label}, found {left}; truncated or damaged: {REMEDY}"
+                f"{self.where}: expected {size} bytes of {label}, found {available}; truncated or damaged: {REMEDY}"
             )
         self.offset += size
         return self.offset - size
@@ -313,10 +313,10 @@ logger = logging.getLogger("clsplat")
 class ColmapReader(Reader):
     """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
-    If there are several models, the reader takes the one with the most images.  Every `holdout`-th view by name is a
-    test view.  Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may
-    contain masks, named like the images, with .png appended or as the suffix.  With a file `images/times.json` that
-    gives each image a time, the scene is dynamic.
+    If there are several models, the one with the most images is used.  Every `holdout`-th view by name is a test view.
+    Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may contain masks,
+    named like the images, with .png appended or as the suffix.  With a file `images/times.json` that gives each image a
+    time, the scene is dynamic.
     """
 
     name = "COLMAP"
@@ -329,11 +329,11 @@ class ColmapReader(Reader):
         model, images = _largest_model(path)
         cameras = read_cameras(model)
         images, files, masks = self._files(path, images)
-        views = [view_of(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
+        views = [make_view(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
         views = sorted((views[i] for i in files.existing(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
         original = [view for view in views if view.image_path not in files.reduced]
-        points, tracks = (table.cloud(), tracks_of(images, table, original)) if table else (None, None)
+        points, tracks = (table.cloud(), make_tracks(images, table, original)) if table else (None, None)
         views = [fit_to_photograph(view) if view.image_path in files.reduced else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         tracks = tracks and tracks.shifted(scene.origin).on_faces(scene.views)
@@ -350,7 +350,7 @@ class ColmapReader(Reader):
         parts.image_folder = files.folder
         parts.expect(files)
         for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
-            if view := parts.attempt(view_of, image, cameras, file, mask):
+            if view := parts.attempt(make_view, image, cameras, file, mask):
                 parts.views.append(fit_to_photograph(view) if file in files.reduced else view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = len(image.points)
@@ -368,19 +368,19 @@ def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
     """Return a view without a photograph for each image of the largest model, and the points."""
     model, images = _largest_model(path)
     cameras, table = read_cameras(model), read_point_table(model)
-    return [view_of(image, cameras) for image in images], table.cloud() if table else None
+    return [make_view(image, cameras) for image in images], table.cloud() if table else None
 
 
-def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
+def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
     """Return which points each image shows, with reprojection residuals for `views`; None if no image lists points."""
     finite = table.is_finite()
     positions, ids = table.positions[finite], table.ids[finite]
     order = np.argsort(ids, kind="stable")
     seen, residuals, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
-        named, first = np.unique(image.points, return_index=True)
-        nearest = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
-        is_match = ids[order][nearest] == named if len(ids) else np.zeros(len(named), bool)
+        ids2, first = np.unique(image.points, return_index=True)
+        nearest = np.minimum(np.searchsorted(ids[order], ids2), max(len(ids) - 1, 0))
+        is_match = ids[order][nearest] == ids2 if len(ids) else np.zeros(len(ids2), bool)
         rows = seen[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
         view = by_name.get(image.name)
         if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
@@ -415,13 +415,13 @@ def image_folder(path: Path, root: Path | None = None) -> Path:
     return next((parent / "images" for parent in above if (parent / "images").is_dir()), above[-1] / "images")
 
 
-def view_of(
+def make_view(
     image: ImageRecord, cameras: dict[int, CameraRecord], file: Path = NO_FILE, mask: Path | None = None
 ) -> View:
     """Return the view of an image.  Raises DataError if the image or its camera is invalid."""
     if image.camera not in cameras:
         raise DataError(
-            f"{image.where}: image {quote(image.name)} names camera {image.camera}; expected one of the cameras file, "
+            f"{image.where}: image {quote(image.name)} has camera {image.camera}; expected one of the cameras file, "
             f"{sorted(cameras)[:8]}: {REMEDY}"
         )
     try:

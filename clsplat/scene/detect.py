@@ -1,4 +1,4 @@
-"""Find the reader of a dataset among shipped readers and those of plug-ins."""
+"""Find the reader of a dataset among the shipped readers and those of plug-ins."""
 
 import logging
 from contextlib import suppress
@@ -23,11 +23,11 @@ PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, 
 def readers() -> list[Reader]:
     """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition.
 
-    Raises ConfigError if two have the same name, or one has none.
+    Raises ConfigError if two readers have the same name.
     """
 
     def rank(kind: type[Reader]) -> int:
-        """Return the rank of a shipped reader, or of the one that the class extends."""
+        """Return the rank of a shipped reader or of its subclass; other readers come last."""
         return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(kind, shipped)), len(PRECEDENCE))
 
     by_name: dict[str, Reader] = {}
@@ -42,8 +42,8 @@ def readers() -> list[Reader]:
 
 def format_names() -> str:
     """Return the names of all formats in the form `A, B or C`."""
-    *others, last = (reader.name for reader in readers())
-    return f"{', '.join(others)} or {last}"
+    *names, last = (reader.name for reader in readers())
+    return f"{', '.join(names)} or {last}"
 
 
 def find_reader(path: Path) -> Reader | None:
@@ -70,8 +70,8 @@ def find_datasets(path: Path) -> list[Reader]:
 def find_dataset(path: Path) -> Reader | None:
     """Return the reader of the dataset in a folder, or of the only one below it; None without a dataset.
 
-    Of several COLMAP models of the same photographs, the one with the photographs counts, otherwise the largest, the
-    first by name in a tie.  Raises DataError, with a list, for several datasets.
+    If several COLMAP models have the same photographs, the one with the image files is used, otherwise the largest (the
+    first by name in a tie).  Raises DataError, with a list, for several datasets.
     """
     datasets = find_datasets(path)
     if len(datasets) < 2:
@@ -83,14 +83,14 @@ def find_dataset(path: Path) -> Reader | None:
     ]
     best = max(range(len(datasets)), key=lambda i: (has_photographs[i], len(names[i])))
     if sum(has_photographs) > 1 or not all(names[i] & names[best] for i in range(len(names))):
-        listed = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
-        raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {listed}; give one of these")
+        candidates = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
+        raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {candidates}; give one of these")
     datasets[best].choice = f", of {len(datasets)} models of these photographs"
     return datasets[best]
 
 
 def _image_names(folder: Path) -> set[str]:
-    """Return the names of the images of a COLMAP dataset without folder and suffix; none if it is damaged."""
+    """Return the names of the images of a COLMAP dataset without folder and suffix; empty if it is damaged."""
     with suppress(DataError):
         return {PureWindowsPath(image.name).stem for model in find_models(folder) for image in read_images(model)}
     return set()
@@ -119,7 +119,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         if reader.note:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
-        return split.apply(replace(reader.read(reader.folder, split.of_reader), path=path))
+        return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
     if any(is_image(file) for file in path.iterdir()):
         above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"

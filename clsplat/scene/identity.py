@@ -21,16 +21,16 @@ from clsplat.core.machine import cache_folder
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
-from clsplat.scene.quality import excludes_all, shows_nothing
+from clsplat.scene.quality import excludes_all, is_blank
 from clsplat.scene.scene import SPLITS, Scene
 from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene before training, so that damaged files are found early.
 
 MAX_THREADS = 8  # each has one photograph in memory
-MAX_REMEMBERED = 1 << 24  # bytes: about 200 000 photographs
+MAX_CACHE_BYTES = 1 << 24  # bytes: about 200 000 photographs
 MAX_NAMES = 3  # in a message
-Entry = tuple[int, int, int]  # width and height, px, and bits: shows nothing, uses no pixel as a mask, is transparent
+Entry = tuple[int, int, int]  # width and height, px, and bits: blank, excludes every pixel as a mask, transparent
 
 
 @dataclass
@@ -42,15 +42,15 @@ class ImageFile:
     orientation: int = 1  # from EXIF; 1: upright
     cut: bool = False  # its end is missing
     fault: str = ""  # the error that training would report
-    blank: bool = False  # as a photograph: it shows nothing
-    excluded: bool = False  # as a mask: it uses no pixel
+    blank: bool = False  # as a photograph: black, of one color, or transparent
+    excluded: bool = False  # as a mask: it excludes every pixel
     transparent: bool = False
 
 
 def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
     """Decode the photographs and masks of views, and check that their sizes match the cameras, as load_image does.
 
-    Files are read in threads, and a file that several views share only once.  Views without a photograph are skipped.
+    Files are read in threads; files shared by several views are read once.  Views without a photograph are skipped.
     """
     users: dict[Path, list[View]] = defaultdict(list)
     for view in views:
@@ -75,21 +75,21 @@ def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
     """Raise DataError if training cannot use image files of the scene at `path`."""
     damaged = {file: result.fault.removeprefix(f"{file}: ") for file, result in files.items() if result.fault}
     if damaged:
-        named = "; ".join(f"{file} ({fault})" for file, fault in list(damaged.items())[:MAX_NAMES])
+        examples = "; ".join(f"{file} ({fault})" for file, fault in list(damaged.items())[:MAX_NAMES])
         more = "; …" if len(damaged) > MAX_NAMES else ""
-        raise DataError(f"{path}: {len(damaged)} of {len(files)} image files cannot be trained on: {named}{more}")
+        raise DataError(f"{path}: {len(damaged)} of {len(files)} image files cannot be trained on: {examples}{more}")
 
 
 def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:
-    """Return the names of the views whose photographs show nothing.
+    """Return the names of the views with blank photographs.
 
-    Raises DataError if all do, or if a mask excludes every pixel of a photograph, as training would.
+    Raises DataError, as training would, if all are blank or if a mask excludes every pixel of a photograph.
     """
     masked = [view for view in views if _is_excluded(view, files)]
     if masked:
-        named = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
+        examples = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
         raise DataError(
-            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photograph')}: {named}; masks are white "
+            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photograph')}: {examples}; masks are white "
             "(255) in pixels to use: correct them, or remove these photographs"
         )
     blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
@@ -123,7 +123,7 @@ def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSi
 class DecodedSizes:
     """A cache of the sizes and contents of images that this version of the decoder has decoded, by content hash.
 
-    It is a text file in the user's cache folder; if that cannot be used, all images are decoded.
+    It is a text file in the user's cache folder; without a usable cache folder, all images are decoded.
     """
 
     def __init__(self) -> None:
@@ -132,7 +132,7 @@ class DecodedSizes:
         self.path: Path | None = None
         with suppress(DataError, OutputError):
             self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-contents.txt"
-            lines = read_file(self.path, limit=MAX_REMEMBERED).splitlines(keepends=True)
+            lines = read_file(self.path, limit=MAX_CACHE_BYTES).splitlines(keepends=True)
             self._known = dict(filter(None, map(_entry, lines)))
 
     def size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
@@ -141,24 +141,24 @@ class DecodedSizes:
         if key not in self._known:
             pixels = decode_image(data, file, upright)
             is_transparent = pixels.shape[2] == 4 and excludes_all(pixels[:, :, 3])
-            shown = shows_nothing(pixels), excludes_all(pixels[:, :, 0]), is_transparent
+            flags = is_blank(pixels), excludes_all(pixels[:, :, 0]), is_transparent
             height, width = pixels.shape[:2]
-            self._known[key] = self._new[key] = width, height, sum(2**bit for bit, is_set in enumerate(shown) if is_set)
+            self._known[key] = self._new[key] = width, height, sum(2**bit for bit, is_set in enumerate(flags) if is_set)
         return self._known[key][:2]
 
     def contents(self, digest: str) -> tuple[bool, bool, bool]:
-        """Return whether a known image shows nothing, uses no pixel as a mask, and is transparent."""
+        """Return whether a cached image is blank, excludes every pixel as a mask, and is transparent."""
         bits = self._known[digest][2]
         return bool(bits & 1), bool(bits & 2), bool(bits & 4)
 
     def save(self) -> None:
-        """Append the new sizes in one write, so that lines of two processes do not mix."""
+        """Append the new sizes in one write, so that lines of several processes do not mix."""
         if self.path is None or not self._new:
             return
         lines = "".join(f"{key} {width} {height} {bits}\n" for key, (width, height, bits) in self._new.items())
         with suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            full = self.path.exists() and self.path.stat().st_size >= MAX_REMEMBERED
+            full = self.path.exists() and self.path.stat().st_size >= MAX_CACHE_BYTES
             with self.path.open("wb" if full else "ab", buffering=0) as file:
                 file.write(lines.encode())
 
@@ -171,7 +171,7 @@ def _entry(line: bytes) -> tuple[str, Entry] | None:
     return words[0].decode(errors="replace"), (int(words[1]), int(words[2]), int(words[3]))
 
 
-Row = dict[str, str]  # hashes of the photograph, mask and camera of a view, "" if there is none; its time if it has one
+Row = dict[str, str]  # hashes of the photograph, mask and camera of a view ("" if missing); its time if it has one
 
 
 @dataclass(frozen=True)

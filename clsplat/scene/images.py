@@ -23,7 +23,7 @@ from clsplat.core.reading import open_file, read_file, read_json
 HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes to read at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
-FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
+FRAME_MARKERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
 ORIENTATION = 0x0112  # Exif tag
 
 
@@ -37,17 +37,17 @@ class Header:
     complete: bool = True
 
 
-def parse_header(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
+def parse_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
     """Return the header of a PNG or JPEG file from its first and last bytes; None for other formats.
 
-    `whole` returns all bytes; it is called when the end marker is in neither part.
+    `read_all` returns all bytes; it is called when neither part contains the end marker.
     """
     header = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        header = Header(width, height, complete=PNG_END in tail or PNG_END in whole())
+        header = Header(width, height, complete=PNG_END in tail or PNG_END in read_all())
     elif head.startswith(JPEG):
-        header = _jpeg(head, tail, whole)
+        header = _jpeg(head, tail, read_all)
     return header if header and header.width and header.height else None
 
 
@@ -57,17 +57,17 @@ def is_truncated(data: bytes) -> bool:
     return header is not None and not header.complete
 
 
-def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
+def _jpeg(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
     """Walk the segments up to the frame header; None when the walk fails."""
     orientation = 1
-    for marker, at, length in jpeg_segments(head):
-        if marker in FRAMES:
-            height, width = struct.unpack_from(">HH", head, at + 5)
+    for marker, offset, length in jpeg_segments(head):
+        if marker in FRAME_MARKERS:
+            height, width = struct.unpack_from(">HH", head, offset + 5)
             # Pixels cannot contain an end marker; a thumbnail has one, but before the frame header.
-            complete = JPEG_END in tail or whole().find(JPEG_END, at) >= 0
+            complete = JPEG_END in tail or read_all().find(JPEG_END, offset) >= 0
             return Header(width, height, orientation, complete)
-        if _is_exif(head, marker, at):
-            orientation = _orientation(head[at + 10 : at + 2 + length])
+        if _is_exif(head, marker, offset):
+            orientation = _orientation(head[offset + 10 : offset + 2 + length])
     return None
 
 
@@ -76,31 +76,31 @@ def find_exif_segment(head: bytes) -> tuple[int, int] | None:
 
     Its TIFF block starts 10 bytes after the offset.
     """
-    matches = ((at, length) for marker, at, length in jpeg_segments(head) if _is_exif(head, marker, at))
+    matches = ((offset, length) for marker, offset, length in jpeg_segments(head) if _is_exif(head, marker, offset))
     return next(matches, None) if head.startswith(JPEG) else None
 
 
-def _is_exif(head: bytes, marker: int, at: int) -> bool:
-    return marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0"
+def _is_exif(head: bytes, marker: int, offset: int) -> bool:
+    return marker == 0xE1 and head[offset + 4 : offset + 10] == b"Exif\0\0"
 
 
 def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield the marker, offset and length of each segment of a JPEG file, up to a damaged one."""
-    at = 2
-    while at + 9 <= len(head) and head[at] == 0xFF:
-        marker = head[at + 1]
+    offset = 2
+    while offset + 9 <= len(head) and head[offset] == 0xFF:
+        marker = head[offset + 1]
         if marker == 0xFF:  # fill
-            at += 1
+            offset += 1
             continue
-        (length,) = struct.unpack_from(">H", head, at + 2)
-        yield marker, at, length
-        at += 2 + length
+        (length,) = struct.unpack_from(">H", head, offset + 2)
+        yield marker, offset, length
+        offset += 2 + length
 
 
 def _orientation(exif: bytes) -> int:
     """Return the orientation in a TIFF block, 1 to 8; 1 if missing."""
-    at = find_orientation(exif)
-    value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
+    offset = find_orientation(exif)
+    value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, offset)[0] if offset else 1
     return int(value) if 1 <= value <= 8 else 1
 
 
@@ -111,15 +111,15 @@ def find_orientation(exif: bytes) -> int | None:
         return None
     (start,) = struct.unpack_from(order + "I", exif, 4)
     entries = struct.unpack_from(order + "H", exif, start)[0] if start + 2 <= len(exif) else 0
-    for at in range(start + 2, min(start + 2 + 12 * entries, len(exif) - 11), 12):
-        if struct.unpack_from(order + "H", exif, at)[0] == ORIENTATION:
-            return at + 8
+    for offset in range(start + 2, min(start + 2 + 12 * entries, len(exif) - 11), 12):
+        if struct.unpack_from(order + "H", exif, offset)[0] == ORIENTATION:
+            return offset + 8
     return None
 
 
 # PNG files are checked and stripped before OpenCV reads them.
 
-USED = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # next to the critical chunks, which have a capital letter
+RELEVANT_CHUNKS = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # in addition to critical chunks, in capitals
 
 
 def strip_png_metadata(data: bytes) -> bytes:
@@ -129,25 +129,25 @@ def strip_png_metadata(data: bytes) -> bytes:
     """
     if not data.startswith(PNG):
         return data
-    view, at, chunks = memoryview(data), len(PNG), [memoryview(PNG)]
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        kind, end = data[at + 4 : at + 8], at + 12 + length
+    view, offset, chunks = memoryview(data), len(PNG), [memoryview(PNG)]
+    while offset + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, offset)
+        kind, end = data[offset + 4 : offset + 8], offset + 12 + length
         if end > len(data):
             break
-        if kind in USED or not kind[0] & 0x20:
-            if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-                raise ValueError(f"byte {at}: the checksum of the chunk {quote(kind.decode('latin-1'))} is wrong")
-            chunks.append(view[at:end])
+        if kind in RELEVANT_CHUNKS or not kind[0] & 0x20:
+            if zlib.crc32(view[offset + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+                raise ValueError(f"byte {offset}: the checksum of the chunk {quote(kind.decode('latin-1'))} is wrong")
+            chunks.append(view[offset:end])
         if kind == b"IEND":
             return b"".join(chunks)
-        at = end
-    raise ValueError(f"byte {at}: expected another chunk, but only {len(data) - at} bytes are left")
+        offset = end
+    raise ValueError(f"byte {offset}: expected another chunk, but only {len(data) - offset} bytes are left")
 
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its messages do not name the file; ours do
 MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
-REDUCED = {  # OpenCV's flag for gray, by the divisor of the size
+GRAY_FLAGS = {  # OpenCV's flag for gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
     4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
@@ -205,19 +205,19 @@ def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[floa
     data = read_file(path, "an image", limit=MAX_BYTES)
     header = parse_header(data[:HEAD_SIZE], data[-TAIL_SIZE:], lambda: data) if data.startswith(JPEG) else None
     longest = max(header.width, header.height) if header else 0
-    half = next((n for n in (8, 4, 2) if longest >= n * long_side), 1)
-    pixels = _decoded(data, path, REDUCED[half] | cv2.IMREAD_IGNORE_ORIENTATION)
+    divisor = next((n for n in (8, 4, 2) if longest >= n * long_side), 1)
+    pixels = _decode(data, path, GRAY_FLAGS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION)
     height, width = pixels.shape[:2]
-    shrink = max(1.0, max(height, width) / long_side)
-    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    factor = max(1.0, max(height, width) / long_side)
+    size = max(1, round(width / factor)), max(1, round(height / factor))
     if size != (width, height):
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(pixels, np.uint8), (half * width / size[0], half * height / size[1])
+    return np.asarray(pixels, np.uint8), (divisor * width / size[0], divisor * height / size[1])
 
 
 def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]:
     """Decode the bytes of the image file `path`, as read_image does.  Raises DataError when they are damaged."""
-    pixels = _decoded(data, path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
+    pixels = _decode(data, path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
     if pixels.ndim == 2 or pixels.shape[2] == 1:
@@ -232,19 +232,19 @@ def _transparent_gray(data: bytes) -> int | None:
     """Return the gray level that a PNG declares transparent, which OpenCV drops; None for other files."""
     if data[:8] != PNG or len(data) < 26 or data[25] != 0:
         return None
-    at = data.find(b"\0\0\0\2tRNS", 33, data.find(b"IDAT"))
+    offset = data.find(b"\0\0\0\2tRNS", 33, data.find(b"IDAT"))
     largest = (1 << data[24]) - 1
-    level = struct.unpack_from(">H", data, at + 8)[0] & largest if at > 0 else None
+    level = struct.unpack_from(">H", data, offset + 8)[0] & largest if offset > 0 else None
     return None if level is None else level * max(1, 255 // largest)
 
 
 def _without_rotation(data: bytes) -> bytes:
     """Return a TIFF without its orientation, by which OpenCV always rotates; other files unchanged."""
-    at = find_orientation(data) if data[:4] in (b"II*\0", b"MM\0*") else None
-    return data if at is None else data[:at] + (b"\1\0" if data[:1] == b"I" else b"\0\1") + data[at + 2 :]
+    offset = find_orientation(data) if data[:4] in (b"II*\0", b"MM\0*") else None
+    return data if offset is None else data[:offset] + (b"\1\0" if data[:1] == b"I" else b"\0\1") + data[offset + 2 :]
 
 
-def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
+def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     if is_truncated(data):  # some versions of OpenCV fill the rest with gray
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
@@ -269,7 +269,7 @@ GPS_IFD, LATITUDE, LONGITUDE = 0x8825, 2, 4
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm equivalent for 35 mm film
 TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # types of values
-POSSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
+PLAUSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
 Value = float | str
 
 
@@ -320,8 +320,8 @@ def copy_exif(head: bytes, jpeg: bytes) -> bytes:
     segment = find_exif_segment(head)
     if segment is None:
         return jpeg
-    at, length = segment
-    block = bytearray(head[at : at + 2 + length])
+    segment_start, length = segment
+    block = bytearray(head[segment_start : segment_start + 2 + length])
     if offset := find_orientation(bytes(block[10:])):
         block[10 + offset : 12 + offset] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
     return jpeg[:2] + bytes(block) + jpeg[2:]
@@ -335,8 +335,8 @@ def _read_tags(path: Path) -> dict[int, Value]:
     tags: dict[int, Value] = {}
     if segment is None:
         return tags
-    at, length = segment
-    block = head[at + 10 : at + 2 + length]
+    segment_start, length = segment
+    block = head[segment_start + 10 : segment_start + 2 + length]
     with suppress(struct.error, KeyError, ValueError):  # truncated, or without EXIF tags
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
@@ -348,27 +348,27 @@ def _read_tags(path: Path) -> dict[int, Value]:
 
 
 def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """Return the values of an IFD by tag; of several numbers, the first."""
+    """Return the values of an IFD by tag; for several numbers, the first."""
     values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
-    for at in range(start + 2, start + 2 + 12 * entries, 12):
-        tag, kind, count, value = struct.unpack_from(order + "HHII", block, at)
+    for entry in range(start + 2, start + 2 + 12 * entries, 12):
+        tag, kind, count, value = struct.unpack_from(order + "HHII", block, entry)
         if kind == RATIONAL:
-            above, below = struct.unpack_from(order + "II", block, value)
-            if below:
-                values[tag] = above / below
+            numerator, denominator = struct.unpack_from(order + "II", block, value)
+            if denominator:
+                values[tag] = numerator / denominator
         elif kind in (SHORT, LONG):
-            (values[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
+            (values[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, entry + 8)
         elif kind == TEXT:
-            offset = value if count > 4 else at + 8
+            offset = value if count > 4 else entry + 8
             values[tag] = block[offset : offset + count].split(b"\0")[0].decode("ascii", "replace").strip()
     return values
 
 
 def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
-    """Return an exposure, or None when a value is not a number that a camera can have."""
+    """Return an exposure, or None when a value is missing or implausible for a camera."""
     numbers = [float(value) for value in (seconds, aperture, iso) if isinstance(value, int | float)]
-    is_valid = len(numbers) == 3 and all(low < n < high for n, (low, high) in zip(numbers, POSSIBLE, strict=True))
+    is_valid = len(numbers) == 3 and all(low < n < high for n, (low, high) in zip(numbers, PLAUSIBLE, strict=True))
     return CameraExposure(*numbers) if is_valid else None
 
 
@@ -380,7 +380,7 @@ def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:
-    """Return the exposures in the file of a folder of images; none without the file.
+    """Return the exposures in the file of a folder of images, by name; empty without the file.
 
     Raises DataError when it is damaged.
     """

@@ -1,4 +1,4 @@
-"""Find the files that a dataset names, even if their names, suffixes or folders have changed."""
+"""Find the files of a dataset, even if their names, suffixes or folders have changed."""
 
 import difflib
 import logging
@@ -21,9 +21,9 @@ Missing = Literal["refuse", "skip"]  # what to do about missing photographs
 Parts = tuple[str, ...]  # of a path
 MAX_DEPTH = 6  # folders below that of the scene
 MAX_COMPARED = 5000  # file names, to find the nearest one
-RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs, ours and 3DGS's, and of preparation
+RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs (ours and 3DGS's) and of `prepare`
 CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)")
-OTHER_CONTENT = re.compile(  # folders whose images are photographs only where a name contains the folder
+OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the name in the dataset contains the folder
     r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
 SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph in one does not match another
@@ -33,7 +33,7 @@ logger = logging.getLogger("clsplat")
 
 
 def safe_join(folder: Path, name: str, where: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `where`, when that is outside the folder."""
+    """Return `folder / name`.  Raises DataError, starting with `where`, when the path is outside the folder."""
     if not _is_safe(name):
         raise DataError(f"{where}: the file name {quote(name)} is not a path below {folder}; rename it")
     return folder / name
@@ -47,13 +47,13 @@ def _is_safe(name: str) -> bool:
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError that names the first few `files` of the dataset at `path` that do not exist, if any."""
     paths = list(files)
-    if lost := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
-        raise DataError(f"{path}: {_missing_text(lost, len(paths))}; put them back")
+    if missing := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
+        raise DataError(f"{path}: {_missing_text(missing, len(paths))}; put them back")
 
 
-def _missing_text(lost: Sequence[str], count: int) -> str:
-    names = ", ".join(map(shorten, lost[:3])) + (", ..." if len(lost) > 3 else "")
-    return f"{len(lost)} of {count} image files are missing: {names}"
+def _missing_text(missing: Sequence[str], count: int) -> str:
+    names = ", ".join(map(shorten, missing[:3])) + (", ..." if len(missing) > 3 else "")
+    return f"{len(missing)} of {count} image files are missing: {names}"
 
 
 def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
@@ -74,12 +74,12 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 class FileLookup:
     """The image files of a dataset that another machine or program may have written.
 
-    An image `name` that exists below `folder` is used.  Otherwise a name and a file below `root` belong together if
-    each is the only best match of the other: the one with the longest common end of their paths.  Upper and lower case,
-    slashes, Unicode forms, URL escapes and the suffix of the image do not matter.  Links out of `root` are ignored.
+    An image `name` that exists below `folder` is used.  Otherwise, a name and a file below `root` match if each is the
+    only best match of the other: the one with the longest common end of their paths.  Upper and lower case, slashes,
+    Unicode forms, URL escapes and the suffix of the image do not matter.  Links out of `root` are ignored.
 
     spellings: returns the file names to try first for a name, by default the name itself.  strict: for masks and depth
-    maps, whose whole path must match, below their folder or below that of the name.  taken: files of another purpose.
+    maps, whose whole path must match, below their folder or below that of the name.  excluded: files not to match.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class FileLookup:
         names: Sequence[str],
         spellings: Callable[[str], Sequence[str]] = lambda name: (name,),
         strict: bool = False,
-        taken: Iterable[Path] = (),
+        excluded: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
         self.listed, self.names = list(names), list(names)  # the names in the dataset, and those of views
@@ -97,14 +97,14 @@ class FileLookup:
         self.matched: dict[int, int] = {}  # the length of the common end of each inexact match
         self.reduced: set[Path] = set()  # photographs from a folder such as images_4
         self.choices: dict[int, list[Path]] = {}  # several files that fit a name equally well
-        lost = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
-        self._match(lost, {*taken} | {*self.paths} - {self.paths[i] for i in lost})
-        self.skipped = tuple(self.names[i] for i in lost if i not in self.matched)
+        unmatched = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
+        self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
+        self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matched)
         if self.matched:
             logger.info("%s: %s", root, self.note)
 
     def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
-        """Take the file that a name spells, and return whether it exists."""
+        """Use the file that exactly matches a name, and return whether it exists."""
         for name in filter(_is_safe, dict.fromkeys((self.listed[i], PureWindowsPath(self.listed[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
                 self.paths[i] = path
@@ -116,7 +116,7 @@ class FileLookup:
         return False
 
     def _target(self, name: str) -> Parts:
-        """Return the comparable parts of a path that can be below `root`; none for an impossible name."""
+        """Return the comparable parts of a path that can be below `root`; empty for an impossible name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
         if not parts or parts[-1] == ".." or min(name) < " ":
@@ -138,17 +138,17 @@ class FileLookup:
                     files[_stem(path.name)].append(((*parts, _comparable(path.name)), path))
         return files
 
-    def _match(self, lost: Sequence[int], taken: set[Path]) -> None:
-        targets = list(map(self._target, self.listed)) if lost else []
+    def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
+        targets = list(map(self._target, self.listed)) if unmatched else []
         by_key = defaultdict[str, set[Parts]](set)
         for target in targets:
             for key in _keys(target):
                 by_key[key].add(target)
-        for i in lost:
+        for i in unmatched:
             ranked = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
-            files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in taken]
-            near = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
-            for parts, path in near or files:
+            files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
+            siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
+            for parts, path in siblings or files:
                 if rank := self._rank(self.listed[i], targets[i], parts, path):
                     ranked[rank].append((parts, path))
             best = ranked[max(ranked)] if ranked else []
@@ -169,18 +169,18 @@ class FileLookup:
         is_other = any(map(OTHER_CONTENT.search, above)) or (SPLITS & above and SPLITS.intersection(target))
         if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
             return None
-        same = parts[-1] == target[-1], path.name == name.name, path.stem == name.stem
-        return length, -_divisor(parts[:-length]), *same
+        is_equal = parts[-1] == target[-1], path.name == name.name, path.stem == name.stem
+        return length, -_divisor(parts[:-length]), *is_equal
 
     @property
     def note(self) -> str:
-        """How many names were matched, and how, in one sentence; "" if all names are exact."""
+        """The number of inexact matches and their criterion, in one sentence; "" if all names are exact."""
         for i, length in self.matched.items():
             count = f"{len(self.matched)} of {pluralize(len(self.listed), 'image' if self.strict else 'photograph')}"
-            how = "base name" if length == 1 else "the end of their paths"
-            reduced = ", with cameras scaled to these smaller photographs" if self.reduced else ""
+            criterion = "base name" if length == 1 else "the end of their paths"
+            scaling = ", with cameras scaled to these smaller photographs" if self.reduced else ""
             file = self.paths[i].relative_to(self.root).as_posix()
-            return f"{count} matched by {how}, such as {file} for {quote(self.listed[i])}{reduced}"
+            return f"{count} matched by {criterion}, such as {file} for {quote(self.listed[i])}{scaling}"
         return ""
 
     def existing(self, where: Path, missing: Missing) -> list[int]:
@@ -190,9 +190,9 @@ class FileLookup:
         where: the dataset, for messages.
         """
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
-        if lost := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
-            fault = f"{where}: {_missing_text([str(self.paths[i]) for i in lost], len(self.paths))}"
-            for name in [self.listed[i] for i in lost if not _is_safe(self.listed[i])][:1]:
+        if absent := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
+            fault = f"{where}: {_missing_text([str(self.paths[i]) for i in absent], len(self.paths))}"
+            for name in [self.listed[i] for i in absent if not _is_safe(self.listed[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
                 skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
@@ -202,7 +202,7 @@ class FileLookup:
 
     @cached_property
     def hint(self) -> str:
-        """Which similar files or which folders exist, in brackets after a space; "" if no file is missing."""
+        """Similar files or searched folders, in parentheses after a space; "" if no file is missing."""
         if not self.skipped:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
@@ -211,10 +211,10 @@ class FileLookup:
             return f" ({first_few(fit)} fit {quote(self.listed[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
-        used = {*self.paths}
-        free = {_stem(path.name): name for path, name in relative.items() if path not in used}
-        near = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
-        nearest = f"the nearest file is {free[near[0]].as_posix()}, " if near else ""
+        matched = {*self.paths}
+        free = {_stem(path.name): name for path, name in relative.items() if path not in matched}
+        similar = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
+        nearest = f"the nearest file is {free[similar[0]].as_posix()}, " if similar else ""
         folders = Counter(path.parent.as_posix() for path in relative.values())
         return f" ({nearest}searched: {first_few([folder for folder, _ in folders.most_common()])})"
 

@@ -13,7 +13,7 @@ from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
-from clsplat.scene.transforms_json import Transforms, view_name, view_of
+from clsplat.scene.transforms_json import Transforms, make_view, view_name
 from clsplat.scene.view import View
 
 LOG = logging.getLogger("clsplat")
@@ -59,13 +59,13 @@ def names_of(image: str) -> tuple[str, str]:
 
 
 def _entries(path: Path) -> list[Path]:
-    """Return the entries of the folder `videos` by name; none if there is no such folder."""
+    """Return the entries of the folder `videos` by name; empty if the folder does not exist."""
     folder = path / VIDEOS
     return sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
 
 
 def _camera_names(path: Path) -> set[str]:
-    """Return the possible names of a dataset's cameras; none if files are damaged, which another reader reports."""
+    """Return the possible names of a dataset's cameras; empty if files are damaged, which another reader reports."""
     try:
         if (path / TRANSFORMS).is_file():
             paths = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
@@ -121,7 +121,7 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
         transforms = Transforms(path / TRANSFORMS)
         first = next(iter(frames.values()))[0]
         size = stored_size(first)
-        posed = [view_of(frame, frame.image_name(), size) for frame in transforms.frames]
+        posed = [make_view(frame, frame.image_name(), size) for frame in transforms.frames]
         points = transforms.points(Clock(0.0, 1.0))
     else:
         posed, points = camera_views(path)
@@ -134,10 +134,10 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
             both = f"{cameras[name].name} and {view.name}"
             raise DataError(f"{path}: {both} are both poses of camera {name}; expected one pose per camera: remove one")
         cameras[name] = view
-    if without := sorted(set(frames) - set(cameras)):
+    if unposed := sorted(set(frames) - set(cameras)):
         raise DataError(
-            f"{path}: {len(without)} of {len(frames)} cameras have no pose: {first_few(without)}; expected an image "
-            f"NAME.png of each camera among the poses, or remove {VIDEOS}/{without[0]}"
+            f"{path}: {len(unposed)} of {len(frames)} cameras have no pose: {first_few(unposed)}; expected an image "
+            f"NAME.png of each camera among the poses, or remove {VIDEOS}/{unposed[0]}"
         )
     if len(posed) > len(cameras):
         LOG.info("%s: left out %d images of cameras without frames in %s", path, len(posed) - len(cameras), VIDEOS)

@@ -15,7 +15,7 @@ from clsplat.core.errors import DataError, pluralize
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.lookup import FileLookup
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View, load_image, load_mask, photograph_of
+from clsplat.scene.view import View, load_image, load_mask, photograph_name
 
 
 def load_photograph(
@@ -75,7 +75,7 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
             f"{scene.path}: the dataset already has masks, such as {existing}; remove scene.masks, "
             "or the masks of the dataset"
         )
-    photographs = [view.name if view.lens is None else photograph_of(view.name) for view in scene.views]
+    photographs = [view.name if view.lens is None else photograph_name(view.name) for view in scene.views]
     masks = find_masks(folder, photographs)
     views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
     mask_of = dict(zip(photographs, masks, strict=True))

@@ -16,10 +16,10 @@ from clsplat.scene.view import View
 
 Floats = NDArray[np.floating]
 Places = NDArray[np.integer]
-LONG_SIDE = 160  # px of the photographs that are compared
+LONG_SIDE = 160  # px, of the compared photographs
 PLANES = 64  # evenly spaced in inverse depth
 MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to the point that the cameras look at
-NEIGHBORS = 4  # photographs that each is compared with
+NEIGHBORS = 4  # photographs with which each photograph is compared
 WINDOW = 5  # px
 MAX_COST_RATIO = 0.6  # cost of the best plane / mean cost of all planes
 MIN_VOTES = 2  # neighbors that must confirm the depth of a point
@@ -40,13 +40,13 @@ class Surface:
 
         A point covers the pixel that it projects to, unless the surface there is more than a plane nearer.
         """
-        seen, row, column, depth = _project(self.view, points)
+        is_visible, row, column, depth = _project(self.view, points)
         nearest = np.zeros(self.inverse.shape)
-        np.maximum.at(nearest, (row[seen], column[seen]), 1 / depth[seen])
+        np.maximum.at(nearest, (row[is_visible], column[is_visible]), 1 / depth[is_visible])
         return np.asarray((nearest == 0) | (self.inverse > nearest + self.step))
 
 
-def swept_points(
+def sweep_points(
     views: Sequence[View],
     center: Floats,
     load: Callable[[View], NDArray[np.uint8]],
@@ -77,19 +77,19 @@ def swept_points(
 
 
 def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
-    """Return the surface that each view shows; arguments as for `swept_points`."""
+    """Return the surface that each view shows; arguments as for `sweep_points`."""
     small = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
     ]
     images = [load(view).astype(np.float32) / 255 for view in small]
-    near = [_neighbors(i, small) for i in range(len(small))]
+    nearest = [_neighbors(i, small) for i in range(len(small))]
     distance = float(np.median([np.linalg.norm(view.position - center) for view in small]))
     inverse = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
-    planes = [_best_planes(i, small, images, near[i], inverse) for i in range(len(small))]
+    planes = [_best_planes(i, small, images, nearest[i], inverse) for i in range(len(small))]
     step = float(inverse[1] - inverse[0])
     return [
-        Surface(view, images[i], np.where(_confirmed(i, small, planes, near[i], inverse), inverse[planes[i]], 0), step)
+        Surface(view, images[i], np.where(_confirm(i, small, planes, nearest[i], inverse), inverse[planes[i]], 0), step)
         for i, view in enumerate(small)
     ]
 
@@ -102,7 +102,7 @@ def _neighbors(i: int, views: Sequence[View]) -> list[int]:
 
 
 def _best_planes(
-    i: int, views: Sequence[View], images: Sequence[Floats], near: Sequence[int], inverse: Floats
+    i: int, views: Sequence[View], images: Sequence[Floats], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
     """Return the plane of each pixel, [H, W], with the smallest difference to the better half of the neighbors.
 
@@ -112,7 +112,7 @@ def _best_planes(
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
     for plane, depth in enumerate(inverse):
         differences = []
-        for j in near:
+        for j in neighbors:
             matrix = _homography(view, views[j], depth)
             size = view.camera.width, view.camera.height
             warped = cv2.warpPerspective(
@@ -150,25 +150,25 @@ def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Pla
     """Return which points, [M, 3], project into a view, their rows and columns, and their depths; 1 if behind it."""
     camera, pose = view.camera, view.world_to_camera
     x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
-    ahead = z > 0
-    depth = np.where(ahead, z, 1)
+    in_front = z > 0
+    depth = np.where(in_front, z, 1)
     column = np.floor(x / depth * camera.fx + camera.cx).clip(-1, camera.width).astype(int)
     row = np.floor(y / depth * camera.fy + camera.cy).clip(-1, camera.height).astype(int)
-    seen = ahead & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    return seen, row, column, depth
+    is_visible = in_front & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return is_visible, row, column, depth
 
 
-def _confirmed(
-    i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], near: Sequence[int], inverse: Floats
+def _confirm(
+    i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
-    """Return the pixels, [H, W], whose depth enough neighbors confirm, and is not on the first or last plane."""
+    """Return the pixels, [H, W], whose depth enough neighbors confirm and is not on the first or last plane."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
     points = _unproject(views[i], rows, columns, 1 / inverse[planes[i].ravel()])
     votes = np.zeros(len(points), int)
-    for j in near:
-        seen, row, column, depth = _project(views[j], points)
-        other = inverse[planes[j][row * seen, column * seen]]
-        votes += seen & (np.abs(other - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
-    middle = (planes[i] > 0) & (planes[i] < len(inverse) - 1)
-    return np.asarray((votes >= MIN_VOTES).reshape(shape) & middle)
+    for j in neighbors:
+        is_visible, row, column, depth = _project(views[j], points)
+        inverse_depth = inverse[planes[j][row * is_visible, column * is_visible]]
+        votes += is_visible & (np.abs(inverse_depth - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
+    is_inner = (planes[i] > 0) & (planes[i] < len(inverse) - 1)
+    return np.asarray((votes >= MIN_VOTES).reshape(shape) & is_inner)

@@ -51,7 +51,7 @@ class PointTable(NamedTuple):
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~finite):,}")
         colors = np.asarray(self.rgb[finite], np.float32) / np.float32(255)
         if clock and len(self.times):
-            times = np.asarray(clock.of_points(self.file, self.times[finite]), np.float32)
+            times = np.asarray(clock.normalize_points(self.file, self.times[finite]), np.float32)
         return PointCloud(self.positions[finite], colors, times)
 
 

@@ -16,7 +16,7 @@ from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import MIN_WHITE, View, load_mask, load_transparency, sample_views
 
 NEAREST = 0.01  # quantile of the depths of observed points: a few nearer ones are wrong
-NEAR_SHARE = 0.04  # of the extent
+NEAR_FRACTION = 0.04  # of the extent
 MAX_POINTS = 10_000  # of a cloud, for depths
 
 
@@ -46,15 +46,15 @@ def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda
 
 
 def near_depth(scene: Scene) -> float | None:
-    """Return the depth in scene units below which 1 % of all observed points are, over the training views.
+    """Return the 1 % quantile of the depths of all points that training views observe, scene units; None without any.
 
-    Validation views count as training views.  When the dataset does not say which views observe which points, a view
-    observes those inside its image.  None without points.
+    Validation views count as training views.  When the dataset does not contain observations, a view observes the
+    points inside its image.
     """
     views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file
-        ahead = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
-    return float(np.quantile(np.concatenate(ahead), NEAREST)) if any(map(len, ahead)) else None
+        in_front = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
+    return float(np.quantile(np.concatenate(in_front), NEAREST)) if any(map(len, in_front)) else None
 
 
 def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
@@ -67,7 +67,7 @@ def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
 
 
 def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]:
-    """Return the depths of points that project into a view's image, scene units; of a large cloud, of a sample."""
+    """Return the depths of points that project into a view's image, scene units; for a large cloud, of a sample."""
     points = np.zeros((0, 3)) if cloud is None else cloud.positions
     points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
     x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
@@ -80,11 +80,11 @@ def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]
 def near_plane(scene: Scene) -> float:
     """Return the near plane of `model.near: auto`, scene units.
 
-    It is 4% of the extent, 0.2 where that is 5, or half of `near_depth` if that is less.  With three digits, it is the
-    same number on every machine.
+    It is 4 % of the extent (0.2 for an extent of 5), or half of `near_depth` if that is less, rounded to three digits,
+    so that it is the same on every machine.
     """
     nearest = near_depth(scene)
-    return float(f"{min(NEAR_SHARE * scene.extent, np.inf if nearest is None else nearest / 2):.3g}")
+    return float(f"{min(NEAR_FRACTION * scene.extent, np.inf if nearest is None else nearest / 2):.3g}")
 
 
 # Sharpness of photographs.
@@ -98,15 +98,15 @@ def sharpness(gray: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_64F).var())
 
 
-def both_sharpnesses(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
+def sharpness_values(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the sharpness of an image [H, W] and, invariant to brightness, divided by its squared mean, [2]."""
     value = sharpness(gray)
     return np.array([value, value / max(float(gray.mean()), 1.0) ** 2])
 
 
-def sharpness_of(path: Path) -> NDArray[np.float64]:
+def measure_sharpness(path: Path) -> NDArray[np.float64]:
     """Return both sharpness values of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
-    return both_sharpnesses(read_gray(path, SIDE)[0])
+    return sharpness_values(read_gray(path, SIDE)[0])
 
 
 def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool:
@@ -117,12 +117,12 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
     return bool((values < BLURRED * median).all())
 
 
-# Photographs and masks that show nothing.
+# Blank photographs, and masks that exclude everything.
 
 DARK, PLAIN = 8, 2  # gray levels of 255: the brightest of a black image, and the range of an image of one color
 
 
-def shows_nothing(pixels: NDArray[Any]) -> bool:
+def is_blank(pixels: NDArray[Any]) -> bool:
     """Return whether an image, [H, W] or [H, W, C], is black, of one color, or transparent everywhere."""
     unit = 255 / np.iinfo(pixels.dtype).max
     channels = pixels.reshape(*pixels.shape[:2], -1)
@@ -136,26 +136,26 @@ def shows_nothing(pixels: NDArray[Any]) -> bool:
 
 
 def excludes_all(layer: NDArray[Any]) -> bool:
-    """Return whether a mask, [H, W], uses no pixel."""
+    """Return whether a mask, [H, W], excludes every pixel."""
     return bool(layer.max() <= MIN_WHITE * np.iinfo(layer.dtype).max)
 
 
 # Transparency of photographs.
 
-LOOKED_AT = 3  # training photographs, since the object may fill one of them
+SAMPLED_PHOTOGRAPHS = 3  # for training; more than one, since the object may fill it
 
 
 def is_transparent(scene: Scene) -> bool:
     """Return whether a sampled training photograph has transparent pixels that are not masked.  Raises DataError."""
-    return any(map(_is_transparent, sample_views(scene.split("train"), LOOKED_AT)))
+    return any(map(_is_transparent, sample_views(scene.split("train"), SAMPLED_PHOTOGRAPHS)))
 
 
-def background_shows(scene: Scene) -> bool:
+def has_visible_background(scene: Scene) -> bool:
     """Return whether a sampled training photograph can be composited on another background.
 
     Photographs with masks cannot.  Raises DataError.
     """
-    return any(load_transparency(view) is not None for view in sample_views(scene.split("train"), LOOKED_AT))
+    return any(load_transparency(view) is not None for view in sample_views(scene.split("train"), SAMPLED_PHOTOGRAPHS))
 
 
 def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
@@ -163,11 +163,11 @@ def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
 
     Raises DataError.
     """
-    shows, counted = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    masks = [mask for mask in (None if shows is None else shows == 0, counted) if mask is not None]
+    shows, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    masks = [mask for mask in (None if shows is None else shows == 0, unmasked) if mask is not None]
     return np.logical_and.reduce(masks) if masks else None
 
 
 def _is_transparent(view: View) -> bool:
-    shows, counted = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    return shows is not None and bool((shows if counted is None else shows[counted]).any())
+    shows, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    return shows is not None and bool((shows if unmasked is None else shows[unmasked]).any())

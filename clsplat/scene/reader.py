@@ -37,15 +37,15 @@ class Parts:
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
-    hint: str = ""  # what is there instead of missing files
+    hint: str = ""  # similar files that exist instead of missing ones
     notes: list[str] = field(default_factory=list)  # about files that are not where the dataset says
     scene: Scene | None = None
     refusal: str = ""
 
-    def attempt(self, read: Callable[..., Result], *arguments: Any) -> Result | None:
+    def attempt(self, function: Callable[..., Result], *arguments: Any) -> Result | None:
         """Call a function and return its result; when it raises DataError, record the fault and return None."""
         try:
-            return read(*arguments)
+            return function(*arguments)
         except DataError as error:
             if str(error) not in self.faults:
                 self.faults.append(str(error))
@@ -61,10 +61,10 @@ class Parts:
 
 
 class Reader(ABC):
-    """A dataset format.
+    """The reader of a dataset format.
 
-    All commands use a subclass as soon as it is defined, unless it has subclasses itself.  A class that is defined
-    again, as in a notebook, replaces the earlier one.
+    All commands use a subclass as soon as it is defined, unless it has subclasses itself.  A class that is redefined,
+    as in a notebook, replaces the earlier one.
     """
 
     name: ClassVar[str]  # of the format

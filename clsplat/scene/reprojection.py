@@ -20,8 +20,8 @@ def reprojection_residuals(view: View, positions: NDArray[np.floating], observed
     original photograph; NaN behind the camera, and for observations far outside the photograph."""
     original = view.lens or view.camera
     size = np.array([original.width, original.height])
-    near = np.all(np.abs(observed - size / 2) <= size, axis=1, keepdims=True)  # others come from damaged files
-    return np.where(near, observed - project_points(view, positions), np.nan)
+    is_plausible = np.all(np.abs(observed - size / 2) <= size, axis=1, keepdims=True)  # others come from damaged files
+    return np.where(is_plausible, observed - project_points(view, positions), np.nan)
 
 
 def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
@@ -34,14 +34,14 @@ def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
 
 
 def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
-    """Return a scene at full size with other cameras; the observations of its points stay where they are."""
+    """Return a scene at full size with other cameras; the observed pixels of its points do not change."""
     tracks, residuals = scene.tracks, dict[str, Floats]()
     if tracks is not None:
         for old, new in zip(scene.views, views, strict=True):
             if old.name in tracks.residuals:
                 positions = tracks.positions[tracks.seen[old.name]]
-                moved = project_points(old, positions) - project_points(new, positions)
-                residuals[old.name] = tracks.residuals[old.name] + moved
+                displacement = project_points(old, positions) - project_points(new, positions)
+                residuals[old.name] = tracks.residuals[old.name] + displacement
         tracks = replace(tracks, residuals={**tracks.residuals, **residuals})
     return replace(scene, views=tuple(views), tracks=tracks)
 
@@ -66,13 +66,13 @@ def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = MAX_ERRO
 
     Views without known observations, and views not in `views`, keep all points.
     """
-    seen, residuals = dict(tracks.seen), dict(tracks.residuals)
+    rows, residuals = dict(tracks.seen), dict(tracks.residuals)
     for view in sorted(views, key=lambda view: -view.downscale):  # the largest size of a photograph is last and counts
         if view.name in tracks.residuals:
             vectors = tracks.residuals[view.name]
-            near = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN, unknown
-            seen[view.name], residuals[view.name] = tracks.seen[view.name][near], vectors[near]
-    return Tracks(tracks.positions, seen, residuals)
+            is_accurate = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN, unknown
+            rows[view.name], residuals[view.name] = tracks.seen[view.name][is_accurate], vectors[is_accurate]
+    return Tracks(tracks.positions, rows, residuals)
 
 
 def require_points_in_front(points: PointCloud, scene: Scene) -> None:

@@ -5,7 +5,7 @@ Conventions of the whole project
     pixels      pixel (0, 0) has its center at (0.5, 0.5)
     quaternions (w, x, y, z)
     lengths     scene units; screen quantities in pixels
-    colors      as the image files store them, in [0, 1]
+    colors      as stored in image files, in [0, 1]
 """
 
 import logging
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
-from clsplat.scene.view import Alpha, Floats, View, load_image, photograph_of
+from clsplat.scene.view import Alpha, Floats, View, load_image, photograph_name
 
 LOG = logging.getLogger("clsplat")
 
@@ -37,26 +37,26 @@ class Tracks:
     # by name of the view, [K, 2] px of the original photograph: from the projection of each point to its observation
 
     def shifted(self, origin: Floats) -> "Tracks":
-        """Return the tracks in coordinates whose zero is at `origin`, [3] in the present coordinates."""
+        """Return the tracks in coordinates whose zero is at `origin`, [3] in the current coordinates."""
         return replace(self, positions=self.positions - origin) if origin.any() else self
 
     def on_faces(self, views: Iterable["View"]) -> "Tracks":
-        """Return the tracks with those of wide photographs divided among the views of their faces."""
-        seen = dict(self.seen)
+        """Return the tracks with the points of wide photographs divided among the views of their faces."""
+        by_view = dict(self.seen)
         for view in views:
-            if view.lens is not None and view.lens.face and photograph_of(view.name) in self.seen:
-                rows, camera = self.seen[photograph_of(view.name)], view.camera
+            if view.lens is not None and view.lens.face and photograph_name(view.name) in self.seen:
+                rows, camera = self.seen[photograph_name(view.name)], view.camera
                 x, y, z = view.world_to_camera @ np.vstack([self.positions[rows].T, np.ones(len(rows))])
                 with np.errstate(all="ignore"):
                     x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-                    seen[view.name] = rows[(z > 0) & (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)]
+                    by_view[view.name] = rows[(z > 0) & (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)]
         names = {view.name for view in views}
-        return replace(self, seen={name: rows for name, rows in seen.items() if name in names or name in self.seen})
+        return replace(self, seen={name: rows for name, rows in by_view.items() if name in names or name in self.seen})
 
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
-        """Return the tracks of the views in `names`, with their new names by the old ones."""
-        seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
-        return Tracks(self.positions, seen, {names[old]: rows for old, rows in self.residuals.items() if old in names})
+        """Return the tracks of the views in `names`, which maps old names to new ones."""
+        rows = {names[old]: rows for old, rows in self.seen.items() if old in names}
+        return Tracks(self.positions, rows, {names[old]: rows for old, rows in self.residuals.items() if old in names})
 
 
 Background = Literal["black", "white"]
@@ -64,7 +64,7 @@ HOLDOUT = 8  # every 8th view is a test view if the dataset has no split: the de
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_OFFSET = 100  # x the median distance of the points; float32 then places them to 1e-5 of that distance
 MAX_OUTLIERS = 0.2  # fraction of the cameras
-ROUNDING = 1e-6  # of the largest coordinate: cameras that are nearer to each other have one center
+ROUNDING = 1e-6  # of the largest coordinate: closer cameras have the same center
 MAX_THUMBNAILS = 4
 SPLITS = ("train", "test", "validation")
 
@@ -99,7 +99,7 @@ class Scene:
     extent: float  # radius of the training cameras, scene units
     background: Background = "black"  # as in papers on this dataset
     validation: tuple[int, ...] = ()  # held out to choose the best model
-    tracks: Tracks | None = None  # which photographs see which points, if the dataset has that
+    tracks: Tracks | None = None  # which photographs show which points, if the dataset has this
     origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of this scene's zero
     skipped: tuple[str, ...] = ()  # names of views whose photographs are missing
 
@@ -211,18 +211,18 @@ def make_scene(
     if not views:
         raise DataError(f"{path}: the dataset has no images; expected at least one image with a pose")
     faces = [view.faces() for view in views]
-    counted = np.cumsum([0, *map(len, faces)]).tolist()
-    views, test = list(chain.from_iterable(faces)), {i for n in test for i in range(counted[n], counted[n + 1])}
-    seen: set[str] = set()
+    counts = np.cumsum([0, *map(len, faces)]).tolist()
+    views, test = list(chain.from_iterable(faces)), {i for n in test for i in range(counts[n], counts[n + 1])}
+    names: set[str] = set()
     for view in views:
-        if view.name in seen:
+        if view.name in names:
             raise DataError(f"{path}: two images are called {quote(view.name)}; names must differ")
-        seen.add(view.name)
+        names.add(view.name)
         try:
             view.camera.check()
         except ValueError as error:
             raise DataError(f"{path}: {quote(view.name)}: {error}; remove that image or fix its camera") from error
-    train = other_views(path, len(views), test)
+    train = remaining_views(path, len(views), test)
     points = points if points and len(points) else None
     origin = choose_origin(views, points)
     if origin.any():
@@ -235,7 +235,7 @@ def make_scene(
     return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background, origin=origin)
 
 
-def other_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
+def remaining_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
     """Return the indices below `count` that are not in `test`.  Raises DataError when there are none."""
     if train := tuple(i for i in range(count) if i not in test):
         return train
@@ -244,23 +244,23 @@ def other_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
 
 
 def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
-    """Return the world coordinates, [3] float64, that become a scene's zero: 0 unless the scene is far from there.
+    """Return the world coordinates, [3] float64, of a scene's origin: 0 unless the scene is far from there.
 
-    Positions on the device are float32, which holds those of a map's coordinates to half a meter only.  The origin is a
-    multiple of a power of ten, so that differences are exact where the file's digits allow that.
+    Positions on the device are float32, in which map coordinates have a precision of only half a meter.  The origin is
+    a multiple of a power of ten, so that differences are exact where the file's digits allow that.
     """
     centers = np.stack([view.position for view in views])
-    around = centers if points is None else np.asarray(points.positions, np.float64)
-    return far_origin(np.median(centers, axis=0), around)
+    positions = centers if points is None else np.asarray(points.positions, np.float64)
+    return far_origin(np.median(centers, axis=0), positions)
 
 
-def far_origin(middle: Floats, around: Floats) -> Floats:
-    """Return the origin near `middle`, [3], of positions `around`, [N, 3]; 0 unless that is far for their spread."""
-    spread = float(np.median(np.linalg.norm(around - middle, axis=1)))
-    if np.abs(middle).max() <= MAX_OFFSET * (spread or 1.0):
+def far_origin(center: Floats, positions: Floats) -> Floats:
+    """Return an origin near `center`, [3]; 0 unless `center` is far from 0 compared with the spread of positions."""
+    spread = float(np.median(np.linalg.norm(positions - center, axis=1)))
+    if np.abs(center).max() <= MAX_OFFSET * (spread or 1.0):
         return np.zeros(3)
     step = 10.0 ** math.ceil(math.log10(10 * (spread or 1.0)))
-    return np.round(middle / step) * step + 0.0  # no -0.0
+    return np.round(center / step) * step + 0.0  # no -0.0
 
 
 def position_text(position: Floats) -> str:
@@ -272,32 +272,32 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
-    have one center, it is the median distance of the points, or without points the depth of the coordinates' zero.
+    have the same center, it is the median distance of the points, or without points the distance to zero.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
-    middle = centers.mean(axis=0)
+    center = centers.mean(axis=0)
     if not share_center(centers):
-        return 1.1 * float(np.linalg.norm(centers - middle, axis=1).max())
+        return 1.1 * float(np.linalg.norm(centers - center, axis=1).max())
     around = np.zeros((0, 3)) if points is None else points.astype(np.float64)
     around = around[np.isfinite(around).all(axis=1)]
-    distances = np.linalg.norm(around - middle, axis=1) if len(around) else np.abs([views[0].world_to_camera[2, 3]])
+    distances = np.linalg.norm(around - center, axis=1) if len(around) else np.abs([views[0].world_to_camera[2, 3]])
     return float(np.median(distances)) or 1.0
 
 
 def share_center(centers: Floats) -> bool:
-    """Return whether camera centers, [V, 3], are one point, up to rounding."""
+    """Return whether camera centers, [V, 3], are equal up to rounding."""
     return bool(np.ptp(centers, axis=0).max() <= ROUNDING * np.abs(centers).max())
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
     """Return which cameras, [N], are more than MAX_DISTANCE times the median distance from the median center.
 
-    If those are more than MAX_OUTLIERS of all, the scene has several groups of cameras, and all are False.
+    If more than MAX_OUTLIERS of the cameras are, the scene has several groups of cameras, and all are False.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    far = distance > MAX_DISTANCE * np.median(distance)
-    return far if np.median(distance) > 0 and far.mean() <= MAX_OUTLIERS else np.zeros(len(views), bool)
+    is_far = distance > MAX_DISTANCE * np.median(distance)
+    return is_far if np.median(distance) > 0 and is_far.mean() <= MAX_OUTLIERS else np.zeros(len(views), bool)
 
 
 def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
@@ -307,7 +307,7 @@ def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
     """
     if holdout <= 0:
         return set()
-    photographs = [photograph_of(name) for name in names]
+    photographs = [photograph_name(name) for name in names]
     held_out = set(sorted(set(photographs))[offset::holdout])
     return {i for i, photograph in enumerate(photographs) if photograph in held_out}
 

@@ -18,7 +18,7 @@ class Clock:
     first: float
     last: float
 
-    def of_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
+    def normalize_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the timestamps of points in a file as times in [0, 1], of the same shape.
 
         Raises DataError when some are outside the range of the scene by more than single precision explains.
@@ -46,9 +46,9 @@ def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clo
     values = [value for _, value in moments if value is not None]
     if not values:
         return None
-    if without := [where for where, value in moments if value is None]:
+    if untimed := [name for name, value in moments if value is None]:
         raise DataError(
-            f"{path}: {len(without)} of {len(moments)} frames have no `time`: {first_few(without)}; expected a time in "
+            f"{path}: {len(untimed)} of {len(moments)} frames have no `time`: {first_few(untimed)}; expected a time in "
             "every frame or in none: add the missing ones, or remove all for a static scene"
         )
     first, last = min(values), max(values)

@@ -40,9 +40,9 @@ def read_times(folder: Path) -> dict[str, float] | None:
 
 
 def add_times(views: list[View], folder: Path) -> list[View]:
-    """Return views with the times of the file in their folder of photographs; without a file the same.
+    """Return views with the times of the file in their folder of photographs; without a file, the same views.
 
-    Raises DataError as read_times and clock_of do.
+    Raises DataError as read_times and make_clock do.
     """
     times = read_times(folder)
     if times is None:

@@ -49,7 +49,7 @@ class JsonFrame:
         return self._values[key] if key in self._values else self._common.get(key)
 
     def array(self, key: str) -> Floats:
-        """Return a list of numbers as an array, without checks; [0] if it is none."""
+        """Return a list of numbers as an array, without checks; an empty array if it is not one."""
         try:
             return np.array(self.value(key), np.float64)
         except (ValueError, TypeError, OverflowError):
@@ -127,7 +127,7 @@ class FrameFiles(FileLookup):
         """Find the masks of some of the frames.  Raises DataError when one is missing."""
         for key in self.masks:
             names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
-            files = FileLookup(self.root, self.folder, [*names.values()], strict=True, taken=self.paths)
+            files = FileLookup(self.root, self.folder, [*names.values()], strict=True, excluded=self.paths)
             files.existing(where, "refuse")
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
@@ -152,7 +152,7 @@ class FrameFiles(FileLookup):
                 size = stored_size(path)
             except DataError:  # decoding lists all damaged photographs
                 size = self._first_size
-        view = view_of(frame, self.names[i], size, clock)
+        view = make_view(frame, self.names[i], size, clock)
         view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
         return fit_to_photograph(view) if path in self.reduced else view
 
@@ -195,7 +195,7 @@ def list_frames(parts: Parts, root: Path, *names: str) -> None:
         path = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, path) if path else None
         if parts.points and clock and len(parts.points.times):
-            parts.attempt(clock.of_points, path, parts.points.times[parts.points.is_finite()])
+            parts.attempt(clock.normalize_points, path, parts.points.times[parts.points.is_finite()])
 
 
 def view_name(file_path: str) -> str:
@@ -203,16 +203,16 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def view_of(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+def make_view(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
     """Return the view of a frame, without its photograph; `size` is that of the image, for a frame without a size.
 
     clock: of a moving scene.  Raises DataError.
     """
-    lens = intern_lens(lens_of(frame, camera_of(frame, size)))
+    lens = intern_lens(make_lens(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
     moment = frame.number("time")
     time = None if clock is None or moment is None else float(clock(moment))
-    matrix = camera_to_world_of(frame)
+    matrix = read_pose(frame)
     return View(name, camera, np.linalg.inv(matrix)[:3], lens=distortion, time=time, camera_to_world=matrix)
 
 
@@ -245,25 +245,25 @@ def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> fl
     return pixels / 2 / math.tan(angle / 2)
 
 
-def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
-    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one, or a panorama.  Raises DataError."""
+def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
+    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye model, or a panorama.  Raises DataError."""
     model = frame.value("camera_model")
     model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if model is None else model
-    used = LENSES.get(model) if isinstance(model, str) else None
+    keys = LENSES.get(model) if isinstance(model, str) else None
     values = {key: frame.number(key) or 0.0 for key in DISTORTION}
-    surplus = [key for key, value in values.items() if value and key not in (used or DISTORTION)]
-    if used is None or surplus:
+    surplus = [key for key, value in values.items() if value and key not in (keys or DISTORTION)]
+    if keys is None or surplus:
         fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "export the cameras with one of these, or pinhole images without distortion"
         )
-    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(values[key] for key in used))
-    name = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)]
+    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(values[key] for key in keys))
+    name = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(keys)]
     return Lens(camera.width, camera.height, name, params)
 
 
-def camera_to_world_of(frame: JsonFrame) -> Floats:
+def read_pose(frame: JsonFrame) -> Floats:
     """Return [4, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
     matrix = frame.array("transform_matrix")
     is_finite = matrix.shape in ((4, 4), (3, 4)) and (np.abs(matrix) < MAX_VALUE).all()
@@ -300,7 +300,7 @@ TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 class BlenderReader(Reader):
     """A Blender scene; the test views are those of transforms_test.json, and none without that file.
 
-    With a `time` in every frame of both files it moves (D-NeRF): the first moment of all frames is 0, the last 1.
+    With a `time` in every frame of both files, the scene moves (D-NeRF): the first timestamp is 0, the last is 1.
     """
 
     name = "Blender"
@@ -335,7 +335,8 @@ class NerfstudioReader(Reader):
     """A nerfstudio scene; views are in order of name.
 
     The lists `train_filenames` and `test_filenames` are the split if the file has one of them; images on neither
-    list are left out.  Otherwise every `holdout`-th view is for testing.  With a `time` in every frame the scene moves.
+    list are left out.  Otherwise, every `holdout`-th view is for testing.  With a `time` in every frame, the scene
+    moves.
     """
 
     name = "nerfstudio"
@@ -353,10 +354,10 @@ class NerfstudioReader(Reader):
         train, test = (_read_list(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
-        listed = views if train is None else [view for view in views if view.name in train | (test or set())]
-        if len(listed) < len(views):
-            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(listed))
-        return files.scene(path, listed, test or set(), transforms.points(clock))
+        split_views = views if train is None else [view for view in views if view.name in train | (test or set())]
+        if len(split_views) < len(views):
+            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(split_views))
+        return files.scene(path, split_views, test or set(), transforms.points(clock))
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)

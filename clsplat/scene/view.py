@@ -102,7 +102,7 @@ class View:
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
     def shifted(self, origin: Floats) -> "View":
-        """Return the view in coordinates whose zero is at `origin`, [3] float64 in the present coordinates."""
+        """Return the view in coordinates whose zero is at `origin`, [3] float64 in the current coordinates."""
         if not origin.any():
             return self
         if (matrix := self.camera_to_world) is not None:
@@ -113,9 +113,9 @@ class View:
         return replace(self, world_to_camera=np.column_stack([rotation, translation + rotation @ origin]))
 
     def faces(self) -> list["View"]:
-        """Return the views of the faces of a wide photograph, without those that show nothing; of others, the view.
+        """Return the views of the non-empty faces of a wide photograph; for other photographs, only this view.
 
-        Raises DataError when the mask shows nothing.
+        Raises DataError when the mask excludes every pixel.
         """
         if self.lens is None or not self.lens.is_wide or self.lens.face:
             return [self]
@@ -136,11 +136,11 @@ class View:
         return views
 
     def whole_photograph(self) -> "View":
-        """Return the view of the wide photograph that this face is cut from; other views as they are."""
+        """Return the view of the wide photograph that this face is cut from; other views unchanged."""
         if self.lens is None or not self.lens.face:
             return self
         lens, pose = intern_lens(replace(self.lens, face="", whole=False)), FACES[self.lens.face].T
-        name = photograph_of(self.name)
+        name = photograph_name(self.name)
         return replace(self, name=name, camera=lens.pinhole, world_to_camera=pose @ self.world_to_camera, lens=lens)
 
     @property
@@ -169,14 +169,14 @@ class View:
         `picture.background`.  Raises DataError when the file cannot be read or does not fit the camera, ValueError for
         an invalid background.
         """
-        red, green, blue = color_of(background).tolist()
+        red, green, blue = to_color(background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
 
 
 CUBE = "cube_"  # before the name of a face
 
 
-def photograph_of(name: str) -> str:
+def photograph_name(name: str) -> str:
     """Return the name of the photograph that a view shows: `a/cube_front.png` is a face of `a.png`."""
     path = PurePosixPath(name)
     stem, dot, suffix = path.name.partition(".")
@@ -184,7 +184,7 @@ def photograph_of(name: str) -> str:
     return f"{path.parent}{dot}{suffix}" if is_face else name
 
 
-def color_of(background: ArrayLike) -> Floats:
+def to_color(background: ArrayLike) -> Floats:
     """Return a background as three numbers.  Raises ValueError unless it is one number or three in [0, 1]."""
     try:
         color = np.asarray(background, np.float64)
@@ -203,12 +203,12 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     """
     pixels = _read_original(view, view.image_path)
     width, height = view.camera.width, view.camera.height
-    opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
-    if opaque and not resized and pixels.dtype == np.uint8:
+    opaque, is_resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
+    if opaque and not is_resized and pixels.dtype == np.uint8:
         return pixels
     # Double precision with alpha, to truncate as the reference does; single precision saves memory otherwise.
     values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
-    if resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
+    if is_resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
     limit = int(np.iinfo(pixels.dtype).max)
     if opaque:
@@ -216,7 +216,7 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     unit = values / limit
     color, alpha = unit[:, :, :3], unit[:, :, 3:]
     composite = color * alpha + np.asarray(background) * (1 - alpha)
-    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
+    slack = 1e-3 if is_resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 
 
@@ -306,16 +306,16 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
 
 
 def fit_to_photograph(view: View) -> View:
-    """Return a view whose photograph is smaller than its camera, but of its shape, with a camera of that size."""
+    """Return the view with its camera scaled to a photograph that is smaller but has the same aspect ratio."""
     (width, height), camera = stored_size(view.image_path), view.lens or view.camera
-    across, down = width / camera.width, height / camera.height
-    if across >= 1 or abs(height - across * camera.height) > MAX_ROUNDING:
+    x_scale, y_scale = width / camera.width, height / camera.height
+    if x_scale >= 1 or abs(height - x_scale * camera.height) > MAX_ROUNDING:
         return view
     if view.lens is None:
         return replace(view, camera=view.camera.resized(width, height))
-    scales = (*(across, down)[: MODELS[view.lens.model][0]], across, down)
-    scaled = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
-    lens = intern_lens(replace(view.lens, width=width, height=height, params=scaled))
+    scales = (*(x_scale, y_scale)[: MODELS[view.lens.model][0]], x_scale, y_scale)
+    camera_size = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
+    lens = intern_lens(replace(view.lens, width=width, height=height, params=camera_size))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 
@@ -402,7 +402,7 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
 
 def _below(view: View) -> Iterator[tuple[Path, str]]:
     """Yield the folders that contain the image, up to the one that its view's name starts from, and its path below."""
-    parts = PurePosixPath(view.name if view.lens is None else photograph_of(view.name)).parts
+    parts = PurePosixPath(view.name if view.lens is None else photograph_name(view.name)).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:
             yield folder, "/".join(parts[-number:])

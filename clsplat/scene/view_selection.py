@@ -14,14 +14,14 @@ from clsplat.core.reading import read_text
 from clsplat.core.settings import InputPath, Settings, in_one_sentence
 from clsplat.scene.images import is_image
 from clsplat.scene.lookup import Missing
-from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_views
-from clsplat.scene.view import photograph_of
+from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, remaining_views
+from clsplat.scene.view import photograph_name
 
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
-TakenBy = Literal["holdout", "train", "missing"]
-Taken = Mapping[TakenBy, Sequence[str]]  # names that cannot be selected, by the reason: a setting, or missing files
-NONE: Taken = {}
+ExcludedBy = Literal["holdout", "train", "missing"]
+Excluded = Mapping[ExcludedBy, Sequence[str]]  # names that cannot be selected, by reason: a setting, or missing files
+NONE: Excluded = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 
@@ -34,7 +34,7 @@ def _text(value: Any) -> Any:
 
 
 class MissingViewError(DataError):
-    """A selection that does not fit the photographs at hand; it may fit once they are prepared."""
+    """A selection that does not match the photographs; it may match once they are prepared."""
 
 
 class ViewSelection(Settings):
@@ -81,40 +81,40 @@ class ViewSelection(Settings):
         path = super().input_path(key, scene)
         return path and Path(scene or "") / path
 
-    def select(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
+    def select(self, names: Sequence[str], folders: Sequence[Path], excluded: Excluded = NONE) -> set[int]:
         """Return the indices of the selected `names`.
 
-        folders: where to look for a relative file, in order; others: names that must not be selected, and names with
+        folders: where to look for a relative file, in order.  excluded: names that must not be selected, and names with
         missing photographs, which are skipped.  Raises DataError for names that match no view or several.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
-        source, listed = self._read_names(folders)
-        index, excluded = _NameIndex(names), {key: _NameIndex(taken) for key, taken in others.items()}
-        matches_of = {name: index.indices_of(name) for name in listed}
+        source, lines = self._read_names(folders)
+        index, indexes = _NameIndex(names), {key: _NameIndex(group) for key, group in excluded.items()}
+        matches_of = {name: index.indices_of(name) for name in lines}
         for name in [name for name, matches in matches_of.items() if not matches]:
-            for key in (key for key, taken in excluded.items() if taken.indices_of(name)):
+            for key in (key for key, group in indexes.items() if group.indices_of(name)):
                 if key != "missing":
                     raise _excluded_error(source, name, key)
                 del matches_of[name]
-        if lost := len({*listed}) - len(matches_of):
-            LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(lost, "name"))
+        if count := len({*lines}) - len(matches_of):
+            LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(count, "name"))
         return {i for name, matches in matches_of.items() for i in _only_match(name, matches, names, source)}
 
-    def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
-        """Return the listed names, some of which may be left out later; none for every n-th.
+    def check(self, names: Sequence[str], folders: Sequence[Path], excluded: Excluded = NONE) -> list[str]:
+        """Return the listed names, some of which may be left out later; empty for every n-th view.
 
-        others: names that must not be selected.  Raises DataError for a name that matches none, or only such names.
+        excluded: names that must not be selected.  Raises DataError for a name that matches none, or only such names.
         """
         if self.every is not None:
             return []
-        source, listed = self._read_names(folders)
-        index, excluded = _NameIndex(names), {key: {*taken} for key, taken in others.items()}
-        matches = {name: index.indices_of(name) for name in listed}
+        source, lines = self._read_names(folders)
+        index, groups = _NameIndex(names), {key: {*group} for key, group in excluded.items()}
+        matches = {name: index.indices_of(name) for name in lines}
         for name, indices in matches.items():
             if not indices:
                 raise _unknown_name_error(name, names, source)
-            for key in (key for key, taken in excluded.items() if {names[i] for i in indices} <= taken):
+            for key in (key for key, group in groups.items() if {names[i] for i in indices} <= group):
                 raise _excluded_error(source, name, key)
         return [names[i] for indices in matches.values() for i in indices]
 
@@ -135,7 +135,7 @@ Chosen = Annotated[Number | ViewSelection, in_one_sentence(NOTATIONS)]
 ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
-def _excluded_error(source: str, name: str, key: TakenBy) -> DataError:
+def _excluded_error(source: str, name: str, key: ExcludedBy) -> DataError:
     """Return the error for a name that another setting of the scene excludes."""
     reason, remedy = {
         "holdout": ("is a test view", "from scene.holdout"),
@@ -151,7 +151,7 @@ class _NameIndex:
     def __init__(self, names: Sequence[str]):
         self._views: dict[str, list[int]] = {}
         for i, name in enumerate(names):
-            self._views.setdefault(photograph_of(name), []).append(i)
+            self._views.setdefault(photograph_name(name), []).append(i)
         names = self._names = list(self._views)
         paths = [PurePosixPath(name) for name in names]
         stems = [path.with_suffix("") for path in paths]
@@ -159,19 +159,19 @@ class _NameIndex:
         self._ends, self._stems = _group(_ends_of(paths)), _group(_ends_of(stems))
         self._whole = _group((stem.parts, i) for i, stem in enumerate(stems))
 
-    def indices_of(self, listed: str) -> list[int]:
+    def indices_of(self, name: str) -> list[int]:
         """Return the indices of the names that end with a listed name, with or without its suffix.
 
         If there are none, the suffix may differ, since prepared images are PNG.
         """
-        return [i for match in self._matches_of(listed) for i in self._views[self._names[match]]]
+        return [i for match in self._matches_of(name) for i in self._views[self._names[match]]]
 
-    def _matches_of(self, listed: str) -> list[int]:
-        if listed in self._at:
-            return [self._at[listed]]
-        wanted = PurePosixPath(listed.replace("\\", "/"))
-        stem = (wanted.with_suffix("") if is_image(wanted) else wanted).parts
-        return self._ends.get(wanted.parts) or self._whole.get(stem) or self._stems.get(stem, [])
+    def _matches_of(self, name: str) -> list[int]:
+        if name in self._at:
+            return [self._at[name]]
+        parts = PurePosixPath(name.replace("\\", "/"))
+        stem = (parts.with_suffix("") if is_image(parts) else parts).parts
+        return self._ends.get(parts.parts) or self._whole.get(stem) or self._stems.get(stem, [])
 
 
 def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
@@ -187,21 +187,21 @@ def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ..
     return groups
 
 
-def _only_match(listed: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
+def _only_match(name: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
     """Return the views of the only photograph that matches.  Raises DataError for none or several."""
-    if len({photograph_of(names[i]) for i in matches}) == 1:
+    if len({photograph_name(names[i]) for i in matches}) == 1:
         return matches
     if matches:
         candidates = " and ".join(quote(names[i]) for i in matches[:2])
-        raise MissingViewError(f"{source}: {quote(listed)} matches {candidates}; give more of the path")
-    raise _unknown_name_error(listed, names, source)
+        raise MissingViewError(f"{source}: {quote(name)} matches {candidates}; give more of the path")
+    raise _unknown_name_error(name, names, source)
 
 
-def _unknown_name_error(listed: str, names: Sequence[str], source: str) -> DataError:
-    similar = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
-    more = f"the first is {quote(names[0])}: correct or remove the name"
-    more = f"did you mean {quote(similar[0])}?" if similar else more
-    return MissingViewError(f"{source}: no photograph is called {quote(listed)}; {more}")
+def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataError:
+    similar = get_close_matches(name, [*names, *(PurePosixPath(name).name for name in names)], 1)
+    hint = f"the first is {quote(names[0])}: correct or remove the name"
+    hint = f"did you mean {quote(similar[0])}?" if similar else hint
+    return MissingViewError(f"{source}: no photograph is called {quote(name)}; {hint}")
 
 
 # Split a scene into training, validation and test views.
@@ -221,12 +221,12 @@ class Split:
     folder: Path | None = None  # where to look for lists of names that the folder of the dataset does not have
 
     @property
-    def of_reader(self) -> int:
+    def reader_holdout(self) -> int:
         """The holdout for a reader, which it applies if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def apply(self, scene: Scene) -> Scene:
-        """Return the scene, read with `of_reader`, with this split.
+        """Return the scene, read with `reader_holdout`, with this split.
 
         Raises DataError for wrong names, or when one split takes all views.
         """
@@ -265,22 +265,22 @@ class Split:
 
         Photos need not have poses yet.
         """
-        others: dict[TakenBy, list[str]] = {}
+        excluded: dict[ExcludedBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, ViewSelection):
                 try:
-                    listed = {*choice.check(names, [folder], others)}
+                    lines = {*choice.check(names, [folder], excluded)}
                 except DataError as error:
                     raise DataError(f"{folder}: scene.{key}: {error}") from error
-                if listed and key == "holdout":
-                    others["holdout"] = [*listed]
-                if listed and key == "train":
-                    free = listed | self._held_out(names)
-                    others["train"] = [name for name in names if name not in free]
+                if lines and key == "holdout":
+                    excluded["holdout"] = [*lines]
+                if lines and key == "train":
+                    free = lines | self._held_out(names)
+                    excluded["train"] = [name for name in names if name not in free]
 
     def _held_out(self, names: Sequence[str]) -> set[str]:
         """Return the names that are held out for testing by number, if all photos get poses."""
-        every, offset = self.of_reader, 0
+        every, offset = self.reader_holdout, 0
         if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset
         return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
@@ -308,7 +308,7 @@ class Split:
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
     """Return the scene with other test views, and with the extent of its training views."""
-    train = other_views(scene.path, len(scene.views), test)
+    train = remaining_views(scene.path, len(scene.views), test)
     points = None if scene.points is None else scene.points.positions
     extent = camera_extent([scene.views[i] for i in train], points)
     return replace(scene, train=train, test=tuple(sorted(test)), extent=extent)
@@ -319,9 +319,9 @@ def _select_training(
 ) -> set[int]:
     """Return the indices of the selected training views; key: the setting that selects them."""
     names = [scene.views[i].name for i in scene.train]
-    tested = [scene.views[i].name for i in scene.test]
-    others: Taken = {"holdout": tested, "train": left_out, "missing": scene.skipped}
-    return {scene.train[i] for i in _select(scene, key, choice, names, folders, others)}
+    test_names = [scene.views[i].name for i in scene.test]
+    excluded: Excluded = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
+    return {scene.train[i] for i in _select(scene, key, choice, names, folders, excluded)}
 
 
 def _select(
@@ -330,21 +330,23 @@ def _select(
     choice: int | ViewSelection,
     names: Sequence[str],
     folders: Sequence[Path],
-    others: Taken = NONE,
+    excluded: Excluded = NONE,
 ) -> set[int]:
-    """Return the indices of the selected names; a number selects every n-th, starting with the first, and 0 none.
+    """Return the indices of the selected names; a number n selects every n-th, starting with the first, and 0 none.
 
-    key: the setting, which a DataError names.
+    key: the name of the setting, for messages.
     """
     try:
-        return choice.select(names, folders, others) if isinstance(choice, ViewSelection) else every_nth(names, choice)
+        if isinstance(choice, ViewSelection):
+            return choice.select(names, folders, excluded)
+        return every_nth(names, choice)
     except DataError as error:
         raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
 
 
 def _validation_fold(scene: Scene) -> set[int]:
     """Return the views of every 8th training photograph by name, and of at least two."""
-    names = [photograph_of(scene.views[i].name) for i in scene.train]
+    names = [photograph_name(scene.views[i].name) for i in scene.train]
     order = sorted(set(names))
     count = len(order)
     if count < MIN_TRAIN:

@@ -10,9 +10,9 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 
-MIN_TURN = 0.1  # second eigenvalue of the right axes, from which cameras turn enough: 18 degrees
-MAX_ROLL = 0.15  # third eigenvalue by the second, up to which cameras are level
-MIN_UP = 0.2  # mean of the up axes along the axis, from which its sign is clear
+MIN_TURN = 0.1  # smallest second eigenvalue of the right axes of cameras that turn enough: 18 degrees
+MAX_ROLL = 0.15  # largest ratio of the third to the second eigenvalue of level cameras
+MIN_UP = 0.2  # mean of the up axes along the axis from which its sign is clear
 AGREED, FURTHEST = 0.5, 75.0  # a mean of up axes at least this long is less than this many degrees from up
 PRIOR = 1e-3  # weight of the splats' center, which fixes the distance when all axes are parallel
 START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # without views
@@ -35,15 +35,15 @@ class Viewpoint:
         """Start at `first`, or else outside of most points.  points: [N, 3], the centers of the splats."""
         means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         low, high = np.quantile(means, QUANTILES, axis=0) if len(means) else np.zeros((2, 3))
-        middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        center, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         if first is None or not views:
             up = np.array([0.0, -1.0, 0.0])  # up in an OpenCV camera
             radius = spread or 1.0
-            eye = middle + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
-            return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
+            eye = center + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
+            return cls(center, up, radius, START.fx, View.looking_at(eye, center, up, START, "start"))
         poses = np.stack([view.world_to_camera for view in views])
         centers = np.stack([view.position for view in views])
-        pivot = nearest_to_axes(centers, poses[:, 2, :3], middle)
+        pivot = nearest_to_axes(centers, poses[:, 2, :3], center)
         radius = float(np.median(np.linalg.norm(centers - pivot, axis=1))) or spread or 1.0
         return cls(pivot, up_direction(views), radius, float(np.median([view.camera.fx for view in views])), first)
 
@@ -55,14 +55,14 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     axes, which leans when all look down from one side.  When these cancel out, it is opposite to where most look.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
-    right, mean, ahead = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
+    right, mean, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
     squares, axes = np.linalg.eigh(right.T @ right / len(right))
     axis, length = axes[:, 0], np.linalg.norm(mean)
     leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
     if squares[1] >= MIN_TURN and squares[0] <= MAX_ROLL * squares[1] and not leans:
-        sign = axis @ mean if abs(axis @ mean) > MIN_UP else -axis @ ahead  # cameras look down more often than up
+        sign = axis @ mean if abs(axis @ mean) > MIN_UP else -axis @ forward  # cameras look down more often than up
         return np.asarray(axis if sign > 0 else -axis)
-    axis = mean if length > np.linalg.norm(ahead) / 2 else -ahead
+    axis = mean if length > np.linalg.norm(forward) / 2 else -forward
     axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 

@@ -46,11 +46,11 @@ class Silhouette:
         matrix = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose).astype(np.float32)
         # no matrix product: BLAS sums in an order that depends on the number of threads
         x, y, depth = (sum(row[k] * points[:, k] for k in range(3)) + row[3] for row in matrix)
-        ahead = depth > 0
-        safe = np.where(ahead, depth, 1)
+        in_front = depth > 0
+        safe = np.where(in_front, depth, 1)
         row = np.floor(y / safe).clip(-1, c.height).astype(int)
         column = np.floor(x / safe).clip(-1, c.width).astype(int)
-        inside = ahead & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
+        inside = in_front & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
         return Projection(inside, row[inside], column[inside], depth[inside])
 
     def radius(self, size: float, depth: Floats) -> int:
@@ -127,22 +127,22 @@ def _centers(cells: Cells, center: Floats, half_side: float, number: int) -> tup
 
 def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
     """Return which balls, [M], are inside the silhouettes of all views that see them, and which are on the edge of one
-    and outside none.  Balls that few views see are neither, since nothing is known about them."""
-    full, left, seen = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
+    and outside none.  Balls that few views see are in neither group."""
+    full, remaining, view_counts = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:
-        projection = silhouette.project(centers[left])
+        projection = silhouette.project(centers[remaining])
         if not len(projection.depth):
             continue
-        around = np.ones((2 * silhouette.radius(radius, projection.depth) + 1,) * 2, np.uint8)
-        here = left[projection.inside]
-        seen[here] += 1
-        full[here[cv2.erode(silhouette.alpha, around)[projection.row, projection.column] <= HALF]] = False
-        remains = ~projection.inside
-        remains[projection.inside] = cv2.dilate(silhouette.alpha, around)[projection.row, projection.column] > HALF
-        left = left[remains]
+        kernel = np.ones((2 * silhouette.radius(radius, projection.depth) + 1,) * 2, np.uint8)
+        rows = remaining[projection.inside]
+        view_counts[rows] += 1
+        full[rows[cv2.erode(silhouette.alpha, kernel)[projection.row, projection.column] <= HALF]] = False
+        is_remaining = ~projection.inside
+        is_remaining[projection.inside] = cv2.dilate(silhouette.alpha, kernel)[projection.row, projection.column] > HALF
+        remaining = remaining[is_remaining]
     touched = np.zeros(len(centers), bool)
-    touched[left] = True
-    touched &= seen >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
+    touched[remaining] = True
+    touched &= view_counts >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
     return touched & full, touched & ~full
 
 
@@ -158,10 +158,10 @@ def _colors(
         cell = max(1, math.ceil(side * max(camera.fx, camera.fy) / float(np.median(projection.depth))))  # px
         nearest = np.full((camera.height // cell + 1, camera.width // cell + 1), np.inf, np.float32)
         np.minimum.at(nearest, (projection.row // cell, projection.column // cell), projection.depth)
-        shown = projection.depth <= nearest[projection.row // cell, projection.column // cell] + MAX_BEHIND * side
+        is_visible = projection.depth <= nearest[projection.row // cell, projection.column // cell] + MAX_BEHIND * side
         rgba = silhouette.rgba[projection.row, projection.column]
-        shown &= rgba[:, 3] >= OPAQUE
-        here = np.flatnonzero(projection.inside)[shown]
-        total[here] += rgba[shown, :3]
-        number[here] += 1
+        is_visible &= rgba[:, 3] >= OPAQUE
+        rows = np.flatnonzero(projection.inside)[is_visible]
+        total[rows] += rgba[is_visible, :3]
+        number[rows] += 1
     return np.asarray(total / np.maximum(255 * number, 1)[:, None], np.float32), number > 0

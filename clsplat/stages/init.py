@@ -14,7 +14,7 @@ from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
-from clsplat.scene.plane_sweep import swept_points
+from clsplat.scene.plane_sweep import sweep_points
 from clsplat.scene.quality import is_transparent, opaque_pixels
 from clsplat.scene.reprojection import require_points_in_front
 from clsplat.scene.scene import PointCloud, Scene
@@ -45,7 +45,7 @@ def scene_points(scene: Scene) -> PointCloud:
 def sweep_photos(run: Run, count: int) -> PointCloud:
     """Return at most `count` points from a plane sweep over the training photos."""
     views = _views(run)
-    return swept_points(views, scene_center(views), load_image, count, run.seed)
+    return sweep_points(views, scene_center(views), load_image, count, run.seed)
 
 
 def points_with_sweep(run: Run, count: int) -> PointCloud:
@@ -55,7 +55,7 @@ def points_with_sweep(run: Run, count: int) -> PointCloud:
     """
     points, views = scene_points(run.scene), _views(run)
     positions = points.positions.astype(np.float64)
-    new = swept_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
+    new = sweep_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
     if not len(new):
         LOG.warning("the plane sweep found no additional points; starting from the scene's points only")
     return points.joined(new)

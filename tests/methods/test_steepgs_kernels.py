@@ -123,7 +123,7 @@ def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
         assert error < bound * np.abs(matrices[n]).max() * (v @ v)
 
 
-def view_of(frame: Frame, pixel_sums: Array) -> ViewGradients:
+def make_view(frame: Frame, pixel_sums: Array) -> ViewGradients:
     """A view for statistics that read no photograph."""
     workspace = Workspace(pixel_sums.device)
     return ViewGradients(frame, Comparison(workspace, frame.camera, *[frame.image] * 3), [], pixel_sums)
@@ -139,7 +139,7 @@ def added_up(device: Device, case: Case, weights: np.ndarray, views: int = 1) ->
     gradients = rasterizer.gradients(model, frame, pixel_sums)
     stats = SplatStats(model.gaussians, ["splitting", "screen_grad"])
     for _ in range(views):
-        stats.add(view_of(frame, pixel_sums), gradients.mean2d)
+        stats.add(make_view(frame, pixel_sums), gradients.mean2d)
     return model.gaussians.get("stats/splitting"), stats
 
 
@@ -379,11 +379,11 @@ def test_gaussian_between_two_blobs_escapes_its_saddle(device):
     pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes))
     mean2d = rasterizer.gradients(model, frame, pixel_sums).mean2d
     stats = SplatStats(model.gaussians, {"splitting", "screen_grad"})
-    stats.add(view_of(frame, pixel_sums), mean2d)
+    stats.add(make_view(frame, pixel_sums), mean2d)
     assert stats.mean("screen_grad")[0] < 2e-5
     scale = SceneScale(1.0)
     assert densify(Edit(model.gaussians, stats, scale, 700, 4), [Clone(size_below=9.0)], rasterizer.tiler).after == 1
-    stats.add(view_of(frame, pixel_sums), mean2d)
+    stats.add(make_view(frame, pixel_sums), mean2d)
     edit = Edit(model.gaussians, stats, scale, 700, 4)
     assert densify(edit, [SplitSteepest(gradient_above=0.0)], rasterizer.tiler).after == 2
     apart = camera.rotation @ np.diff(model.gaussians.get("means"), axis=0)[0]

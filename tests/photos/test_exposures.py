@@ -15,7 +15,7 @@ from clsplat.photos.exposure_estimate import (
     sample_points,
 )
 from clsplat.prepare.undistort import undistort_scene
-from clsplat.scene.colmap import read_images, read_point_table, tracks_of
+from clsplat.scene.colmap import make_tracks, read_images, read_point_table
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
@@ -167,20 +167,20 @@ def test_tracks_are_written_and_read(rng, tmp_path):
     points = PointCloud(wall.tracks.positions.astype(np.float32), wall.colors.astype(np.float32))
     write_model(tmp_path, wall.views, points, wall.tracks)
     images, read = read_images(tmp_path), read_point_table(tmp_path)
-    tracks = tracks_of(images, read)
+    tracks = make_tracks(images, read)
     assert tracks.positions == pytest.approx(wall.tracks.positions)
     assert {name: rows.tolist() for name, rows in tracks.seen.items()} == {
         name: rows.tolist() for name, rows in wall.tracks.seen.items()
     }
     assert [len(image.points) for image in images] == [60] * len(images)
     write_model(tmp_path, wall.views, points)
-    assert tracks_of(read_images(tmp_path), read_point_table(tmp_path)) is None
+    assert make_tracks(read_images(tmp_path), read_point_table(tmp_path)) is None
 
 
 def test_text_tracks_follow_point_ids(tmp_path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n1 1 7 2 2 -1 3 3 5 4 4 5 9 9 77\n")
     (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 2\n")
-    tracks = tracks_of(read_images(tmp_path), read_point_table(tmp_path))
+    tracks = make_tracks(read_images(tmp_path), read_point_table(tmp_path))
     assert tracks.seen["a.png"].tolist() == [1, 0], "by id; 77 is no point"
 
 

@@ -182,7 +182,7 @@ def test_damaged_cache_is_ignored(scene, decoded, cache):
 
 
 def test_full_cache_is_cleared(scene, decoded, cache, monkeypatch):
-    monkeypatch.setattr(decoding, "MAX_REMEMBERED", 500)
+    monkeypatch.setattr(decoding, "MAX_CACHE_BYTES", 500)
     for size in (10, 20, 20):
         decode_all(views(scene))
         assert len(decoded) == size or size == 20

@@ -44,7 +44,7 @@ LENSES = {  # parameters after the focal lengths and the middle
 SIZE = 60, 40
 
 
-def lens_of(model, i=0):
+def make_lens(model, i=0):
     focals = (61.25 + i / 7, 63.5)[: MODELS[model][0]]
     return Lens(*SIZE, model, (*focals, 31.125, 18.75 + i / 3, *LENSES[model]))
 
@@ -59,7 +59,7 @@ def scene_of(rng, tmp_path):
             quaternion = rng.normal(size=4)
             rotation = rotation_matrix(*(quaternion / np.linalg.norm(quaternion)))
             pose = np.column_stack([rotation, rng.normal(size=3) * 3])
-            lens = lens_of(model, i % lenses)
+            lens = make_lens(model, i % lenses)
             name = f"left/ä_{i}.png" if i < 3 else f"right/{i}.png"
             file = tmp_path / "photographs" / name
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def test_nerfstudio_round_trip(model, lenses, scene_of, tmp_path, rng):
 
 @pytest.mark.parametrize("model", sorted(LENSES.keys() - DISTORTION.keys()))
 def test_lens_unknown_to_nerfstudio_is_refused(model, scene_of, tmp_path):
-    with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or `clsplat data undistort` first"):
+    with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or run `clsplat data undistort`"):
         clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
     assert not (tmp_path / "out").exists()
     stage = SimpleNamespace(original=scene_of(model))
@@ -142,7 +142,7 @@ def test_cameras_json_has_undistorted_cameras(model, scene_of, tmp_path, caplog)
     scene = scene_of(model, 3)
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
-    assert "the middle of the image for the principal point, which is up to" in caplog.text
+    assert "the principal point at the center of the image; it is up to" in caplog.text
     found = camera_files.read_inria(tmp_path / "cameras.json")
     for a, b in zip(scene.views, found, strict=True):
         assert (b.name, b.camera) == (a.name, a.camera)
@@ -153,7 +153,7 @@ def test_cameras_json_has_undistorted_cameras(model, scene_of, tmp_path, caplog)
 
 
 def test_distorted_images_are_refused_with_pinhole_cameras(scene_of, tmp_path):
-    with pytest.raises(DataError, match=r"inria holds cameras of undistorted photographs, .*`clsplat data undistort`"):
+    with pytest.raises(DataError, match=r"inria has no lens distortion, .*`clsplat data undistort`"):
         clsplat.write_cameras(scene_of("OPENCV"), tmp_path / "a", "inria", images="copy")
     assert not (tmp_path / "a").exists()
     clsplat.write_cameras(scene_of("PINHOLE"), tmp_path / "b", "inria", images="copy")
@@ -184,7 +184,7 @@ def test_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
 @pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
 def test_lost_split_is_logged_in_one_line(form, lines, scene_of, tmp_path, caplog):
     clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, form)
-    words = f"{tmp_path}: {form} does not keep which views are for testing, 2 of 5; nerfstudio does"
+    words = f"{tmp_path}: {form} does not store which views are for testing, 2 of 5; nerfstudio does"
     assert [record.levelname for record in caplog.records if record.getMessage() == words] == ["WARNING"] * lines
 
 
@@ -273,7 +273,7 @@ def test_exposures_are_written_next_to_copied_images(form, scene_of, tmp_path, r
     prefix = "images/" if form == "nerfstudio" else ""
     assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
     assert (found.tracks is None) == (form == "nerfstudio")
-    said = "nerfstudio does not keep which points the photographs show; colmap does"
+    said = "nerfstudio does not store which points the photographs show; colmap does"
     assert (said in caplog.text) == (form == "nerfstudio")
     clsplat.write_cameras(scene, tmp_path / "alone", form)
     assert not (tmp_path / "alone/images").exists()

@@ -132,7 +132,7 @@ def test_tiny_focal_length(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> 
 def test_unknown_camera(tmp_path: Path) -> None:
     images = [*tiny_model().images, ImageEntry("d.jpg", camera=7)]
     message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
-    assert "'d.jpg' names camera 7" in message
+    assert "'d.jpg' has camera 7" in message
 
 
 def test_nan_distortion_is_refused(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def test_text_dialects(tmp_path: Path, edit) -> None:
         ("images", "0 0 0 0 0 1 1 a", "nan 0 0 0 0 1 1 a", "images.txt: line 2"),
         ("images", "4 0 0 1 b", "4 inf 0 1 b", "images.txt: line 4"),
         ("images", "2 0 1 0 0 4", "2 0 0 0 0 4", "images.txt: line 4"),
-        ("images", "1 a.jpg", "5 a.jpg", "names camera 5"),
+        ("images", "1 a.jpg", "5 a.jpg", "has camera 5"),
         ("images", "1 a.jpg", "", "images.txt: line 2"),
         ("images", "1 2 -1 3 4 7", "1 2 -1 3", "images.txt: line 3"),
         ("cameras", "50 51", "-nan(ind) 51", "cameras.txt: line 2"),

@@ -183,7 +183,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
         3,
         "are called '0.png'",
     ),
-    "an unknown camera": (changed(camera=7), 3, "names camera 7"),
+    "an unknown camera": (changed(camera=7), 3, "has camera 7"),
     "a pose that is not a number": (changed(translation=(float("nan"), 0, 0)), 3, "the pose of '2.png'"),
     "a pose without rotation": (changed(quaternion=(0, 0, 0, 0)), 3, "the pose of '2.png'"),
     "a far camera": (changed(translation=(1e7, 0.0, 4.0)), 0, ""),

@@ -22,7 +22,7 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 rng = np.random.default_rng(5)
 
 
-def view_of(path: Path, width: int, height: int) -> View:
+def make_view(path: Path, width: int, height: int) -> View:
     return View("v", Camera(width, height, 50, 50, width / 2, height / 2), np.eye(3, 4), path)
 
 
@@ -42,7 +42,7 @@ def random(*shape: int, dtype=np.uint8) -> np.ndarray:
 
 def test_rgb_is_returned_as_stored(tmp_path: Path) -> None:
     pixels = random(48, 64, 3)
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 64, 48), WHITE)
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 64, 48), WHITE)
     np.testing.assert_array_equal(image, pixels)
     assert image.dtype == np.uint8
     assert image.flags.c_contiguous
@@ -52,20 +52,20 @@ def test_name_with_unicode_and_spaces(tmp_path: Path) -> None:
     pixels = random(4, 6, 3)
     path = tmp_path / "fôx 日本.png"
     stored(tmp_path / "a.png", pixels).rename(path)
-    np.testing.assert_array_equal(load_image(view_of(path, 6, 4)), pixels)
+    np.testing.assert_array_equal(load_image(make_view(path, 6, 4)), pixels)
     assert image_size(path) == (6, 4)
 
 
 def test_gray_becomes_rgb(tmp_path: Path) -> None:
     pixels = random(4, 6)
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 6, 4))
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 6, 4))
     np.testing.assert_array_equal(image, np.repeat(pixels[:, :, None], 3, axis=2))
 
 
 def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
     pixels = random(4, 6, 3, dtype=np.uint16)
     pixels[0, 0] = (0, 65535, 257 * 77)
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 6, 4))
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 6, 4))
     np.testing.assert_array_equal(image, np.rint(pixels / 257))
     assert image[0, 0].tolist() == [0, 255, 77]
 
@@ -74,7 +74,7 @@ def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
 def test_alpha_is_composited_in_double_and_truncated(tmp_path: Path, background) -> None:
     colors, alphas = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     pixels = np.stack([colors, colors[:, ::-1], 255 - alphas, alphas], axis=2)
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 256, 256), background)
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 256, 256), background)
     # Transcribed from the reference (3DGS, scene/dataset_readers.py, readCamerasFromTransforms).
     norm = pixels / 255.0
     arr = norm[:, :, :3] * norm[:, :, 3:4] + np.array(background) * (1 - norm[:, :, 3:4])
@@ -85,7 +85,7 @@ def test_alpha_is_composited_in_double_and_truncated(tmp_path: Path, background)
 def test_sixteen_bit_alpha(tmp_path: Path) -> None:
     pixels = np.full((2, 2, 4), 65535, np.uint16)
     pixels[:, :, 3] = 32768
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 2, 2))
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 2, 2))
     assert (image == 127).all()  # 127.502 truncated
 
 
@@ -97,7 +97,7 @@ def test_exif_rotation_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
     assert cv2.imread(str(path)).shape == (16, 8, 3)  # the tag is understood
-    assert load_image(view_of(path, 16, 8)).shape == (8, 16, 3)
+    assert load_image(make_view(path, 16, 8)).shape == (8, 16, 3)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -121,13 +121,13 @@ def test_unreadable_image_is_named(tmp_path: Path, content) -> None:
     if content is not None:
         whole = stored(tmp_path / "b.png", random(48, 64, 3)).read_bytes()
         path.write_bytes(whole[: len(whole) // 2] if content == "cut" else content)
-    assert "a.png: " in refusal(load_image, view_of(path, 64, 48))
+    assert "a.png: " in refusal(load_image, make_view(path, 64, 48))
 
 
 def test_float_image_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tiff"
     assert cv2.imwrite(str(path), np.zeros((4, 6, 3), np.float32))
-    assert "float32" in refusal(load_image, view_of(path, 6, 4))
+    assert "float32" in refusal(load_image, make_view(path, 6, 4))
 
 
 # ---- resizing
@@ -136,7 +136,7 @@ def test_float_image_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("factor", [2, 4])
 def test_downscaling_is_a_box_mean(tmp_path: Path, factor: int) -> None:
     pixels = random(48, 64, 3)
-    view = view_of(stored(tmp_path / "a.png", pixels), 64 // factor, 48 // factor)
+    view = make_view(stored(tmp_path / "a.png", pixels), 64 // factor, 48 // factor)
     mean = pixels.reshape(48 // factor, factor, 64 // factor, factor, 3).mean(axis=(1, 3))
     image = load_image(view)
     assert np.abs(image - mean).max() <= 0.5 + 1e-4  # rounded to nearest
@@ -145,7 +145,7 @@ def test_downscaling_is_a_box_mean(tmp_path: Path, factor: int) -> None:
 
 def test_alpha_is_averaged_separately_from_colors(tmp_path: Path) -> None:
     pixels = random(48, 64, 4)
-    image = load_image(view_of(stored(tmp_path / "a.png", pixels), 32, 24), WHITE)
+    image = load_image(make_view(stored(tmp_path / "a.png", pixels), 32, 24), WHITE)
     mean = pixels.reshape(24, 2, 32, 2, 4).mean(axis=(1, 3)) / 255
     exact = (mean[:, :, :3] * mean[:, :, 3:] + (1 - mean[:, :, 3:])) * 255
     assert (exact - image).max() < 1
@@ -163,7 +163,7 @@ def test_flat_region_keeps_its_value(tmp_path: Path, size, camera, level: int) -
     """Truncation must not turn 199.99999 into 199."""
     flat = np.full((size[1], size[0], 4), level, np.uint8)
     flat[:, :, 3] = 255
-    assert (load_image(view_of(stored(tmp_path / "a.png", flat), *camera), WHITE) == level).all()
+    assert (load_image(make_view(stored(tmp_path / "a.png", flat), *camera), WHITE) == level).all()
 
 
 @given(st.integers(1, 500), st.integers(1, 500), st.floats(1, 40))
@@ -178,7 +178,7 @@ def test_every_downscaled_camera_finds_its_image(tmp_path_factory, width: int, h
 @pytest.mark.parametrize("size", [(64, 50), (65, 48), (32, 26), (128, 96)])
 def test_wrong_size_names_both_sizes(tmp_path: Path, size: tuple[int, int]) -> None:
     path = stored(tmp_path / "a.png", random(48, 64, 3))
-    message = refusal(load_image, view_of(path, *size))
+    message = refusal(load_image, make_view(path, *size))
     assert "64x48" in message
     assert f"{size[0]}x{size[1]}" in message
 
@@ -186,8 +186,8 @@ def test_wrong_size_names_both_sizes(tmp_path: Path, size: tuple[int, int]) -> N
 def test_real_photographs(tmp_path: Path) -> None:
     path = data_set("lund") / "images" / "01.jpg"
     photo = cv2.imread(str(path))[:, :, ::-1]
-    np.testing.assert_array_equal(load_image(view_of(path, 480, 360)), photo)
-    half = load_image(view_of(path, 240, 180))
+    np.testing.assert_array_equal(load_image(make_view(path, 480, 360)), photo)
+    half = load_image(make_view(path, 240, 180))
     assert abs(half.mean() - photo.mean()) < 0.05
 
 
@@ -198,7 +198,7 @@ def test_written_image_is_read_back(tmp_path: Path) -> None:
     pixels = random(5, 7, 3)
     path = tmp_path / "deep" / "er" / "a.png"
     write_image(path, pixels)
-    np.testing.assert_array_equal(load_image(view_of(path, 7, 5)), pixels)
+    np.testing.assert_array_equal(load_image(make_view(path, 7, 5)), pixels)
     assert [file.name for file in path.parent.iterdir()] == ["a.png"]
 
 
@@ -212,7 +212,7 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OutputError, match="No space left"):
         write_image(path, 255 - pixels)
-    np.testing.assert_array_equal(load_image(view_of(path, 7, 5)), pixels)
+    np.testing.assert_array_equal(load_image(make_view(path, 7, 5)), pixels)
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
 
 

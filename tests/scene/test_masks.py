@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 BLACK = (0.0, 0.0, 0.0)
 
 
-def view_of(path: Path, width: int, height: int, **more: object) -> View:
+def make_view(path: Path, width: int, height: int, **more: object) -> View:
     return View("v.png", Camera(width, height, 50, 50, width / 2, height / 2), np.eye(3, 4), path, **more)
 
 
@@ -36,15 +36,15 @@ def test_white_pixels_count(tmp_path, rng):
     photo = store(tmp_path / "a.png", np.full((4, 6, 3), 90, np.uint8))
     white = rng.random((4, 6)) < 0.5
     mask = store(tmp_path / "m.png", np.where(white, 255, 0).astype(np.uint8))
-    np.testing.assert_array_equal(load_mask(view_of(photo, 6, 4, mask_path=mask)), white)
-    assert load_mask(view_of(photo, 6, 4)) is None
+    np.testing.assert_array_equal(load_mask(make_view(photo, 6, 4, mask_path=mask)), white)
+    assert load_mask(make_view(photo, 6, 4)) is None
 
 
 def test_only_fully_unmasked_pixels_count(tmp_path):
     photo = store(tmp_path / "a.png", np.full((4, 8, 3), 90, np.uint8))
     white = np.full((4, 8), 255, np.uint8)
     white[0, 0] = 0
-    view = view_of(photo, 4, 2, mask_path=store(tmp_path / "m.png", white))
+    view = make_view(photo, 4, 2, mask_path=store(tmp_path / "m.png", white))
     expected = np.ones((2, 4), bool)
     expected[0, 0] = False
     np.testing.assert_array_equal(load_mask(view), expected)
@@ -53,14 +53,14 @@ def test_only_fully_unmasked_pixels_count(tmp_path):
 def test_alpha_as_mask(tmp_path):
     pixels = np.full((3, 4, 4), 200, np.uint8)
     pixels[:, :, 3] = [0, 128, 254, 255]
-    view = view_of(store(tmp_path / "a.png", pixels), 4, 3)
+    view = make_view(store(tmp_path / "a.png", pixels), 4, 3)
     assert load_mask(view) is None
     np.testing.assert_array_equal(load_mask(replace(view, alpha="mask")), [[False, False, True, True]] * 3)
 
 
 def test_mask_of_another_size_is_refused(tmp_path):
     photo = store(tmp_path / "a.png", np.zeros((4, 6, 3), np.uint8))
-    view = view_of(photo, 6, 4, mask_path=store(tmp_path / "m.png", np.zeros((4, 5), np.uint8)))
+    view = make_view(photo, 6, 4, mask_path=store(tmp_path / "m.png", np.zeros((4, 5), np.uint8)))
     assert "m.png: the image is 5x4 pixels, its camera 6x4" in refusal(load_mask, view)
 
 
@@ -114,13 +114,13 @@ def test_masks_of_rotated_images(tmp_path):
     pixels = np.zeros((8, 16, 3), np.uint8)
     pixels[:, :8] = 255
     path = with_orientation(tmp_path / "a.jpg", pixels, 6)  # to be turned clockwise
-    stored, turned = load_image(view_of(path, 16, 8)), load_image(view_of(path, 8, 16))
+    stored, turned = load_image(make_view(path, 16, 8)), load_image(make_view(path, 8, 16))
     assert stored[:, :4].min() > 200
     assert stored[:, -4:].max() < 50
     assert turned[:4].min() > 200
     assert turned[-4:].max() < 50
-    assert load_image(view_of(path, 4, 8)).shape == (8, 4, 3)
-    assert "16x8" in refusal(load_image, view_of(path, 9, 16))
+    assert load_image(make_view(path, 4, 8)).shape == (8, 4, 3)
+    assert "16x8" in refusal(load_image, make_view(path, 9, 16))
 
 
 # ---- undistorted photographs

@@ -14,7 +14,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.photographs import with_masks
 from clsplat.scene.scene import Tracks
-from clsplat.scene.view import View, load_image, load_mask, photograph_of
+from clsplat.scene.view import View, load_image, load_mask, photograph_name
 from clsplat.scene.view_selection import Split, ViewSelection
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, write_scene
 from tests.support.transforms_scene import frames, write
@@ -138,7 +138,7 @@ def panoramas(tmp_path: Path, rng: np.random.Generator) -> Path:
 
 
 def photographs(scene, split: str) -> list[str]:
-    return sorted({photograph_of(view.name) for view in scene.split(split)})
+    return sorted({photograph_name(view.name) for view in scene.split(split)})
 
 
 def test_faces_of_a_photograph_share_its_place_and_split(panoramas: Path) -> None:

@@ -17,7 +17,7 @@ from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
+from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, sweep_points
 from clsplat.scene.quality import opaque_pixels
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
@@ -50,7 +50,7 @@ def wall_views(rng, count=6):
 
 def test_wall_is_found_at_its_depth(rng):
     views, photographs = wall_views(rng)
-    points = swept_points(views, np.array([0, 0, DEPTH]), lambda view: photographs[view.name], 5000, 0)
+    points = sweep_points(views, np.array([0, 0, DEPTH]), lambda view: photographs[view.name], 5000, 0)
     assert len(points) == 5000
     depth = points.positions[:, 2]
     assert np.mean(np.abs(depth - DEPTH) < 0.05 * DEPTH) > 0.95
@@ -63,7 +63,7 @@ def test_wall_is_found_at_its_depth(rng):
 
 def test_swept_points_are_reproducible(rng):
     views, photographs = wall_views(rng, 3)
-    first, second = (swept_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
+    first, second = (sweep_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
     np.testing.assert_array_equal(first.positions, second.positions)
     np.testing.assert_array_equal(first.colors, second.colors)
 
@@ -71,8 +71,8 @@ def test_swept_points_are_reproducible(rng):
 def test_unrelated_images_give_few_points(rng):
     views, photographs = wall_views(rng)
     noise = {name: rng.integers(0, 256, image.shape).astype(np.uint8) for name, image in photographs.items()}
-    assert len(swept_points(views, np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) < 2500
-    assert len(swept_points(views[:1], np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) == 0
+    assert len(sweep_points(views, np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) < 2500
+    assert len(sweep_points(views[:1], np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) == 0
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def before_a_sky(view):
 
 
 def swept(table, shown):
-    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, allowed=shown)
+    return sweep_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, allowed=shown)
 
 
 def test_pixels_are_placed_at_exact_depths(table):
@@ -150,9 +150,9 @@ def test_points_near_existing_ones_are_not_new():
 def test_missing_surfaces_are_added(rng):
     views, photographs = wall_views(rng, 4)
     center, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
-    alone = swept_points(views, center, load, 10**6, 0).positions
+    alone = sweep_points(views, center, load, 10**6, 0).positions
     left = alone[alone[:, 0] < 0].astype(np.float64)
-    new = swept_points(views, center, load, 10**6, 0, existing=left).positions
+    new = sweep_points(views, center, load, 10**6, 0, existing=left).positions
     assert len(new) < 0.6 * len(alone)
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
@@ -161,7 +161,7 @@ def test_added_points_are_reproducible(table, all_points):
     first, second = all_points, swept(table, lambda view: None)
     for name in ("positions", "colors"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    assert len(swept_points(table[0], LOOK_AT, before_a_sky, 700, 0)) == 700 < len(first)
+    assert len(sweep_points(table[0], LOOK_AT, before_a_sky, 700, 0)) == 700 < len(first)
 
 
 @pytest.mark.large
@@ -170,7 +170,7 @@ def test_real_surfaces_are_covered():
     scene = read_scene(data_set("fox"))
     views = scene.split("train")
     center = scene_center(views)
-    points = swept_points(views, center, load_image, 100_000, 0)
+    points = sweep_points(views, center, load_image, 100_000, 0)
     distance = np.median([np.linalg.norm(view.position - center) for view in views])
     gaps, _ = cKDTree(points.positions).query(scene.points.positions)
     assert np.quantile(gaps, 0.9) < 0.03 * distance
@@ -183,7 +183,7 @@ def test_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplo
     """more: than the scene's points are enough."""
     own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
     cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
-    monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
+    monkeypatch.setattr("clsplat.stages.init.sweep_points", lambda *arguments: cloud)
     monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda scene: alpha)
     stages = f"[{{init: {{min_points: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
     file.write_text(f"name: start\nstages: {stages}\n")
@@ -208,7 +208,7 @@ def test_points_and_sweep_are_combined(tiny_scene, tmp_path, caplog):
 
 def test_empty_sweep_is_reported(tiny_scene, tmp_path, monkeypatch, caplog):
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-    monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: nothing)
+    monkeypatch.setattr("clsplat.stages.init.sweep_points", lambda *arguments: nothing)
     run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")
     assert "found no additional points" in caplog.text
     assert run.model.gaussians.count == len(read_scene(tiny_scene).points)

@@ -29,7 +29,7 @@ from clsplat.scene.images import (
     read_header,
 )
 from clsplat.scene.points import MAX_VALUE
-from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred, shows_nothing
+from clsplat.scene.quality import SIDE, is_blank, is_blurred, sharpness_values
 from clsplat.scene.reader import Parts
 from clsplat.scene.reprojection import reprojection_errors, require_points_in_front
 from clsplat.scene.scene import camera_extent, outlier_cameras, share_center
@@ -48,10 +48,10 @@ MAX_BRIGHTNESS_RATIO = 2.0  # from one photograph to the next; at most 1.4 in fi
 class PhotographMeasures:
     """Measurements of one photograph."""
 
-    sharpness: NDArray[np.float64]  # [2], the two measures of both_sharpnesses
+    sharpness: NDArray[np.float64]  # [2], the two values of sharpness_values
     brightness: NDArray[np.float64]  # [2], mean and median, gray levels
     thumbnail: NDArray[np.float32]  # [THUMBNAIL²], gray levels
-    is_blank: bool  # it shows nothing
+    is_blank: bool  # black, of one color, or transparent
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _measure(file: Path) -> PhotographMeasures | DataError:
         return error
     small = cv2.resize(gray, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     brightness = np.maximum([gray.mean(), np.median(gray)], 1.0)
-    return PhotographMeasures(both_sharpnesses(gray), brightness, small.astype(np.float32).ravel(), shows_nothing(gray))
+    return PhotographMeasures(sharpness_values(gray), brightness, small.astype(np.float32).ravel(), is_blank(gray))
 
 
 def _brightness_steps(
@@ -144,8 +144,8 @@ def _duplicates(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]])
         if thumbnail.std() <= MAX_DUPLICATE_RMS:
             continue
         firsts = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(thumbnail))
-        near = np.flatnonzero(((firsts - thumbnail) ** 2).mean(axis=1) < MAX_DUPLICATE_RMS**2)
-        groups[near[0]].append(i) if len(near) else groups.append([i])
+        matches = np.flatnonzero(((firsts - thumbnail) ** 2).mean(axis=1) < MAX_DUPLICATE_RMS**2)
+        groups[matches[0]].append(i) if len(matches) else groups.append([i])
     return [[names[i] for i in group] for group in groups if len(group) > 1]
 
 
@@ -157,15 +157,15 @@ MAX_DISTANCE = 100.0  # camera extents from the median camera center; photograph
 
 @dataclass(frozen=True)
 class PointFacts:
-    """The sparse points.  Shares are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
+    """The sparse points.  Fractions are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
 
     count: int
     not_finite: int
     distant: int  # beyond MAX_DISTANCE camera extents
     error_mean: float | None  # px
     error_90: float | None  # px; 90 % of the points have less
-    in_two: float | None  # share that projects into at least two images, occluded or not
-    behind: float | None  # share behind all cameras
+    in_two: float | None  # fraction that projects into at least two images, occluded or not
+    behind: float | None  # fraction behind all cameras
 
 
 def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
@@ -174,9 +174,9 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     positions = parts.points.positions
     finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
     errors = _errors(parts, np.asarray(finite))
-    good = positions[finite].astype(np.float64)
-    distance = np.linalg.norm(good - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
-    sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
+    finite_positions = positions[finite].astype(np.float64)
+    distance = np.linalg.norm(finite_positions - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
+    sample = finite_positions[:: max(1, -(-len(finite_positions) // SAMPLE_SIZE))]
     views = list(parts.scene.views) if parts.scene else parts.views  # with the faces of wide photographs
     in_two, behind = _coverage(sample, views) if len(sample) and views else (None, None)
     return PointFacts(
@@ -197,22 +197,22 @@ def _errors(parts: Parts, finite: NDArray[np.bool_]) -> NDArray[np.floating]:
         return errors
     assert parts.points is not None
     error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
-    known = error[np.isfinite(error) & (error > 0)]
-    return known if len(np.unique(known)) > 1 else np.empty(0)  # equal errors are a placeholder
+    known_errors = error[np.isfinite(error) & (error > 0)]
+    return known_errors if len(np.unique(known_errors)) > 1 else np.empty(0)  # equal errors are a placeholder
 
 
 def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
-    """Return the shares of points, [M, 3], that project into at least two views, and that are behind all of them."""
-    inside, ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
+    """Return the fractions of points, [M, 3], that project into at least two views, and that are behind all views."""
+    inside, is_ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
     for view in views:
         camera = view.camera
         x, y, z = view.world_to_camera[:, :3] @ points.T + view.world_to_camera[:, 3:]
-        front = z > 0
-        depth = np.where(front, z, 1)
+        in_front = z > 0
+        depth = np.where(in_front, z, 1)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-        inside += front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        ahead |= front
-    return float((inside >= min(2, len(views))).mean()), float((~ahead).mean())
+        inside += in_front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        is_ahead |= in_front
+    return float((inside >= min(2, len(views))).mean()), float((~is_ahead).mean())
 
 
 MIN_SEEN = 30  # points; COLMAP does not register images with fewer inliers
@@ -228,7 +228,7 @@ class CameraFacts:
     height: int
     focal: tuple[float, float]  # px
     distortion: float | None  # px, the largest displacement by the lens along the border; None if it overflows
-    kept: float  # share of the photograph that undistortion keeps
+    kept: float  # fraction of the photograph that undistortion keeps
     centered: bool  # whether the principal point is inside the photograph
     faces: int  # views that a wide photograph is cut into; 0: none
 
@@ -249,7 +249,7 @@ class PhotographFacts:
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """What files without cameras tell about the capture, with the number of photographs."""
+    """Facts from the headers of photographs without cameras; values are numbers of photographs."""
 
     sizes: dict[str, int]  # as stored
     cameras: dict[str, int]  # make, model, and focal length by EXIF
@@ -275,7 +275,7 @@ class Facts:
     comparison: ComparisonFacts
     capture: CaptureFacts | None  # None when there are views
     points: PointFacts | None
-    points_per_view: dict[str, int]  # sparse points that each view shows; empty if the dataset does not say
+    points_per_view: dict[str, int]  # sparse points that each view shows; empty if unknown
     extent: float | None  # scene units
     origin: list[float]  # [3] world coordinates, of a scene far from zero
     outlier_cameras: list[str]
@@ -285,14 +285,14 @@ class Facts:
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
-    hint: str  # what is there instead of missing files
+    hint: str  # similar files that exist instead of missing ones
     notes: list[str]  # sentences about files that are not where the dataset says
     faults: list[str]  # why parts of it cannot be read
     refusal: str  # why training does not start
 
     @property
     def unplaced(self) -> bool:
-        """Whether these are photographs whose cameras `clsplat run photos` can find."""
+        """Whether the dataset is photographs whose cameras `clsplat run photos` can find."""
         return (
             self.kind == "none"
             and not self.faults
@@ -310,7 +310,7 @@ def measure_dataset(parts: Parts) -> Facts:
     """Measure a dataset that was read in parts."""
     views, expected = parts.views, parts.expected
     missing = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
-    known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
+    known_files = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
     centers = np.stack([view.position for view in views]) if views else np.empty((0, 3))
     extent = (
@@ -328,7 +328,7 @@ def measure_dataset(parts: Parts) -> Facts:
         test=len(parts.scene.test) if parts.scene else None,
         on_disk=len(parts.on_disk),
         missing=[_relative(file, parts) for file in missing],
-        unregistered=[_relative(file, parts) for file in parts.on_disk if file not in known],
+        unregistered=[_relative(file, parts) for file in parts.on_disk if file not in known_files],
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
@@ -339,7 +339,7 @@ def measure_dataset(parts: Parts) -> Facts:
         points_per_view=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         origin=parts.scene.origin.tolist() if parts.scene else [0.0] * 3,
-        outlier_cameras=[view.name for view, far in zip(views, outlier_cameras(views), strict=True) if far]
+        outlier_cameras=[view.name for view, is_far in zip(views, outlier_cameras(views), strict=True) if is_far]
         if views
         else [],
         timestamps=len(distinct_times(views)),
@@ -357,14 +357,14 @@ def measure_dataset(parts: Parts) -> Facts:
 
 def distortion(lens: Lens) -> float | None:
     """Return the largest displacement by the lens along the border, px; None if it overflows."""
-    camera, along = lens.camera, np.linspace(0, 1, BORDER_POINTS)
+    camera, fractions = lens.camera, np.linspace(0, 1, BORDER_POINTS)
     zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
-    x = np.concatenate([along, along, zeros, ones]) * lens.width
-    y = np.concatenate([zeros, ones, along, along]) * lens.height
+    x = np.concatenate([fractions, fractions, zeros, ones]) * lens.width
+    y = np.concatenate([zeros, ones, fractions, fractions]) * lens.height
     with np.errstate(all="ignore"):
         moved_x, moved_y = lens.distort((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-        moved = float(np.hypot(moved_x - x, moved_y - y).max())
-    return moved if np.isfinite(moved) else None
+        displacement = float(np.hypot(moved_x - x, moved_y - y).max())
+    return displacement if np.isfinite(displacement) else None
 
 
 def _relative(file: Path, parts: Parts) -> str:
@@ -393,12 +393,12 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         lens, camera = views[0].lens, views[0].camera
         original = lens.camera if lens else camera
         model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
-        kept = camera.width * camera.height / (original.width * original.height)
-        centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
+        kept_fraction = camera.width * camera.height / (original.width * original.height)
+        is_centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
         faces = len(lens.faces) if lens and lens.is_wide else 0
-        moved, kept = (0.0, 1.0) if faces or not lens else (distortion(lens), kept)
-        cameras.append(CameraFacts(len(views), model, *size, focal, moved, kept, centered, faces))
+        displacement, kept_fraction = (0.0, 1.0) if faces or not lens else (distortion(lens), kept_fraction)
+        cameras.append(CameraFacts(len(views), model, *size, focal, displacement, kept_fraction, is_centered, faces))
     return sorted(cameras, key=lambda facts: -facts.views)
 
 

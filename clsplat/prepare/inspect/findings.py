@@ -44,7 +44,7 @@ class Finding:
         return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
 
 
-def unprepared(facts: Facts) -> Iterator[Finding]:
+def check_photo_folder(facts: Facts) -> Iterator[Finding]:
     """Yield findings about a folder of photographs without cameras: how to find them, and which files are left out."""
     count, damaged = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
@@ -68,33 +68,35 @@ def _capture(facts: Facts, readable: int) -> Iterator[Finding]:
         fault = f"there {_are(readable, 'photograph', 'only ')}, from which cameras are often not found"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
-        every = len(blank) == readable
-        fault = "no photograph shows anything" if every else f"{_are(len(blank), 'photograph')} black or of one color"
-        yield Finding("error" if every else "warning", f"{fault} ({_listed(blank)})", "export or take them again")
+        all_blank = len(blank) == readable
+        fault = (
+            "no photograph shows anything" if all_blank else f"{_are(len(blank), 'photograph')} black or of one color"
+        )
+        yield Finding("error" if all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
 
 MAX_NAMES = 4  # names in a finding
 MIN_VIEWS = 10  # for training
 MIN_POINTS = 100
-MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that may lack a pose without a warning
+MAX_LEFT_OUT = 0.1  # fraction of the photographs that may lack a pose without a warning
 MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
 POSES_ERROR = 1.0  # px, from which pipelines/photos.yaml optimizes poses
 POSES = "optimize.modules.camera_optimizer={start: 500}"
-MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # of points
-MIN_SHARE_KEPT = 0.6  # of a photograph
+MAX_BEHIND, MIN_IN_TWO = 0.1, 0.5  # of points
+MIN_KEPT = 0.6  # of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length / image width, 136 to 3 degrees
 
 
 def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
-    parts = (unprepared, _unreadable, _photographs, _comparison, _cameras, _poses, _points)
+    parts = (check_photo_folder, _unreadable, _photographs, _comparison, _cameras, _poses, _points)
     results = [finding for part in parts for finding in part(facts)]
     if facts.refusal and not facts.unplaced and not any(finding.level == "error" for finding in results):
         results.append(Finding("error", facts.refusal))
     return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
 
-def few_views(train: int) -> Iterator[Finding]:
+def check_view_count(train: int) -> Iterator[Finding]:
     """Yield a warning if a scene has few training views."""
     if train < MIN_VIEWS:
         fault = f"there {_are(train, 'training view', 'only ')}"
@@ -113,9 +115,9 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
         skip = ", or skip them with --set scene.missing=skip" if len(facts.missing) < facts.registered else ""
-        yield Finding("error", f"{fault} ({_listed(facts.missing)}){facts.hint}", f"restore the files{skip}")
+        yield Finding("error", f"{fault} ({_join(facts.missing)}){facts.hint}", f"restore the files{skip}")
     if photographs.unreadable:
-        unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
+        unreadable, reason = _join(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
         fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
     if photographs.no_content:
@@ -123,28 +125,28 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("error", fault, remedy)
     if photographs.blank:
         fault = f"{_are(len(photographs.blank), 'photograph')} black, of one color, or transparent"
-        yield Finding("warning", f"{fault} ({_listed(photographs.blank)})", "remove or export them again")
+        yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "remove or export them again")
     if photographs.cut:
-        fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
+        fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_join(photographs.cut)})"
         yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
-        fault = f"{_are(len(sizes), 'image file')} not the size of the camera ({_listed(sizes, 2)})"
+        fault = f"{_are(len(sizes), 'image file')} not the size of the camera ({_join(sizes, 2)})"
         remedy = "use the images that the cameras were calibrated on"
         if len(photographs.on_side) == len(sizes):
             remedy = "width and height are swapped: " + remedy
         yield Finding("error", fault, remedy)
     if facts.unregistered:
-        share = len(facts.unregistered) / facts.on_disk
+        fraction = len(facts.unregistered) / facts.on_disk
         fault = (
-            f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_listed(facts.unregistered)})"
+            f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_join(facts.unregistered)})"
         )
-        serious = colmap and facts.registered and share > MAX_SHARE_LEFT_OUT
+        is_serious = colmap and facts.registered and fraction > MAX_LEFT_OUT
         remedy = "they are not used for training" + (
             "; more overlapping photographs or colmap exhaustive_matcher may register them" if colmap else ""
         )
         if facts.registered:
-            yield Finding("warning" if serious else "note", fault, remedy)
+            yield Finding("warning" if is_serious else "note", fault, remedy)
     if photographs.exif_turned:
         fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by EXIF"
         yield Finding(
@@ -160,17 +162,17 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
 def _comparison(facts: Facts) -> Iterator[Finding]:
     blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
-        fault = f"{_are(len(blurred), 'photograph')} blurred ({_listed(blurred)})"
+        fault = f"{_are(len(blurred), 'photograph')} blurred ({_join(blurred)})"
         yield Finding("warning", fault, "remove or retake them: the model learns the blur")
     for names in facts.comparison.same[:MAX_NAMES]:
-        yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
+        yield Finding("note", f"{_join(names)} look the same", "one of them is enough")
     if jumps:
-        named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
-        fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({named})"
+        examples = _join([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
+        fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({examples})"
         yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own exposure")
     if steps := facts.comparison.steps:
-        named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
-        fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
+        examples = _join([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
+        fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({examples})"
         remedy = (
             "EXIF lacks an exposure; if it changed, --set optimize.modules.exposure={} gives each photograph its own"
         )
@@ -189,7 +191,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
             yield Finding("warning", fault, "calibrate it again, or compute the poses with the correct focal length")
         if not camera.centered:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
-        if camera.kept < MIN_SHARE_KEPT:
+        if camera.kept < MIN_KEPT:
             fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"
             yield Finding(
                 "warning", fault, "use a lens with less distortion, or crop and undistort the images yourself"
@@ -197,15 +199,15 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
 
 
 def _poses(facts: Facts) -> Iterator[Finding]:
-    used, *others = facts.submodels or {"": 0}
-    if others:
-        parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in others)
-        large = any(facts.submodels[name] > MAX_SHARE_LEFT_OUT * facts.submodels[used] for name in others)
+    used, *unused = facts.submodels or {"": 0}
+    if unused:
+        parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in unused)
+        large = any(facts.submodels[name] > MAX_LEFT_OUT * facts.submodels[used] for name in unused)
         fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
         remedy = f"not used: {parts}; colmap model_merger may merge models that share images"
         yield Finding("warning" if large else "note", fault, remedy)
     if facts.train is not None:
-        yield from few_views(facts.train)
+        yield from check_view_count(facts.train)
     if facts.test == 0:
         yield Finding("note", "there are no test views", "quality is measured on training views only")
     if facts.same_center:
@@ -213,18 +215,18 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "they show no depth; take photographs from different positions")
     if facts.outlier_cameras:
         fault = (
-            f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_listed(facts.outlier_cameras)})"
+            f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_join(facts.outlier_cameras)})"
         )
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or register it again"
         )
     for names in facts.same_pose[:MAX_NAMES] if not facts.same_center else ():
-        fault = f"{_listed(names)} have exactly the same pose"
+        fault = f"{_join(names)} have exactly the same pose"
         yield Finding("note", fault, "if they are copies of one photograph, training counts it twice; keep one of them")
     if facts.few_points:
         counts = [f"{name}: {facts.points_per_view[name]}" for name in facts.few_points]
         verb = "shows" if len(counts) == 1 else "show"
-        fault = f"{pluralize(len(counts), 'view')} {verb} fewer than {MIN_SEEN} points ({_listed(counts)})"
+        fault = f"{pluralize(len(counts), 'view')} {verb} fewer than {MIN_SEEN} points ({_join(counts)})"
         yield Finding("warning", fault, "the poses are unreliable; check the renders, or remove these images")
 
 
@@ -257,19 +259,19 @@ def _points(facts: Facts) -> Iterator[Finding]:
 
 def _coverage(points: PointFacts) -> Iterator[Finding]:
     axes = "the poses do not match these points, or their axes are flipped; export both again together"
-    if points.behind is not None and points.behind > MAX_SHARE_BEHIND:
+    if points.behind is not None and points.behind > MAX_BEHIND:
         yield Finding("warning", f"{100 * points.behind:.0f} % of the points are behind all cameras", axes)
-    elif points.in_two is not None and points.in_two < MIN_SHARE_IN_TWO:
+    elif points.in_two is not None and points.in_two < MIN_IN_TWO:
         yield Finding("warning", f"only {100 * points.in_two:.0f} % of the points project into two or more views", axes)
 
 
-def _are(count: int, word: str, before: str = "") -> str:
+def _are(count: int, word: str, prefix: str = "") -> str:
     """Return a count with its verb: `3 views are`, or with `before`: `are only 3 views`."""
     verb = "is" if count == 1 else "are"
-    return f"{verb} {before}{pluralize(count, word)}" if before else f"{pluralize(count, word)} {verb}"
+    return f"{verb} {prefix}{pluralize(count, word)}" if prefix else f"{pluralize(count, word)} {verb}"
 
 
-def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
+def _join(names: Sequence[str], limit: int = MAX_NAMES) -> str:
     return ", ".join(map(shorten, names[:limit])) + (", …" if len(names) > limit else "")
 
 
@@ -290,12 +292,12 @@ class Inspection:
 
     @property
     def trainable(self) -> bool:
-        """Whether it can be trained on as it is: photographs without cameras cannot."""
+        """Whether the dataset can be trained on as it is; photographs without cameras cannot."""
         return self.next_step is None and all(finding.level != "error" for finding in self.findings)
 
     @property
     def next_step(self) -> str | None:
-        """What finds the cameras of photographs that have none; None for other datasets and unusable photographs."""
+        """How to get cameras for photographs without cameras; None for other datasets and unusable photographs."""
         facts = self.facts
         if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
             return None
@@ -305,7 +307,7 @@ class Inspection:
 
     @property
     def verdict(self) -> str:
-        """The findings in one sentence: the first error or warning, and the number of the others."""
+        """The findings in one sentence: the first error or warning, and the number of others."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
         worst, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
         more = f" (and {pluralize(len(worst) - 1, f'more {kind}')})" if len(worst) > 1 else ""
@@ -370,8 +372,8 @@ def summarize(facts: Facts) -> dict[str, str]:
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """Return what there is, with the number of photographs if there are several kinds."""
-    return _listed([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
+    """Return the keys as text, with their counts if there are several."""
+    return _join([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
 
 
 def camera_line(camera: CameraFacts) -> str:

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from clsplat.opencl.device import Array, Device
-from clsplat.scene.quality import background_shows
+from clsplat.scene.quality import has_visible_background
 from clsplat.scene.scene import Scene
 from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
@@ -27,7 +27,7 @@ class RandomBackground(TrainingModule):
     """`transparent`: only if the photographs have transparent pixels."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
-        return self.when == "always" or (scene is not None and background_shows(scene))
+        return self.when == "always" or (scene is not None and has_visible_background(scene))
 
     def create_state(self, run: Run) -> ModuleState:
         if self.when == "transparent":

@@ -21,7 +21,7 @@ from clsplat.formats.splats import is_timestamp
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
-from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of
+from clsplat.scene.transforms_json import JsonFrame, read_pose
 from clsplat.scene.view import View
 from clsplat.viewer.video.paths import (
     MAX_FRAMES,
@@ -79,7 +79,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.where}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
         matrix = {"transform_matrix": _rows(entry.get("camera_to_world"))}
-        pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
+        pose = np.linalg.inv(read_pose(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
             raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1; export the path again")
