@@ -1,11 +1,11 @@
 /* Adam's update of every parameter.
  *
- * adam_step reads gradients from memory.  update_gaussians computes the gradients of projection itself, which saves
- * writing and reading 59 values for each Gaussian; it gives the same bits as project_backward and adam_step.
+ * adam_step reads gradients from memory.  update_gaussians computes the gradients of the projection itself, which saves
+ * writing and reading 59 values per Gaussian; it gives the same bits as project_backward and adam_step.
  *
- * `every` is all ones where each Gaussian is updated, and 0 where culled ones keep values and moments.
- * `undrawn` is all ones where vectors without a Gaussian in the view are updated at once, and 0 where their harmonics
- * wait (deferred.cl).
+ * `every`: all ones to update all Gaussians; 0: culled Gaussians keep values and moments.
+ * `undrawn`: all ones to update vectors without a Gaussian in the view at once; 0: their harmonics are updated later
+ * (deferred.cl).
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
@@ -41,7 +41,7 @@ void adam_step(
                 EPSILON);
 }
 
-/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]; waiting: a bit for each vector to leave out. */
+/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]; waiting: a bit for each vector to skip. */
 static inline void update_plane(__global float *values, __global float *moment1, __global float *moment2,
                                 const uint *first, const VF *gradient, const gradient_t *g, const VI *updated,
                                 const uint vectors, const uint waiting, const float rate, const float correction2)
@@ -52,7 +52,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
                         g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2, EPSILON);
 }
 
-/* Update plane `plane` of a table, with the member `member` of the block's gradients. */
+/* Update plane `plane` of a table from the member `member` of the block's gradients. */
 #define UPDATE(table, plane, member) UPDATE_BUT(0, first, stride, table, plane, member)
 #define UPDATE_BUT(waiting, first, stride, table, plane, member)                                              \
     do {                                                                                                      \
@@ -66,8 +66,8 @@ static inline void update_plane(__global float *values, __global float *moment1,
 
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
- * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs; those in which none is
- * updated are left out.  Private memory: VECTORS * LANES * 204 bytes. */
+ * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs; vectors without an
+ * updated Gaussian are skipped.  Private memory: VECTORS * LANES * 204 bytes. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(
     __global float *restrict means,                  // [3,S] scene units
@@ -110,7 +110,7 @@ void update_gaussians(
     const float sh_base_correction2,
     const float sh_rest_correction2,
     const uint degree,
-    const uint sh_rest_degree,                       // up to which bands are updated: 0 or `degree`
+    const uint sh_rest_degree,                       // of the bands to update: 0 or `degree`
     const uint every,
     const uint undrawn,
     const uint sh_block,                             // values of a block in a slot
@@ -120,34 +120,34 @@ void update_gaussians(
     const uint i = get_global_id(0) * LANES * VECTORS;
     if (i >= count)
         return;
-    uint first[VECTORS], kept = 0, unseen = 0;
+    uint first[VECTORS], active = 0, unseen = 0;
     gradient_t g[VECTORS];
     VI updated[VECTORS];
     VF weights[VECTORS][16];
     for (uint v = 0; v < VECTORS && i + v * LANES < count; v++) {
         const uint at = i + v * LANES;
-        color_backward(splats, pixel_sums, stride, count, at, g + kept);
-        first[kept] = at;
-        updated[kept] = g[kept].touched | (VI)((int)every);
-        if (ANY(updated[kept])) {
-            unseen |= (ANY(g[kept].touched) ? 0u : 1u) << kept;
-            kept++;
+        color_backward(splats, pixel_sums, stride, count, at, g + active);
+        first[active] = at;
+        updated[active] = g[active].touched | (VI)((int)every);
+        if (ANY(updated[active])) {
+            unseen |= (ANY(g[active].touched) ? 0u : 1u) << active;
+            active++;
         } else {
             for (uint k = 0; k < 2; k++)
                 VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
         }
     }
-    if (kept == 0)
+    if (active == 0)
         return;
-    const uint vectors = kept < VECTORS ? kept : VECTORS;  // where VECTORS is 1, compilers see that it is 1 here
+    const uint vectors = active < VECTORS ? active : VECTORS;  // so that compilers know it is 1 if VECTORS is 1
 #if SH_SLOTS
-    uint rest[VECTORS];
+    uint sh_index[VECTORS];
     for (uint v = 0; v < vectors; v++)
-        rest[v] = sh_first(sh_slot, sh_block, first[v]);
+        sh_index[v] = sh_first(sh_slot, sh_block, first[v]);
 #else
-    const uint *rest = first;
+    const uint *sh_index = first;
 #endif
-    weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, rest, weights);
+    weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, sh_index, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = first[v];
         if ((unseen >> v) & 1) {
@@ -172,6 +172,6 @@ void update_gaussians(
         UPDATE(sh_base, channel, basis[0] * g[v].color[channel]);
     for (uint k = 1; k < (sh_rest_degree + 1) * (sh_rest_degree + 1); k++)
         for (uint channel = 0; channel < 3; channel++)
-            UPDATE_BUT(unseen & ~undrawn, rest, SH_STRIDE(stride), sh_rest, (k - 1) * 3 + channel,
+            UPDATE_BUT(unseen & ~undrawn, sh_index, SH_STRIDE(stride), sh_rest, (k - 1) * 3 + channel,
                        basis[k] * g[v].color[channel]);
 }

@@ -1,13 +1,12 @@
 /* Adam (Kingma and Ba 2015) in the form that 3DGS uses: epsilon outside the root; the host computes the factors of the
- * bias correction; moments of Gaussians without a gradient decay as all others do, unless only those that the view sees
- * are updated. */
+ * bias correction; moments of Gaussians without a gradient decay too, unless only Gaussians in the view are updated. */
 #ifndef CLSPLAT_ADAM_H
 #define CLSPLAT_ADAM_H
 #include "lanes.h"
 
 #define BETA1 0.9f
 #define BETA2 0.999f
-#define EPSILON 1.0e-15f  // of 3DGS
+#define EPSILON 1.0e-15f  // as in 3DGS
 #define ALL_LANES ((VI)(-1))
 
 /* One update of LANES values and their moments.  rate: learning rate / (1 - BETA1^t);

@@ -3,7 +3,7 @@
  * Deterministic: each value has one writer. */
 #include "splat.h"
 
-/* Add the values to their averages; `number` stays. */
+/* Add the values to their averages; `number` is unchanged. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void add_to_average(
     __global const float *restrict values,  // [components,S]
@@ -29,7 +29,7 @@ void count_step(
         number[i] += 1.0f;
 }
 
-/* Replace the values of rows that have an average by it. */
+/* Replace values by their averages, in rows that have one. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void take_average(
     __global float *restrict values,         // [components,S]

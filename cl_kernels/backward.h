@@ -1,6 +1,6 @@
 /* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and color.
- * It computes the values of the forward pass again.  Both kernels that update parameters use it, so they give the same
- * bits. */
+ * The values of the forward pass are recomputed.  Both kernels that update parameters use this file, so they give the
+ * same bits. */
 #ifndef CLSPLAT_BACKWARD_H
 #define CLSPLAT_BACKWARD_H
 #include "gaussian.h"
@@ -23,8 +23,8 @@ static inline VF view_direction(
     return inverse;
 }
 
-/* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and that by a factor
- * of both focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change. */
+/* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and of a factor on both
+ * focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change. */
 static inline void shape_backward(
     const shape_t *s, __constant camera_t *camera,
     const VF *m,  // [PIXEL_SUMS] see splat.h
@@ -106,16 +106,16 @@ static inline void shape_backward(
     *grad_focal = jx * (s->x * gu + j00) + jy * (s->y * gv + j11) + s->ray_x * ray_x + s->ray_y * ray_y;
 }
 
-/* Gradients of everything but the coefficients of harmonics: those are basis[k] * color[channel]. */
+/* Gradients of all parameters except SH coefficients, whose gradients are basis[k] * color[channel]. */
 typedef struct {
-    VI touched;      // whether the Gaussian is visible; if not, all gradients are zero and these values invalid
+    VI touched;      // whether the Gaussian is visible; if not, all gradients are zero and these values are invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
-    VF focal;        // of the logarithm of both focal lengths
+    VF focal;        // of the logarithm of a factor on both focal lengths
     VF basis[16], color[3];
 } gradient_t;
 
-/* Which Gaussians were drawn, and the gradients of their colors. */
+/* Which Gaussians were rendered, and the gradients of their colors. */
 static inline void color_backward(
     __global const float *splats,      // [N,RECORD] see splat.h
     __global const float *pixel_sums,  // [PIXEL_SUMS,S] see splat.h
@@ -131,9 +131,9 @@ static inline void color_backward(
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
-/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics start
- * at each of `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing
- * is visible; its harmonics are not read. */
+/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics start at
+ * `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector without a visible Gaussian,
+ * whose harmonics are not read. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // coefficient-major, see slots.h
     const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,

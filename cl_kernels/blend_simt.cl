@@ -7,7 +7,7 @@
 #if INVERSE_DEPTH
 #define QUADS 4       // of four floats: the whole splat record
 #else
-#define QUADS 3       // of four floats: what blending reads of a splat record
+#define QUADS 3       // of four floats: the part of a splat record that blending reads
 #endif
 
 /* Load a record in aligned quads; in three, the last field is SPLAT_POWER_MIN (or BOX_TURNED, in its place) instead of
@@ -127,11 +127,11 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
         record[k] = vload4(k, sums);
 }
 
-/* One item owns one splat of a batch of PIXELS and adds the tile's pixels one after another: at step s, item i computes
- * pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to back.
- * After the last pixel, an item writes its sums and continues with its splat of the next batch, without waiting.
- * No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture or the entropy, 80 with
- * both, 92 with inverse depths, 96 with a texture too.  Deterministic. */
+/* One item owns one splat of a batch of PIXELS and adds up the tile's pixels one after another: at step s, item i
+ * computes pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to
+ * back.  After the last pixel, an item writes its sums and continues with its splat of the next batch, without
+ * waiting.  No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture or the
+ * entropy, 80 with both, 92 with inverse depths, 96 with a texture too.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]

@@ -1,5 +1,5 @@
 /* Blending for CPUs: one item = one tile, LANES pixels of a row at a time; the forward pass blends two vectors of
- * pixels together, so that their chains of transmittance overlap.  Kerbl et al. 2023, eq. 3; the formulas are in
+ * pixels together, so that their dependent transmittances overlap.  Kerbl et al. 2023, eq. 3; the formulas are in
  * splat.h. */
 #include "rows.h"
 
@@ -98,7 +98,7 @@ void blend_forward(
         }
 }
 
-/* Two vectors to one: of each part of theirs, the lower lanes plus the upper ones. */
+/* Fold two vectors into one: the lower lanes of each part plus the upper ones. */
 #define FOLD(a, b, low, high) ((VF)((a).low, (b).low) + (VF)((a).high, (b).high))
 #if LANES == 16
 #define FOLD_TWICE(a, b, c, d) FOLD(FOLD(a, b, lo, hi), FOLD(c, d, lo, hi), s012389ab, s4567cdef)
@@ -228,7 +228,7 @@ void blend_backward(
         const uint length = last - begin < SEGMENT ? last - begin : SEGMENT;
         float16 segment[SEGMENT];
         uint pairs[SEGMENT];
-        for (uint j = 0; j < length; j++) {  // together, so that their waits for memory overlap
+        for (uint j = 0; j < length; j++) {  // in one loop, so that waits for memory overlap
             pairs[j] = tile_pairs[begin + j];
             segment[j] = records[pair_splat[pairs[j]]];
         }

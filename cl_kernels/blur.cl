@@ -1,5 +1,4 @@
-/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge
- * nor a mask darkens it.
+/* A Gaussian blur of an image: the weighted mean of the pixels that count, so that neither edges nor a mask darken it.
  *
  *   blurred(x) = sum_k w(k) m(x + k) v(x + k) / sum_k w(k) m(x + k),  w(k) = exp(-k^2 / (2 sigma^2)),  |k| <= reach
  *
@@ -7,10 +6,10 @@
  * denominator.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
 #include "common.h"
 
-/* w of the distance between two rows or columns. */
-static inline float weight_of(const uint one, const uint other, const float falloff)
+/* The weight w of the distance between two rows or columns. */
+static inline float weight_of(const uint a, const uint b, const float falloff)
 {
-    const float distance = (float)one - (float)other;
+    const float distance = (float)a - (float)b;
     return exp(-falloff * distance * distance);
 }
 

@@ -4,7 +4,7 @@
  * so the count does not depend on the order of the items. */
 #include "common.h"
 
-/* counter += values of the table that are NaN or infinite. */
+/* Add the number of values that are NaN or infinite to the counter. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void count_not_finite(
     __global const float *restrict values,  // [components,S]

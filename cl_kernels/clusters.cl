@@ -1,13 +1,13 @@
-/* The vector of a palette that is most alike each point: that with the largest product.
+/* The vector of a palette that is most similar to each point: the one with the largest dot product.
  *
  * The products of a point are summed in the order of its components.  No local memory.  Deterministic. */
 #include "lanes.h"
 
 #define FARTHEST 3.0e38f  // beyond all products
-#define TOGETHER 8        // vectors that an item compares with its points together, in registers
+#define TOGETHER 8        // vectors that an item compares with its points at once, in registers
 
-/* Continue with some of the vectors: the ones from `first` on, few enough to stay in a cache.  Of vectors with equal
- * products the first counts; 0 for a point that is not a number.  One item = LANES points. */
+/* Compare with the vectors from `first` to `end`, few enough to stay in a cache.  The first of vectors with equal
+ * products wins; 0 for a point that is NaN.  One item = LANES points. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void most_alike(
     __global const float *restrict points,   // [components,S]
@@ -24,7 +24,7 @@ void most_alike(
     if (i >= count)
         return;
     VF best = first == 0 ? (VF)(-FARTHEST) : VLOAD(largest + i);
-    VF found = first == 0 ? (VF)(0.0f) : VLOAD(label + i);
+    VF best_label = first == 0 ? (VF)(0.0f) : VLOAD(label + i);
     for (uint e = first; e < end; e += TOGETHER) {
         __global const float *v = vectors + (size_t)e * components;
         VF product[TOGETHER];
@@ -38,9 +38,9 @@ void most_alike(
         for (uint j = 0; j < TOGETHER; j++) {
             const VI larger = product[j] > best;
             best = larger ? product[j] : best;
-            found = larger ? (VF)((float)(e + j)) : found;
+            best_label = larger ? (VF)((float)(e + j)) : best_label;
         }
     }
     VSTORE(best, largest + i);
-    VSTORE(found, label + i);
+    VSTORE(best_label, label + i);
 }

@@ -23,7 +23,7 @@ static inline VF hat(const VF distance)
     return near > 0.0f ? near : (VF)(0.0f);
 }
 
-/* The derivative of `hat`: that of the next interval at a node. */
+/* The derivative of `hat`; at a node, that of the next interval. */
 static inline VF hat_slope(const VF distance)
 {
     const VF one = (VF)(1.0f), zero = (VF)(0.0f);
@@ -40,8 +40,8 @@ static inline VF level_of(const VF luminance, const uint nz)
     return smaller(larger(luminance, (VF)(0.0f)), (VF)(1.0f)) * (float)(nz - 1);
 }
 
-/* The positions of LANES pixels starting at one, in nodes; per_pixel: (n - 1) / pixels of the axis. */
-static inline VF places_of(const uint first, const float per_pixel)
+/* The positions of LANES pixels from `first` on, in nodes; per_pixel: (n - 1) / pixels of the axis. */
+static inline VF node_positions(const uint first, const float per_pixel)
 {
     return (to_VF(LANE_INDEX + (int)first) + 0.5f) * per_pixel;
 }
@@ -59,27 +59,27 @@ static inline uint end_of_node(const uint node, const uint nodes, const uint pix
 
 /* The grid interpolated at a row of pixels, [ENTRIES,nz,nx]; all items of a group write it together. */
 static inline void grid_of_row(
-    __global const float *grid, __local float *found, const uint nx, const uint ny, const uint nz, const uint y,
+    __global const float *grid, __local float *row_grid, const uint nx, const uint ny, const uint nz, const uint y,
     const float per_row)
 {
-    const float place = ((float)y + 0.5f) * per_row;
-    const uint above = min((uint)place, ny - 1), below = min(above + 1, ny - 1);
-    const float share = place - (float)above;
+    const float position = ((float)y + 0.5f) * per_row;
+    const uint above = min((uint)position, ny - 1), below = min(above + 1, ny - 1);
+    const float fraction = position - (float)above;
     for (uint e = get_local_id(0); e < ENTRIES * nz * nx; e += TEAM) {
         const uint level = e / nx;
         __global const float *column = grid + level * (ny - 1) * nx + e;
-        found[e] = (1.0f - share) * column[above * nx] + share * column[below * nx];
+        row_grid[e] = (1.0f - fraction) * column[above * nx] + fraction * column[below * nx];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* The matrices of LANES pixels starting at x, `a`, from the grid of their row, and their derivatives by the level,
- * `slopes`; a null pointer: not needed. */
+/* The matrices `a` of LANES pixels from x on, from the grid of their row, and their derivatives by the level, `slopes`,
+ * unless that is a null pointer. */
 static inline void matrices_of(
     __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level,
     VF *a, VF *slopes)
 {
-    const VF place = places_of(x, per_column);
+    const VF position = node_positions(x, per_column);
     const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);
     for (uint n = 0; n < ENTRIES; n++) {
         a[n] = (VF)(0.0f);
@@ -88,7 +88,7 @@ static inline void matrices_of(
     }
     for (uint i = (uint)(((float)x + 0.5f) * per_column); i <= last; i++)
         for (uint k = 0; k < nz; k++) {
-            const VF near = hat(place - (float)i);
+            const VF near = hat(position - (float)i);
             const VF weight = near * hat(level - (float)k), slope = near * hat_slope(level - (float)k);
             for (uint n = 0; n < ENTRIES; n++) {
                 a[n] += weight * grid[(n * nz + k) * nx + i];
@@ -98,7 +98,7 @@ static inline void matrices_of(
         }
 }
 
-/* Change the colors.  One group of TEAM items = one row.  Local memory: ENTRIES * MOST_NODES^2 * 4 bytes. */
+/* Transform the colors.  One group of TEAM items = one row.  Local memory: ENTRIES * MOST_NODES^2 * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_forward(
     __global const float *restrict image,   // [channels,H',stride] 3 or 4 channels
@@ -133,15 +133,15 @@ void color_grid_forward(
     }
 }
 
-/* The gradient of the image, through the matrix and through the luminance at which it is read, and the part of the
- * gradient that passed the clamp.  As color_grid_forward. */
+/* The gradient of the image, through the matrix and through the luminance at which it is interpolated, and the part of
+ * the gradient that passes the clamp.  As color_grid_forward. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_backward(
-    __global const float *restrict image,     // [channels,H',stride] before the change
+    __global const float *restrict image,     // [channels,H',stride] before the transform
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
-    __global const float *restrict gradient,  // [channels,H',stride] by the changed image, zero outside the image
+    __global const float *restrict gradient,  // [channels,H',stride] of the transformed image, zero outside the image
     __global float *restrict grad_image,      // [channels,H',stride]
-    __global float *restrict passed,          // [3,H',stride] the gradient where nothing is cut
+    __global float *restrict passed,          // [3,H',stride] the gradient where nothing is clamped
     const uint first,                         // value of the photograph
     const uint nx,
     const uint ny,
@@ -166,8 +166,8 @@ void color_grid_backward(
         matrices_of(grid, nx, nz, x, per_column, level, a, s);
         VF p[3], grad_level = zero;
         for (uint c = 0; c < 3; c++) {
-            const VF own = c == 0 ? r : c == 1 ? g : b;
-            const VF changed = own + (a[4 * c] * r + a[4 * c + 1] * g + a[4 * c + 2] * b + a[4 * c + 3]);
+            const VF value = c == 0 ? r : c == 1 ? g : b;
+            const VF changed = value + (a[4 * c] * r + a[4 * c + 1] * g + a[4 * c + 2] * b + a[4 * c + 3]);
             p[c] = (changed < 1.0f ? inside : zero) * VLOAD(gradient + c * plane + at);
             VSTORE(p[c], passed + c * plane + at);
             grad_level += p[c] * (s[4 * c] * r + s[4 * c + 1] * g + s[4 * c + 2] * b + s[4 * c + 3]);
@@ -188,7 +188,7 @@ void color_grid_backward(
  * One group of TEAM items = one column of nodes in one row of pixels.  Local memory: ENTRIES * TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_row_sums(
-    __global const float *restrict image,   // [3 or 4,H',stride] before the change
+    __global const float *restrict image,   // [3 or 4,H',stride] before the transform
     __global const float *restrict passed,  // [3,H',stride] of color_grid_backward
     __global float *restrict row_sums,      // [ENTRIES,nz,nx,H']
     const uint nx,
@@ -209,7 +209,7 @@ void color_grid_row_sums(
             const uint at = y * stride + x;
             const VF r = VLOAD(image + at), g = VLOAD(image + plane + at), b = VLOAD(image + 2 * plane + at);
             const VF level = level_of(luminance_of(r, g, b), nz);
-            const VF weight = hat(places_of(x, per_column) - (float)i) * hat(level - (float)k);
+            const VF weight = hat(node_positions(x, per_column) - (float)i) * hat(level - (float)k);
             for (uint c = 0; c < 3; c++) {
                 const VF part = weight * VLOAD(passed + c * plane + at);
                 total[4 * c] += part * r;
@@ -231,7 +231,7 @@ void color_grid_row_sums(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_gather(
     __global const float *restrict row_sums,  // [ENTRIES,nz,nx,H']
-    __global float *restrict grad_grid,         // [ENTRIES,nz,ny,nx]
+    __global float *restrict grad_grid,       // [ENTRIES,nz,ny,nx]
     const uint nx,
     const uint ny,
     const float per_row,                      // (ny - 1) / height

@@ -1,15 +1,15 @@
-/* The grids of all photographs (color_grid.cl): how smooth one is, its update, and their mean.
+/* The grids of all photographs (color_grid.cl): smoothness and update of one grid, and the mean of all.
  *
  * The smoothness of a grid is, for each axis, the mean of the squared differences of neighboring nodes, times a weight
- * (the total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], which is not always a multiple of a vector,
- * so that an item has one value.  Deterministic. */
+ * (the total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], whose length may not be a multiple of a
+ * vector, so an item has one value.  Deterministic. */
 #undef LANES
 #define LANES 1
 #include "adam.h"
 #include "color_grid.h"
 #include "planes.h"
 
-/* The gradient of the smoothness of a photograph's grid, and the share of each value in it: the differences to the next
+/* The gradient of the smoothness of a photograph's grid, and the term of each value: the differences to the next
  * nodes.  One item = one value. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_smoothness(
@@ -64,29 +64,29 @@ void color_grid_update(
                 EPSILON);
 }
 
-/* Subtract from each entry at each level of luminance its mean over photographs and positions: a change of color that
- * all photographs share everywhere belongs to the model.  One group of TEAM items = one entry at one level.
+/* Subtract from each entry at each level of luminance its mean over photographs and positions: a color change that all
+ * photographs share everywhere belongs to the model.  One group of TEAM items = one entry at one level.
  * Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_center(
-    __global float *restrict values,  // [photographs,ENTRIES * nz,places]
-    const uint places,                // ny * nx
+    __global float *restrict values,  // [photographs,ENTRIES * nz,positions]
+    const uint positions,             // ny * nx
     const uint photographs)
 {
     __local float sums[TEAM];
-    const uint item = get_local_id(0), each = get_num_groups(0) * places;  // values of a photograph
-    __global float *own = values + get_group_id(0) * places;
+    const uint item = get_local_id(0), photograph_stride = get_num_groups(0) * positions;  // values of a photograph
+    __global float *entries = values + get_group_id(0) * positions;
     float total = 0.0f;
     for (uint p = item; p < photographs; p += TEAM) {
         float sum = 0.0f;
-        for (uint i = 0; i < places; i++)
-            sum += own[p * each + i];
+        for (uint i = 0; i < positions; i++)
+            sum += entries[p * photograph_stride + i];
         total += sum;
     }
     sums[item] = total;
     barrier(CLK_LOCAL_MEM_FENCE);
-    const float mean = sum_items(sums) / ((float)places * (float)photographs);
+    const float mean = sum_items(sums) / ((float)positions * (float)photographs);
     for (uint p = item; p < photographs; p += TEAM)
-        for (uint i = 0; i < places; i++)
-            own[p * each + i] -= mean;
+        for (uint i = 0; i < positions; i++)
+            entries[p * photograph_stride + i] -= mean;
 }

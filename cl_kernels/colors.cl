@@ -1,18 +1,18 @@
 /* The colors of one photograph: y = min(1, E c + b) for every pixel c, with a matrix [E | b] per photograph, and its
  * gradient.
  *
- * Values are clamped at white, as in a photograph, but not at black, where a pixel below it would have no gradient.
+ * Values are clamped at white, as in a photograph, but not at black, since darker pixels would have no gradient.
  * Clamped values pass no gradient.  A fourth plane of the image is copied.  Planes are [channels,H',W'] with H', W'
  * whole tiles, zero outside the image.  One group of TEAM items = one row; each sum is written once.  Deterministic. */
 #include "planes.h"
 
 #define SUMS 12  // gradients of the matrix [E | b], row by row
 
-/* Change the colors.  No local memory. */
+/* Transform the colors.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void colors_forward(
     __global const float *restrict image,  // [channels,H',stride] 3 or 4 channels
-    __global float *restrict colored,     // [channels,H',stride]
+    __global float *restrict colored,      // [channels,H',stride]
     const float rr, const float rg, const float rb, const float r1,  // the matrix: y_red = rr red + rg green + ...
     const float gr, const float gg, const float gb, const float g1,
     const float br, const float bg, const float bb, const float b1,
@@ -40,8 +40,8 @@ void colors_forward(
  * Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void colors_backward(
-    __global const float *restrict image,     // [channels,H',stride] before the change
-    __global const float *restrict gradient,  // [channels,H',stride] by the changed image, zero outside the image
+    __global const float *restrict image,     // [channels,H',stride] before the transform
+    __global const float *restrict gradient,  // [channels,H',stride] of the transformed image, zero outside
     __global float *restrict grad_image,      // [channels,H',stride]
     __global float *restrict row_sums,        // [SUMS,H']
     const float rr, const float rg, const float rb, const float r1,

@@ -5,7 +5,7 @@
 #ifndef CLSPLAT_COMMON_H
 #define CLSPLAT_COMMON_H
 
-/* ---- names the host may set; nothing else is ever passed with -D ---- */
+/* ---- names that the host may set; nothing else is passed with -D ---- */
 #ifndef LANES
 #define LANES 16  // Gaussians or pixels per item: 16 or 8 on CPUs, 1 on GPUs
 #endif
@@ -31,7 +31,7 @@
 #define SORT_CAPACITY 1024  // pairs of a tile that the bitonic sort holds in local memory, 8 bytes each
 #endif
 #ifndef PIXEL_SUMS
-#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 where a density statistic needs more
+#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 if a density statistic needs more
 #endif
 #ifndef PIXEL_BOX
 #define PIXEL_BOX 0  // 1: a splat is integrated over the box of each pixel (pixel_box.h)

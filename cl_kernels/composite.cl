@@ -1,10 +1,10 @@
-/* From the outputs of a network to the color of a ray, and back (Max 1995, as in Barron et al. 2021).
+/* From the outputs of a network to the color of a ray, and the gradient (Max 1995, as in Barron et al. 2021).
  *
  *   density of a sample s = softplus(raw - 1), color c = (1 + 2 p) sigmoid(raw) - p with p = 0.001
  *   weight w_k = T_k (1 - exp(-s_k e_k)), T_k+1 = T_k exp(-s_k e_k), e_k its length
  *   color of a ray = sum of w_k c_k + (1 - sum of w_k) background
  *
- * The loss of a ray is the squared difference from its pixel times a scale that its photograph has.  Back: with g_k =
+ * The loss of a ray is the squared difference from its pixel times a scale.  Backward: with g_k =
  * dL/dw_k, dL/d(s_k e_k) = T_k+1 g_k - (sum over j > k of w_j g_j), from the last sample to the first.
  *
  * One item = one ray.  No local memory. */
@@ -12,13 +12,13 @@
 
 #define DENSITY_BIAS (-1.0f)   // of the released code, which starts with nearly empty space
 #define COLOR_PADDING 0.001f  // lets colors reach 0 and 1
-#define DUST 1.0e-30f
+#define FLUSH_BELOW 1.0e-30f
 #define COLOR_ROWS 4          // rows of the network's colors, and of its densities: one block (layers.h)
 #define RAY_LENGTH 7           // of a ray's values: |d| (rays.cl)
 #define RAY_STEP 8
 
-/* Numbers that are nearly subnormal, with which some CPUs compute slowly, are zero; NaN stays. */
-static inline float without_dust(const float x) { return fabs(x) < DUST ? 0.0f : x; }
+/* Replace numbers that are nearly subnormal, which are slow on some CPUs, by zero; NaN stays. */
+static inline float flush_to_zero(const float x) { return fabs(x) < FLUSH_BELOW ? 0.0f : x; }
 
 static inline float density_of(const float raw)
 {
@@ -83,8 +83,8 @@ void composite_backward(
     __global const uint *restrict pixels,          // [counted] row * width + column
     __global float *restrict grad_colors,           // [T,COLOR_ROWS,SAMPLES]
     __global float *restrict grad_densities,         // [T,COLOR_ROWS,SAMPLES]
-    __global float *restrict errors,               // [step's rays] from first_ray on
-    const float scale,                             // of a ray's squared difference in the loss
+    __global float *restrict errors,               // [rays of the step] from first_ray on
+    const float scale,                             // factor on a ray's squared difference
     const uint first_ray,
     const uint width,
     const uint stride,
@@ -96,13 +96,13 @@ void composite_backward(
     const uint ray = get_global_id(0);
     if (ray >= rays)
         return;
-    const float own = ray < counted ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
+    const float counts = ray < counted ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
     const uint pixel = pixels[ray < counted ? ray : counted - 1];
-    __global const float *shown = photograph + pixel / width * stride + pixel % width, *t = edges + ray * (samples + 1);
+    __global const float *photo = photograph + pixel / width * stride + pixel % width, *t = edges + ray * (samples + 1);
     float grad_color[3], error = 0.0f;
     for (uint channel = 0; channel < 3; channel++) {
-        const float difference = colors[ray * 3 + channel] - shown[channel * plane];
-        grad_color[channel] = 2.0f * own * scale * difference;
+        const float difference = colors[ray * 3 + channel] - photo[channel * plane];
+        grad_color[channel] = 2.0f * counts * scale * difference;
         error += difference * difference;
     }
     if (ray < counted)
@@ -116,13 +116,13 @@ void composite_backward(
             const float raw = raw_colors[at + channel * SAMPLES], y = logistic(raw);
             grad_weight += grad_color[channel] * (color_of(raw) - background[channel]);
             grad_colors[at + channel * SAMPLES] =
-                without_dust(grad_color[channel] * weight * (1.0f + 2.0f * COLOR_PADDING) * y * (1.0f - y));
+                flush_to_zero(grad_color[channel] * weight * (1.0f + 2.0f * COLOR_PADDING) * y * (1.0f - y));
             grad_densities[at + (1 + channel) * SAMPLES] = 0.0f;
         }
         grad_colors[at + 3 * SAMPLES] = 0.0f;
         const float grad_depth = left[ray * samples + k] * grad_weight - behind;
         grad_densities[at] =
-            without_dust(grad_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
+            flush_to_zero(grad_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
         behind += weight * grad_weight;
     }
 }

@@ -1,7 +1,7 @@
 /* Deferred updates of harmonics by Adam, which wait until a view sees the Gaussian (adam.h).
  *
  * A Gaussian that a view does not show has a gradient of zero, so that its update depends only on its own value and
- * moments.  These updates are done later, in order, each with its own factors, and give the same bits as immediate
+ * moments.  These updates are applied later, in order, each with its own factors, and give the same bits as immediate
  * updates.  A block of LANES Gaussians is updated together; `done` counts how many updates of the list `factors` the
  * block has had, in which each update is (rate, correction2) as in adam.h.
  *
@@ -9,7 +9,7 @@
 #include "adam.h"
 #include "slots.h"
 
-/* Do the pending updates of the list, for the blocks in which the view sees a Gaussian.  `every`: all ones to update
+/* Apply the pending updates of the list to the blocks in which the view sees a Gaussian.  `every`: all ones to update
  * all blocks. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void replay_updates(
@@ -19,7 +19,7 @@ void replay_updates(
     __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled; one vector where `every`
     __global const float *restrict factors,   // [updates,2]
-    __global uint *restrict done,             // [S/LANES] updates of the list that the rows of a block have
+    __global uint *restrict done,             // [S/LANES] number of updates of the list that a block has had
     const uint every,
     const uint updates,
     const uint components,
@@ -33,11 +33,11 @@ void replay_updates(
     const VI seen = (VLOAD_INT(depth_key + (i & ~every)) != -1) | (VI)((int)every);
     if (!ANY(seen) || !sh_held(sh_slot, i))
         return;
-    const uint first = done[block], rest = sh_first(sh_slot, sh_block, i);
+    const uint first = done[block], sh_index = sh_first(sh_slot, sh_block, i);
     if (first >= updates)
         return;
     for (uint k = 0; k < components; k++) {
-        const uint at = k * SH_STRIDE(stride) + rest;
+        const uint at = k * SH_STRIDE(stride) + sh_index;
         VF value = VLOAD(values + at), m = VLOAD(moment1 + at), v = VLOAD(moment2 + at);
         for (uint u = first; u < updates; u++)
             adam_values(&value, &m, &v, (VF)(0.0f), factors[2 * u], factors[2 * u + 1], EPSILON);
@@ -56,7 +56,7 @@ void note_update(
     __global uint *restrict done,             // [S/LANES]
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
-    const uint update,                        // its place in the list
+    const uint update,                        // its index in the list
     const uint count)
 {
     const uint block = get_global_id(0);

@@ -3,12 +3,12 @@
  *   forward   y = larger(b + W^T x, lowest)               lowest: 0 for a ReLU, -FLT_MAX for none
  *   backward  dL/dx = W dL/dy, 0 where x <= lowest        dL/dW = sum over samples of x dL/dy^T,  dL/db of dL/dy
  *
- * A weight is at [input, output].  Each sum has one order: over rows, or over the samples of CHUNK tiles and then over
- * chunks; so there are no atomics, and no result depends on the number of threads.  No local memory. */
+ * A weight is at [input, output].  Each sum has a fixed order: over rows, or over the samples of CHUNK tiles and then
+ * over chunks.  So there are no atomics, and results do not depend on the number of threads.  No local memory. */
 #include "adam.h"
 #include "layers.h"
 
-/* One item = BLOCK outputs of BLOCK vectors of samples; the outputs of a tile follow each other. */
+/* One item = BLOCK outputs of BLOCK vectors of samples; the outputs of a tile are consecutive. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_forward(
     __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
@@ -36,19 +36,19 @@ void dense_forward(
             sums[k * BLOCK + v] = (VF)(biases[k]);
     multiply_rows(sums, inputs + (tile * input_rows + first_input) * SAMPLES + column, weights, 1, output_count,
                   input_count);
-    __global float *found = outputs + (tile * output_rows + output) * SAMPLES + column;
+    __global float *block = outputs + (tile * output_rows + output) * SAMPLES + column;
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
-            VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), found + k * SAMPLES + v * COLUMNS * LANES);
+            VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), block + k * SAMPLES + v * COLUMNS * LANES);
 }
 
-/* Gradients of derived_count inputs of a layer: those in the rows of `inputs` from first_input on, whose weights
- * start at first_parameter.  kept: 1 to add to the existing values, before the gate; else 0.
+/* Gradients of derived_count inputs of a layer, in the rows of `inputs` from first_input on, whose weights start at
+ * first_parameter.  kept: 1 to add to the existing values, before the gate; else 0.
  * One item = BLOCK inputs of BLOCK vectors of samples. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_backward(
     __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
-    __global const float *restrict parameters,  // [P] at first_parameter: weights [derived_count,output_count]
+    __global const float *restrict parameters,    // [P] at first_parameter: weights [derived_count,output_count]
     __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
     __global float *restrict grad_inputs,         // [T,derived_count,SAMPLES]
     const uint first_parameter,
@@ -66,18 +66,18 @@ void dense_backward(
         return;
     const uint blocks = derived_count / BLOCK, column = i % COLUMNS * LANES;
     const uint input = i / COLUMNS % blocks * BLOCK, tile = i / (COLUMNS * blocks);
-    __global float *found = grad_inputs + (tile * derived_count + input) * SAMPLES + column;
+    __global float *block = grad_inputs + (tile * derived_count + input) * SAMPLES + column;
     __global const float *gate = inputs + (tile * input_rows + first_input + input) * SAMPLES + column;
     VF sums[BLOCK * BLOCK];
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
-            sums[k * BLOCK + v] = kept ? VLOAD(found + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
+            sums[k * BLOCK + v] = kept ? VLOAD(block + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
     multiply_rows(sums, grad_outputs + tile * output_rows * SAMPLES + column,
                   parameters + first_parameter + input * output_count, output_count, 1, output_count);
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++) {
             const uint at = k * SAMPLES + v * COLUMNS * LANES;
-            VSTORE((VLOAD(gate + at) <= lowest ? (VF)(0.0f) : sums[k * BLOCK + v]), found + at);
+            VSTORE((VLOAD(gate + at) <= lowest ? (VF)(0.0f) : sums[k * BLOCK + v]), block + at);
         }
 }
 
@@ -108,15 +108,15 @@ void dense_weights(
     for (uint k = 0; k < BLOCK; k++)
         for (uint m = 0; m < BLOCK; m++)
             sums[k * BLOCK + m] = (VF)(0.0f);
-    const uint first = chunk * CHUNK, own = tiles - first < CHUNK ? tiles - first : CHUNK;
+    const uint first = chunk * CHUNK, chunk_tiles = tiles - first < CHUNK ? tiles - first : CHUNK;
     multiply_samples(sums, inputs + (first * input_rows + first_input + input) * SAMPLES,
                      grad_outputs + (first * output_rows + output) * SAMPLES, input_rows * SAMPLES,
                      output_rows * SAMPLES,
-                     own);
-    __global float *found = partials + chunk * parameter_count + first_parameter + input * output_count + output;
+                     chunk_tiles);
+    __global float *block = partials + chunk * parameter_count + first_parameter + input * output_count + output;
     for (uint k = 0; k < BLOCK; k++)
         for (uint m = 0; m < BLOCK; m++)
-            found[k * output_count + m] = sum_lanes(sums[k * BLOCK + m]);
+            block[k * output_count + m] = sum_lanes(sums[k * BLOCK + m]);
 }
 
 /* Gradients of the biases of a layer: sums over the samples of a chunk of tiles.  One item = one output of one

@@ -1,9 +1,9 @@
 /* Density control: sum statistics of each Gaussian, mark rows by rules, and write the new rows.
  *
  * Kerbl et al. 2023, section 5.  A rule is a box in (statistic, size, opacity) with an outcome of three numbers: the
- * rows that a Gaussian becomes (`copies`), how many of them are its old row (`kept`), and the factor of the scales of
- * its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  Where `shared` is set,
- * the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local memory.
+ * rows that a Gaussian becomes (`copies`), how many of them are its old row (`kept`), and the factor on the scales
+ * of its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  If `shared` is
+ * set, the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local memory.
  * Deterministic. */
 #include "random.h"
 #include "splat.h"
@@ -20,7 +20,7 @@ void count_seen(
         seen[i] += 1.0f;
 }
 
-/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: loss by normalized device
+/* Add the Euclidean norm of this view's screen gradient, in the unit of Kerbl et al.: loss by normalized device
  * coordinates.  The gradient is in planes `first` and `first` + 1. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_norm(
@@ -73,8 +73,8 @@ void accumulate_pixel_sum(
         total[i] += pixel_sums[pixel_sum * stride + i];
 }
 
-/* Add by how much a shift by one standard deviation changes this view's loss at most, sqrt(g^T C g) with the splat's
- * covariance C, times a number. */
+/* Add the largest change of this view's loss by a shift of one standard deviation, sqrt(g^T C g) with the splat's
+ * covariance C, times a factor. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_gain(
     __global const float *restrict grad_mean2d,  // [2,S] px^-1
@@ -137,8 +137,8 @@ void start_edit(
     shared[i] = 0;
 }
 
-/* Apply one rule.  The first growing rule whose box holds a Gaussian decides; pruning overrides growth and compares the
- * size of the children after a split. */
+/* Apply one rule.  The first growing rule whose box contains a Gaussian decides; pruning overrides growth, and compares
+ * the size of the children after a split. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mark_rule(
     __global const float *restrict log_scales,     // [3,S] log of scene units
@@ -244,9 +244,9 @@ void spawn_children(
         log_scales[k * stride + i] += log(shrink[source[i]]);
 }
 
-/* Opacities of rows that together let through as much as their Gaussian did: 1 - o' = (1 - o)^(1/n) (Rota Bulo et al.
- * 2024, "Revising Densification in Gaussian Splatting").  In logits, with x = log(1 + e^l) / n:
- * l' = log(e^x - 1). */
+/* Opacities of rows that together transmit as much light as their Gaussian did: 1 - o' = (1 - o)^(1/n) (Rota Bulo et
+ * al.  2024, "Revising Densification in Gaussian Splatting").  In logits, with x = log(1 + e^l) / n: l' = log(e^x - 1).
+ * */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_opacity(
     __global const uint *restrict source,    // [M] row before the edit
@@ -282,7 +282,7 @@ void cap_opacity(
         const float scale = exp(log_scales[k * stride + i]);
         energy2 /= 1.0f + filter_variance[i] / (scale * scale);
     }
-    const float unfiltered = limit / sqrt(energy2);  // limit of the opacity before the filter; may be 1 and more
+    const float unfiltered = limit / sqrt(energy2);  // limit of the opacity before the filter; may be 1 or more
     const float logit = unfiltered < 1.0f ? log(unfiltered / (1.0f - unfiltered)) : logit_opacity[i];
     logit_opacity[i] = logit_opacity[i] < logit ? logit_opacity[i] : logit;
 }

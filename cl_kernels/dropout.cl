@@ -4,13 +4,13 @@
  * One item = one Gaussian.  No local memory.  The random numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
-/* Draw for every Gaussian. */
+/* Draw whether each Gaussian is left out. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void draw_left_out(
-    __global const float *restrict hidden,  // [planes,S] whole numbers: bits of the views that leave it out
+    __global const float *restrict hidden,  // [planes,S] integers: bits of the views that hide a Gaussian
     __global float *restrict left_out,      // [S] 0 or 1
     const uint below,                       // probability times 2^32
-    const uint hidden_plane,                // that has the view
+    const uint hidden_plane,                // of the view
     const uint hidden_bit,                  // of the view; 0: no Gaussian is hidden
     const uint seed,
     const uint step,

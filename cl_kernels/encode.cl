@@ -1,16 +1,16 @@
-/* What a network reads of a sample: the integrated positional encoding of its conical frustum, and the encoding of the
- * direction that it is seen in (Barron et al. 2021).
+/* The inputs of a network for a sample: the integrated positional encoding of its conical frustum, and the encoding of
+ * its viewing direction (Barron et al. 2021).
  *
  * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which
- * are those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their whole
- * part can be left out exactly.
+ * are those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their
+ * integer part can be removed exactly.
  *
  * Features: sines of x, y, z for l = 0, 1, ...; then cosines; then zeros up to a multiple of BLOCK (layers.h).
  * One item = LANES samples of one ray.  No local memory. */
 #include "frustum.h"
 #include "layers.h"
 
-#define FALL_MIN (-32.0f)  // e^x is 1e-14 there: left out, as gradients of such features have subnormal numbers
+#define FALL_MIN (-32.0f)  // e^x is 1e-14 there; such features are 0, since their gradients would be subnormal
 #define TURN 0.159154943f  // 1 / (2 pi)
 
 /* sin(2 pi x) for x in [-1/4, 1/4]: the Taylor polynomial of degree 13, error 1e-9 before rounding. */
@@ -26,7 +26,7 @@ static inline VF sine_of_turns(const VF x)
     return p * x;
 }
 
-/* Sine and cosine of an angle in turns; not finite: NaN. */
+/* Sine and cosine of an angle in turns; NaN if it is not finite. */
 static inline void sine_and_cosine(const VF turns, VF *sine, VF *cosine)
 {
     const VF part = turns - rint(turns), size = magnitude(part);
@@ -53,19 +53,19 @@ void encode_frustums(
         return;
     __global const float *cone = cones + first / samples * RAY_VALUES_READ;
     __global const float *t = edges + first / samples * (samples + 1) + first % samples;
-    const frustum_t own = frustum_of(cone, VLOAD(t), VLOAD(t + 1));
+    const frustum_t frustum = frustum_of(cone, VLOAD(t), VLOAD(t + 1));
     const uint at = feature_at(first, first_row, rows);
     for (uint axis = 0; axis < 3; axis++) {
         const float d = cone[3 + axis], d2 = d * d;
-        const VF turns = (cone[axis] + d * own.distance) * TURN;
-        VF fall = -0.5f * (d2 * own.along + (1.0f - d2 / (cone[7] * cone[7])) * own.across);
+        const VF turns = (cone[axis] + d * frustum.distance) * TURN;
+        VF fall = -0.5f * (d2 * frustum.along + (1.0f - d2 / (cone[7] * cone[7])) * frustum.across);
         float scale = 1.0f;
         for (uint l = 0; l < degrees; l++) {
             VF sine, cosine;
             sine_and_cosine(scale * turns, &sine, &cosine);
-            const VF kept = fall < FALL_MIN ? (VF)(0.0f) : exp_clamped(fall);
-            VSTORE(kept * sine, features + at + (3 * l + axis) * SAMPLES);
-            VSTORE(kept * cosine, features + at + (3 * (degrees + l) + axis) * SAMPLES);
+            const VF factor = fall < FALL_MIN ? (VF)(0.0f) : exp_clamped(fall);
+            VSTORE(factor * sine, features + at + (3 * l + axis) * SAMPLES);
+            VSTORE(factor * cosine, features + at + (3 * (degrees + l) + axis) * SAMPLES);
             scale *= 2.0f;
             fall *= 4.0f;
         }

@@ -2,10 +2,10 @@
  *
  * A camera of focal length f, px, at depth z, scene units, takes one sample every z / f scene units.  The smallest such
  * interval over the cameras that see a Gaussian bounds its frequencies; its filter is `variance` times that interval^2.
- * One item = LANES Gaussians.  No local memory.  Deterministic: a maximum has no order. */
+ * One item = LANES Gaussians.  No local memory.  Deterministic: a maximum does not depend on the order. */
 #include "lanes.h"
 
-#define VIEW_MARGIN 0.15f  // share of the image beyond its edges that still counts as seen
+#define VIEW_MARGIN 0.15f  // fraction of the image size beyond its edges that still counts as seen
 
 /* Smallest sampling interval of each Gaussian, 0 where no camera sees it, and the bits of the largest of all. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
@@ -51,7 +51,7 @@ void sampling_interval(
     atomic_max(largest, as_uint(lane_max));  // floats above zero are ordered as their bits
 }
 
-/* Convert intervals to variances; a Gaussian that no camera sees has the largest interval of all. */
+/* Convert intervals to variances; Gaussians that no camera sees get the largest interval. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void filter_variance(
     __global const uint *restrict largest,  // [1] bits of a float
@@ -62,7 +62,7 @@ void filter_variance(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const VF own = VLOAD(interval + i);
-    const VF taken = own > 0.0f ? own : (VF)(as_float(*largest));
-    VSTORE(variance * taken * taken, interval + i);
+    const VF smallest = VLOAD(interval + i);
+    const VF sampled = smallest > 0.0f ? smallest : (VF)(as_float(*largest));
+    VSTORE(variance * sampled * sampled, interval + i);
 }

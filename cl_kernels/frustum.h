@@ -1,5 +1,5 @@
-/* The part of a cone between two distances, taken for a normal distribution (Barron et al. 2021, equations 7 and 8):
- * with m = (t0 + t1) / 2, h = (t1 - t0) / 2 and s = 3 m^2 + h^2
+/* The part of a cone between two distances, approximated by a normal distribution (Barron et al. 2021, equations 7 and
+ * 8): with m = (t0 + t1) / 2, h = (t1 - t0) / 2 and s = 3 m^2 + h^2
  *
  *   mean along the ray   m + 2 m h^2 / s
  *   variance along it    h^2 / 3 - 4/15 h^4 (12 m^2 - h^2) / s^2

@@ -43,7 +43,7 @@ static inline void cross_product(const VF *a, const VF *b, VF *product)
     product[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* All values between a Gaussian's parameters and its screen ellipse; the forward and the backward pass compute them. */
+/* All values between a Gaussian's parameters and its screen ellipse, which both passes compute. */
 typedef struct {
     VI valid;                 // in front of the near plane, with a direction and a shape
     VF x, y, z, inverse_z;    // mean in camera space, scene units
@@ -60,7 +60,7 @@ typedef struct {
     VF determinant;           // of the covariance after the screen filter
     VF ratio;                 // determinant before / after the screen filter
     VF conic_xx, conic_xy, conic_yy;  // inverse covariance after the screen filter, px^-2
-    VF energy;                // factor of the opacity: the energy that the two filters leave
+    VF energy;                // factor on the opacity that conserves energy under the two filters
 } shape_t;
 
 /* The result is written to an address: Oclgrind 21.10 does not support inlined functions that return a structure. */

@@ -1,5 +1,5 @@
-/* A multiresolution hash grid of features, which a network reads instead of sines (Müller et al. 2022), each level
- * weighted by how well a sample resolves it (Barron et al. 2023, "Zip-NeRF", section 3.1).
+/* A multiresolution hash grid of features, the input of a network instead of sines (Müller et al. 2022), with each
+ * level weighted by how well a sample resolves it (Barron et al. 2023, "Zip-NeRF", section 3.1).
  *
  *   place    mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
  *            the variances along the three axes, as for a sphere
@@ -8,9 +8,9 @@
  *   feature  w * (trilinear mean of the 8 entries around u), w = erf(1 / sqrt(8 v n^2)), by erf(x) ~ sqrt(1 - exp(-4/pi
  *            x^2)), which is off by 0.7 % at most: so w = sqrt(1 - exp(-1 / (2 pi v n^2)))
  *
- * Outside the cube all features are 0.  Backward: an item owns a range of a level's entries, and adds the gradients of
- * all samples to them, in the order of samples: without atomics, and with results that do not depend on the number of
- * items per level.  No local memory. */
+ * Outside the cube all features are 0.  Backward: an item owns a range of a level's entries and adds the gradients of
+ * all samples to it in order, without atomics, so results do not depend on the number of items per level.  No local
+ * memory. */
 #include "frustum.h"
 #include "layers.h"
 
@@ -21,20 +21,20 @@
 #define HASH_Z 805459861u
 #define CORNERS 8
 #define TWO_PI 6.28318531f
-#define SERIES_MAX 0.01f  // below it 1 - e^-x is a sum of powers: the difference would lose digits
+#define SERIES_MAX 0.01f  // below it, 1 - e^-x is computed as a series, since the difference would lose digits
 
-/* LANES samples in a level: the index of the first corner of the cell along each axis, the place in the cell, w. */
+/* LANES samples in a level: the index of the first corner of the cell along each axis, the offset in the cell, w. */
 typedef struct {
     int x[LANES], y[LANES], z[LANES];
-    float place_x[LANES], place_y[LANES], place_z[LANES], weight[LANES];
+    float offset_x[LANES], offset_y[LANES], offset_z[LANES], weight[LANES];
 } cells_t;
 
-/* The cell along an axis; a place at the end of the cube is in the last one. */
-static inline void cell_along(const VF u, const float n, int *cell, float *place)
+/* The cell along an axis, and the offset in it; positions at the end of the cube are in the last cell. */
+static inline void cell_along(const VF u, const float n, int *cell, float *offset)
 {
-    const VF at = n * u, below = floor(at), last = larger(smaller(below, (VF)(n - 1.0f)), (VF)(0.0f));
+    const VF scaled = n * u, below = floor(scaled), last = larger(smaller(below, (VF)(n - 1.0f)), (VF)(0.0f));
     VSTORE_INT_PRIVATE(to_VI(last), cell);
-    VSTORE_PRIVATE(at - last, place);
+    VSTORE_PRIVATE(scaled - last, offset);
 }
 
 static inline void find_cells(__global const float *places, const uint n, cells_t *cells)
@@ -46,9 +46,9 @@ static inline void find_cells(__global const float *places, const uint n, cells_
     const VF weight = sqrt(part < SERIES_MAX ? series : 1.0f - exp_clamped(-part));
     const VI inside = (x >= 0.0f) & (x <= 1.0f) & (y >= 0.0f) & (y <= 1.0f) & (z >= 0.0f) & (z <= 1.0f);  // no NaN is
     VSTORE_PRIVATE((inside ? weight : (VF)(0.0f)), cells->weight);
-    cell_along(x, size, cells->x, cells->place_x);
-    cell_along(y, size, cells->y, cells->place_y);
-    cell_along(z, size, cells->z, cells->place_z);
+    cell_along(x, size, cells->x, cells->offset_x);
+    cell_along(y, size, cells->y, cells->offset_y);
+    cell_along(z, size, cells->z, cells->offset_z);
 }
 
 /* The entries of the corners of a lane's cell, in their level, and the weights of the trilinear mean. */
@@ -57,13 +57,13 @@ static inline void find_corners(const cells_t *cells, const uint lane, const uin
 {
     const uint step_y = shared ? HASH_Y : n + 1, step_z = shared ? HASH_Z : (n + 1) * (n + 1);
     const uint x = (uint)cells->x[lane], y = (uint)cells->y[lane] * step_y, z = (uint)cells->z[lane] * step_z;
-    const float dx = cells->place_x[lane], dy = cells->place_y[lane], dz = cells->place_z[lane];
-    const float own = cells->weight[lane];
+    const float dx = cells->offset_x[lane], dy = cells->offset_y[lane], dz = cells->offset_z[lane];
+    const float level_weight = cells->weight[lane];
     for (uint corner = 0; corner < CORNERS; corner++) {
         const uint right = corner & 1, down = corner >> 1 & 1, back = corner >> 2;
         const uint a = x + right, b = y + down * step_y, c = z + back * step_z;
         entry[corner] = shared ? (a ^ b ^ c) & (entries - 1) : a + b + c;
-        weight[corner] = own * (right ? dx : 1.0f - dx) * (down ? dy : 1.0f - dy) * (back ? dz : 1.0f - dz);
+        weight[corner] = level_weight * (right ? dx : 1.0f - dx) * (down ? dy : 1.0f - dy) * (back ? dz : 1.0f - dz);
     }
 }
 
@@ -85,12 +85,12 @@ void grid_places(
         return;
     __global const float *cone = cones + first / samples * RAY_VALUES_READ;
     __global const float *t = edges + first / samples * (samples + 1) + first % samples;
-    __global float *own = places + feature_at(first, 0, PLACE_ROWS);
+    __global float *sample = places + feature_at(first, 0, PLACE_ROWS);
     const frustum_t f = frustum_of(cone, VLOAD(t), VLOAD(t + 1));
-    VSTORE((cone[0] + cone[3] * f.distance - corner_x) / side, own);
-    VSTORE((cone[1] + cone[4] * f.distance - corner_y) / side, own + SAMPLES);
-    VSTORE((cone[2] + cone[5] * f.distance - corner_z) / side, own + 2 * SAMPLES);
-    VSTORE((cone[7] * cone[7] * f.along + 2.0f * f.across) / (3.0f * side * side), own + 3 * SAMPLES);
+    VSTORE((cone[0] + cone[3] * f.distance - corner_x) / side, sample);
+    VSTORE((cone[1] + cone[4] * f.distance - corner_y) / side, sample + SAMPLES);
+    VSTORE((cone[2] + cone[5] * f.distance - corner_z) / side, sample + 2 * SAMPLES);
+    VSTORE((cone[7] * cone[7] * f.along + 2.0f * f.across) / (3.0f * side * side), sample + 3 * SAMPLES);
 }
 
 /* Features of samples.  One item = LANES samples of one level. */
@@ -110,12 +110,12 @@ void grid_forward(
     if (i >= count)
         return;
     const uint level = i / (samples / LANES), first = i % (samples / LANES) * LANES;
-    __global const uint *of_level = levels + level * LEVEL_VALUES;
-    const uint n = of_level[0], entries = of_level[2], shared = of_level[3];
-    __global const float4 *table = (__global const float4 *)(parameters + first_parameter) + of_level[1];
+    __global const uint *values = levels + level * LEVEL_VALUES;
+    const uint n = values[0], entries = values[2], shared = values[3];
+    __global const float4 *table = (__global const float4 *)(parameters + first_parameter) + values[1];
     cells_t cells;
     find_cells(places + feature_at(first, 0, PLACE_ROWS), n, &cells);
-    float found[GRID_FEATURES][LANES];
+    float sums[GRID_FEATURES][LANES];
     for (uint lane = 0; lane < LANES; lane++) {
         float4 sum = (float4)(0.0f);
         if (cells.weight[lane] != 0.0f) {
@@ -125,14 +125,14 @@ void grid_forward(
             for (uint corner = 0; corner < CORNERS; corner++)
                 sum += weight[corner] * table[entry[corner]];
         }
-        found[0][lane] = sum.x;
-        found[1][lane] = sum.y;
-        found[2][lane] = sum.z;
-        found[3][lane] = sum.w;
+        sums[0][lane] = sum.x;
+        sums[1][lane] = sum.y;
+        sums[2][lane] = sum.z;
+        sums[3][lane] = sum.w;
     }
     __global float *own = features + feature_at(first, first_row + level * GRID_FEATURES, rows);
     for (uint k = 0; k < GRID_FEATURES; k++)
-        VSTORE(VLOAD_PRIVATE(found[k]), own + k * SAMPLES);
+        VSTORE(VLOAD_PRIVATE(sums[k]), own + k * SAMPLES);
 }
 
 /* Add the gradient of the entries.  One item = a range of the entries of one level, for all samples. */
@@ -152,27 +152,27 @@ void grid_backward(
     if (i >= count)
         return;
     const uint level = i / parts;
-    __global const uint *of_level = levels + level * LEVEL_VALUES;
-    const uint n = of_level[0], entries = of_level[2], shared = of_level[3];
+    __global const uint *values = levels + level * LEVEL_VALUES;
+    const uint n = values[0], entries = values[2], shared = values[3];
     const uint size = (entries + parts - 1) / parts, begin = i % parts * size;
-    __global float4 *table = (__global float4 *)(gradient + first_parameter) + of_level[1];
+    __global float4 *table = (__global float4 *)(gradient + first_parameter) + values[1];
     for (uint first = 0; first < samples; first += LANES) {
         cells_t cells;
         find_cells(places + feature_at(first, 0, PLACE_ROWS), n, &cells);
-        __global const float *by = grad_features + feature_at(first, level * GRID_FEATURES, rows);
-        float given[GRID_FEATURES][LANES];
+        __global const float *grads = grad_features + feature_at(first, level * GRID_FEATURES, rows);
+        float lanes[GRID_FEATURES][LANES];
         for (uint k = 0; k < GRID_FEATURES; k++)
-            VSTORE_PRIVATE(VLOAD(by + k * SAMPLES), given[k]);
+            VSTORE_PRIVATE(VLOAD(grads + k * SAMPLES), lanes[k]);
         for (uint lane = 0; lane < LANES; lane++) {
-            const float4 own = (float4)(given[0][lane], given[1][lane], given[2][lane], given[3][lane]);
-            if (cells.weight[lane] == 0.0f || (own.x == 0.0f && own.y == 0.0f && own.z == 0.0f && own.w == 0.0f))
+            const float4 grad = (float4)(lanes[0][lane], lanes[1][lane], lanes[2][lane], lanes[3][lane]);
+            if (cells.weight[lane] == 0.0f || (grad.x == 0.0f && grad.y == 0.0f && grad.z == 0.0f && grad.w == 0.0f))
                 continue;
             uint entry[CORNERS];
             float weight[CORNERS];
             find_corners(&cells, lane, n, entries, shared, entry, weight);
             for (uint corner = 0; corner < CORNERS; corner++)
                 if (entry[corner] - begin < size)
-                    table[entry[corner]] += weight[corner] * own;
+                    table[entry[corner]] += weight[corner] * grad;
         }
     }
 }

@@ -3,8 +3,8 @@
  *
  *   M X M^T,  M = 1/2 [1 + u, 1 + v; 1 - u, 1 - v],  (u, v) = sqrt(2) h
  *
- * which is X for Haar's h = (1, -1) / sqrt(2), and the block's mean for h = 0.  Where a block reaches beyond the image,
- * it repeats the last row or column.  Masked pixels are the mean of the pixels of their block that are not masked.
+ * which is X for Haar's h = (1, -1) / sqrt(2), and the block's mean for h = 0.  Where a block extends beyond the image,
+ * it repeats the last row or column.  Masked pixels are replaced by the mean of the other pixels of their block.
  * A block is a float4: upper left, upper right, lower left, lower right.  No local memory.  Deterministic. */
 #include "common.h"
 
@@ -27,25 +27,25 @@ static inline float4 block_at(
     return counts > 0.0f ? pixels : (float4)((sum.x + sum.y + sum.z + sum.w) / number);
 }
 
-/* Columns changed by M, and transposed: twice this is M X M^T. */
+/* M applied to columns, and transposed; applied twice, this is M X M^T. */
 static inline float4 changed(const float4 block, const float u, const float v)
 {
     const float2 low = 0.5f * (block.xz + block.yw), high = 0.5f * (u * block.xz + v * block.yw);
     return (float4)(low + high, low - high);
 }
 
-/* Change every block; pixels outside the image become zero.  One item = one block; dimensions x, y. */
+/* Transform every block; pixels outside the image become zero.  One item = one block; dimensions x, y. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void haar_forward(
     __global const float *restrict image,  // [3,H',stride]
     __global const float *restrict mask,   // [H',stride] 0 or 1; read where `masked`
-    __global float *restrict found,        // [3,H',stride]
+    __global float *restrict result,       // [3,H',stride]
     const uint masked,
     const float u,
     const float v,
     const uint width,
     const uint height,
-    const uint rows,                       // H', even as the stride is
+    const uint rows,                       // H', even like the stride
     const uint stride)
 {
     const uint x = 2 * get_global_id(0), y = 2 * get_global_id(1);
@@ -57,26 +57,26 @@ void haar_forward(
         float4 block = (float4)(0.0f);
         if (inside)
             block = changed(changed(block_at(image + plane, mask, masked, x, y, width, height, stride), u, v), u, v);
-        found[at] = block.x;
-        found[at + 1] = right ? block.y : 0.0f;
-        found[at + stride] = lower ? block.z : 0.0f;
-        found[at + stride + 1] = right && lower ? block.w : 0.0f;
+        result[at] = block.x;
+        result[at + 1] = right ? block.y : 0.0f;
+        result[at + stride] = lower ? block.z : 0.0f;
+        result[at + stride + 1] = right && lower ? block.w : 0.0f;
     }
 }
 
 /* Sums that give the gradients of u and v.  One item = one column of blocks in STRIP rows; dimensions column, strip. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void haar_backward(
-    __global const float *restrict image,     // [3,H',stride] before the change
+    __global const float *restrict image,     // [3,H',stride] before the transform
     __global const float *restrict mask,      // [H',stride] 0 or 1; read where `masked`
-    __global const float *restrict gradient,  // [3,H',stride] by the changed image, zero outside the image
+    __global const float *restrict gradient,  // [3,H',stride] of the transformed image, zero outside
     __global float *restrict sums,            // [2,strips,stride/2] for u, v
     const uint masked,
     const float u,
     const float v,
     const uint width,
     const uint height,
-    const uint rows,                          // H', even as the stride is
+    const uint rows,                          // H', even like the stride
     const uint stride)
 {
     const uint column = get_global_id(0), strip = get_global_id(1), x = 2 * column, columns = stride / 2;
@@ -99,7 +99,7 @@ void haar_backward(
             total_v += high * once.yw + 0.5f * first_high * block.yw;
         }
     }
-    const uint place = strip * columns + column, all = get_global_size(1) * columns;
-    sums[place] = 0.5f * (total_u.x + total_u.y);
-    sums[all + place] = 0.5f * (total_v.x + total_v.y);
+    const uint index = strip * columns + column, all = get_global_size(1) * columns;
+    sums[index] = 0.5f * (total_u.x + total_u.y);
+    sums[all + index] = 0.5f * (total_v.x + total_v.y);
 }

@@ -44,7 +44,7 @@ static inline void harmonics_basis(const uint degree, const VF x, const VF y, co
     basis[15] = -SH_C3_0 * x * (xx - 3.0f * yy);
 }
 
-/* Gradient of sum_k c_k basis_k(x, y, z), with x, y, z taken as free variables. */
+/* Gradient of sum_k c_k basis_k(x, y, z), with x, y, z as independent variables. */
 static inline void harmonics_direction_gradient(
     const uint degree, const VF x, const VF y, const VF z, const VF *c, VF *gx, VF *gy, VF *gz)
 {

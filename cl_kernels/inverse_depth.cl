@@ -1,10 +1,10 @@
-/* The loss of inverse depths at some pixels of a view, where structure from motion or a file tells them.
+/* The loss of inverse depths at the pixels of a view where structure from motion or a file provides them.
  *
- * The fourth plane of the image is D = sum_i w_i / z_i (splat.h), with z the depth of a splat's mean: nothing behind
- * the splats counts as infinitely far.  The loss is sum_k q_k |D(pixel k) - 1/z_k|, times a scale.  With m = sum over
+ * The fourth plane of the image is D = sum_i w_i / z_i (splat.h), with z the depth of a splat's mean; behind the
+ * splats, the depth is infinite.  The loss is sum_k q_k |D(pixel k) - 1/z_k|, times a scale.  With m = sum over
  * pixels of w dL/dD, dL/dz = -m / z^2.
  *
- * No local memory.  Deterministic: no pixel is listed twice, and sums have one order. */
+ * No local memory.  Deterministic: no pixel is listed twice, and sums have a fixed order. */
 #include "splat.h"
 
 /* Add the gradient of the fourth plane; return each pixel's term.  One item = one listed pixel. */
@@ -12,7 +12,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void inverse_depth_loss(
     __global const float *restrict image,     // [4,H',stride]
     __global float *restrict gradient,        // [4,H',stride]
-    __global const uint *restrict pixels,     // [count] places in a plane, each once
+    __global const uint *restrict pixels,     // [count] distinct indices in a plane
     __global const float *restrict targets,   // [count] 1/z, scene units^-1
     __global const float *restrict weights,   // [count] q
     __global float *restrict terms,           // [count] q |D - 1/z|
@@ -49,7 +49,7 @@ void sum_inverse_depths(
     sums[i] = sum;
 }
 
-/* Add what the depth of a mean gives to its gradient.  One item = one Gaussian. */
+/* Add the gradient through the depth of a mean.  One item = one Gaussian. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void inverse_depth_backward(
     __global const float *restrict splats,  // [N,RECORD]

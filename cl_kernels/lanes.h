@@ -1,8 +1,8 @@
 /* VF, VI and VB: a float, an int and a byte in each of LANES lanes.  One source serves CPUs, where an item computes 16
  * or 8 Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
  *
- * Comparisons give -1 in vectors and 1 in scalars, so masks are combined with & and | only and used as m ? a : b.
- * Loops that matter use operators only: some CPU runtimes call built-in functions out of line. */
+ * Comparisons give -1 in vectors and 1 in scalars, so masks are only combined with & and | and used as m ? a : b.
+ * Inner loops use operators only: some CPU runtimes call built-in functions out of line. */
 #ifndef CLSPLAT_LANES_H
 #define CLSPLAT_LANES_H
 #include "common.h"
@@ -33,8 +33,8 @@ typedef uchar VB;
 #define to_VF convert_float
 #endif
 
-/* Vectors in memory may start at any value.  They are read and written through a type that allows it, and not by vload
- * and vstore, which some CPU runtimes call out of line or split into four parts. */
+/* Vectors in memory may start at any value.  They are read and written through an unaligned type instead of vload and
+ * vstore, which some CPU runtimes call out of line or split into four parts. */
 typedef VF __attribute__((aligned(4))) VF_in_memory;
 typedef VI __attribute__((aligned(4))) VI_in_memory;
 typedef VB __attribute__((aligned(1))) VB_in_memory;
@@ -79,7 +79,7 @@ static inline bool any_lane(const VI mask)
 }
 #endif
 
-/* Sum of the lanes, by halves: one order on every device. */
+/* Sum of the lanes, by halves: the same order on every device. */
 #if LANES == 16
 static inline float sum_lanes(const VF v)
 {
@@ -117,7 +117,7 @@ static inline void transpose(VF *v)
 #endif
 }
 
-/* The integer in each lane, for whole numbers below 2^22 in size. */
+/* The integer in each lane, for integral values below 2^22 in magnitude. */
 static inline VI to_VI(VF whole) { return as_VI(whole + ROUND_MAGIC) - 0x4b400000; }
 
 /* NaN in the first argument gives NaN. */

@@ -3,17 +3,17 @@
  * A pixel has the color C + T b, with C the layer's color on black, T its transmittance and b the image's color.  A
  * loss on the cover, scale times the sum of 1 - T, keeps the layer transparent.  For the image behind, dL/db =
  * T dL/d(color); for the layer, the backward pass of blending starts from the composite.  Planes are [channels,H',W']
- * with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is no color, is copied. */
+ * with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is not a color, is copied. */
 #include "planes.h"
 
-/* The composite, T dL/dT of the cover's loss, which blend_backward reads, and the sum of 1 - T of each row.
+/* The composite, T dL/dT of the loss on the cover for blend_backward, and the sum of 1 - T of each row.
  * One group = one row.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void lay_over(
     __global const float *restrict layer,          // [3,H',stride]
     __global const float *restrict transmittance,  // [H',stride] of the layer
     __global const float *restrict image,          // [channels,H',stride]
-    __global float *restrict both,                 // [channels,H',stride]
+    __global float *restrict composite,            // [channels,H',stride]
     __global float *restrict behind,               // [H',stride] T dL/dT
     __global float *restrict row_sums,             // [H'] sums of 1 - T
     const float scale,                             // weight / (width height)
@@ -30,11 +30,11 @@ void lay_over(
         const uint at = y * stride + x;
         const VF inside = inside_row(x, columns), t = magnitude(VLOAD(transmittance + at));
         for (uint channel = 0; channel < 3; channel++) {
-            const uint place = channel * plane + at;
-            VSTORE(VLOAD(layer + place) + t * VLOAD(image + place), both + place);
+            const uint index = channel * plane + at;
+            VSTORE(VLOAD(layer + index) + t * VLOAD(image + index), composite + index);
         }
         for (uint channel = 3; channel < channels; channel++)
-            VSTORE(VLOAD(image + channel * plane + at), both + channel * plane + at);
+            VSTORE(VLOAD(image + channel * plane + at), composite + channel * plane + at);
         VSTORE(-scale * (inside * t), behind + at);
         total += inside * (1.0f - t);
     }
@@ -44,11 +44,11 @@ void lay_over(
         row_sums[y] = sum_items(sums);
 }
 
-/* Replace the gradient of the composite by that of the image behind.  One group = one row.  No local memory. */
+/* Replace the gradient of the composite by the gradient of the image behind.  One group = one row.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void look_behind(
     __global const float *restrict transmittance,  // [H',stride] of the layer
-    __global float *restrict gradient,             // [3 or 4,H',stride] a fourth plane stays
+    __global float *restrict gradient,             // [3 or 4,H',stride] a fourth plane is unchanged
     const uint rows,                               // H'
     const uint stride)
 {

@@ -2,20 +2,20 @@
  *
  * Samples come in tiles of SAMPLES: a table of R features of S samples is [S / SAMPLES, R, SAMPLES].  A tile of 128
  * features is 32 KB, which stays in a cache while all outputs of it are computed.  One item computes a block of BLOCK
- * outputs for BLOCK vectors of LANES samples: 16 sums in registers, for 4 + 4 values that are read at a time. */
+ * outputs for BLOCK vectors of LANES samples: 16 sums in registers for each 4 + 4 values read. */
 #ifndef CLSPLAT_LAYERS_H
 #define CLSPLAT_LAYERS_H
 #include "lanes.h"
 
 #define SAMPLES 64         // in a tile
 #define BLOCK 4            // outputs of an item; inputs and outputs of a layer are multiples of it
-#define CHUNK 16           // tiles whose gradients are summed in one place
+#define CHUNK 16           // tiles whose gradients are summed together
 #define PARAMETER_LINE 64  // the parameters of a network are a multiple of it
 
 #define COLUMNS (SAMPLES / (BLOCK * LANES))  // items that share a tile and a block of outputs
 
 /* sums[output * BLOCK + vector] += weight * value over `count` rows of values.  values: the first of the item in
- * its row; weights of output k begin at weights + k * by_output, and follow each other by by_row.  The sums are read
+ * its row; weights of output k start at weights + k * by_output, by_row apart.  The sums are read
  * into variables of the function: some compilers keep an array that a loop indexes in memory. */
 static inline void multiply_rows(VF *sums, __global const float *values, __global const float *weights,
                                  const uint by_output, const uint by_row, const uint count)
@@ -45,9 +45,9 @@ static inline void multiply_rows(VF *sums, __global const float *values, __globa
         d2 = wd * v2 + d2;
         d3 = wd * v3 + d3;
     }
-    const VF found[BLOCK * BLOCK] = {a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3};
+    const VF totals[BLOCK * BLOCK] = {a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3};
     for (uint k = 0; k < BLOCK * BLOCK; k++)
-        sums[k] = found[k];
+        sums[k] = totals[k];
 }
 
 /* sums[k * BLOCK + m] += x[k] * y[m] for BLOCK rows of each, over the samples of some tiles; x_step, y_step: values
@@ -81,9 +81,9 @@ static inline void multiply_samples(VF *sums, __global const float *x, __global 
             d2 = xd * y2 + d2;
             d3 = xd * y3 + d3;
         }
-    const VF found[BLOCK * BLOCK] = {a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3};
+    const VF totals[BLOCK * BLOCK] = {a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3};
     for (uint k = 0; k < BLOCK * BLOCK; k++)
-        sums[k] = found[k];
+        sums[k] = totals[k];
 }
 
 /* Index of a value: feature `row` of sample `sample`, of a table with `rows` features. */

@@ -38,7 +38,7 @@ void unpack_pixels(
             values[lane] = y < height && x + lane < width ? first[lane] * factor : 0.0f;
 }
 
-/* Set pixels that the mask leaves out to zero.  One item = one pixel of one channel; dimensions pixel, channel. */
+/* Set masked pixels to zero.  One item = one pixel of one channel; dimensions pixel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void apply_mask(
     __global float *restrict planes,      // [channels,H',stride]
@@ -50,7 +50,7 @@ void apply_mask(
         planes[channel * pixels + pixel] = 0.0f;
 }
 
-/* Put another color behind transparent pixels: colors += transparency (behind - background).
+/* Change the color behind transparent pixels: colors += transparency (behind - background).
  * One item = one pixel of one channel; dimensions pixel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void change_background(
@@ -233,13 +233,13 @@ void ssim_gradient(
     }
 }
 
-/* How far the view is from its photograph in the loss's own measure: sums of |gradient (x - y)|, by row.
+/* The error of a view, weighted by the gradient of its loss: sums of |gradient (x - y)|, by row.
  * Local memory: TEAM * 4. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void view_error(
     __global const float *restrict image,       // [3,H',stride]
     __global const float *restrict photograph,  // [3,H',stride]
-    __global const float *restrict gradient,    // [3,H',stride] of the loss, by the image
+    __global const float *restrict gradient,    // [3,H',stride] of the loss with respect to the image
     __global float *restrict row_errors,        // [3,H']
     const uint width,
     const uint height,
@@ -260,7 +260,7 @@ void view_error(
         row_errors[channel * rows + y] = sum_items(sums);
 }
 
-/* Add the errors of a view's rows up, in their order.  One item. */
+/* Sum the errors of a view's rows, in order.  One item. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void sum_errors(
     __global const float *restrict row_errors,  // [count]

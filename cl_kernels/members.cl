@@ -1,7 +1,7 @@
-/* Rows that share one vector: each gets the weighted mean of the rows of its cluster.
+/* Rows that share a vector: each becomes the weighted mean of the rows of its cluster.
  *
- * x_i <- x_0 + sum_j w_j (x_j - x_0) / sum_j w_j over the members j of its cluster, of which x_0 is the first: rows
- * that are equal stay as they are, to the bit.  Where all weights are zero it is x_0.
+ * x_i <- x_0 + sum_j w_j (x_j - x_0) / sum_j w_j over the members j of its cluster, with x_0 the first: equal
+ * rows stay bit-identical.  If all weights are zero, the mean is x_0.
  *
  * No local memory.  Deterministic: the members are summed in the order of their rows, and each value has one writer. */
 #include "common.h"
@@ -12,7 +12,7 @@ void share_mean(
     __global float *restrict values,        // [components,S]
     __global const float *restrict weight,  // [S] at least 0
     __global const uint *restrict member,   // [N] rows, cluster by cluster
-    __global const uint *restrict first,    // [clusters + 1] places in `member`; the last is N
+    __global const uint *restrict first,    // [clusters + 1] indices into `member`; the last is N
     const uint stride,
     const uint clusters)
 {

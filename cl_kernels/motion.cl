@@ -51,7 +51,7 @@ void move_forward(
     __global const float *restrict motion,         // [W,S] see above
     __global const float *restrict means,          // [3,S] scene units, at the centers
     __global const float *restrict logit_opacity,  // [S] at the centers
-    __global float *restrict moved_means,          // [3,S] scene units; infinite where nothing is there
+    __global float *restrict moved_means,          // [3,S] scene units; infinite where a Gaussian is not present
     __global float *restrict moved_logit,          // [S]
     const float time,                              // of the scene, in [0, 1]
     const uint degree,                             // of the polynomial, 1 to 3
@@ -101,8 +101,8 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void move_backward(
     __global const float *restrict motion,         // [W,S] see above
     __global const float *restrict logit_opacity,  // [S] at the centers
-    __global const float *restrict grad_means,     // [3,S] at the moment
-    __global float *restrict grad_logit_opacity,   // [S] at the moment; becomes that at the center
+    __global const float *restrict grad_means,     // [3,S] at the time
+    __global float *restrict grad_logit_opacity,   // [S] at the time; becomes that at the center
     __global float *restrict grad_motion,          // [W,S]; its turn is unchanged
     const float time,                              // of the scene, in [0, 1]
     const uint degree,                             // of the polynomial, 1 to 3
@@ -143,7 +143,7 @@ void move_backward(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void turn_backward(
     __global const float *restrict motion,      // [W,S] see above
-    __global const float *restrict grad_quats,  // [4,S] at the moment
+    __global const float *restrict grad_quats,  // [4,S] at the time
     __global float *restrict grad_motion,       // [W,S]
     const float time,                           // of the scene, in [0, 1]
     const uint first,                           // plane of the turn
@@ -174,7 +174,7 @@ void motion_step(
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
-    const float lowest,                       // value that an update leaves
+    const float lowest,                       // bounds of the values after an update
     const float highest,
     const uint every,                         // all ones: each Gaussian is updated; 0: only Gaussians not culled
     const uint first,                         // plane

@@ -1,4 +1,4 @@
-/* Noise on the means of Gaussians; a lower opacity gets more of it (3DGS-MCMC, Kheradmand et al. 2024):
+/* Noise on the means of Gaussians, more for lower opacities (3DGS-MCMC, Kheradmand et al. 2024):
  *
  *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n 3 normal numbers
  *
@@ -7,7 +7,7 @@
 #include "random.h"
 
 __constant float SHARPNESS = 100.0f;  // per unit of opacity: how fast the noise falls at opacity_below
-__constant float REACH = 0.1f;        // 5e-5 of the noise is left there: not worth a random number
+__constant float REACH = 0.1f;        // beyond it, less than 5e-5 of the noise is left
 
 /* Move every mean. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
@@ -39,7 +39,7 @@ void add_noise(
     const float gate = rate / (1.0f + exp(-SHARPNESS * (opacity_below - opacity)));
     const float3 scale = exp((float3)(log_scales[i], log_scales[stride + i], log_scales[2 * stride + i]));
     const float3 turned = rows[0] * normal.x + rows[1] * normal.y + rows[2] * normal.z;  // R^T n
-    const float3 own = scale * scale * turned;  // Sigma n in own axes
+    const float3 scaled = scale * scale * turned;  // Sigma n in the axes of the Gaussian
     for (uint k = 0; k < 3; k++)
-        means[k * stride + i] += gate * dot(rows[k], own);
+        means[k * stride + i] += gate * dot(rows[k], scaled);
 }

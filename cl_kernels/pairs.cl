@@ -1,27 +1,27 @@
 /* List the (tile, splat) pairs: the tiles that each splat touches.
  *
- * A pair's address is its place in emission order, so the pairs of one Gaussian are contiguous.  Deterministic: each
+ * A pair's address is its position in emission order, so the pairs of one Gaussian are contiguous.  Deterministic: each
  * pair has one writer. */
 #include "tiles.h"
 
-/* The pairs of splats with a mask; large.cl adds those of large ones.  One item = one place of `order`. */
+/* The pairs of splats with a mask; large.cl adds those of large splats.  One item = one position in `order`. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
     __global const uint *restrict tile_box,     // [S] see tiles.h
     __global const uint *restrict tile_mask,    // [S] see tiles.h
-    __global const uint *restrict order,        // [N] Gaussian at each place
-    __global const uint *restrict pair_offset,  // [N+1] first pair of each place
+    __global const uint *restrict order,        // [N] Gaussian at each position
+    __global const uint *restrict pair_offset,  // [N+1] first pair of each position
     __global uint *restrict pair_tile,          // [P]
     __global uint *restrict pair_splat,         // [P]
     __global uint *restrict first_pair,         // [N] first pair of each Gaussian
     const uint tiles_x,
     const uint count)
 {
-    const uint place = get_global_id(0);
-    if (place >= count)
+    const uint position = get_global_id(0);
+    if (position >= count)
         return;
-    const uint i = order[place];
-    uint pair = pair_offset[place];
+    const uint i = order[position];
+    uint pair = pair_offset[position];
     first_pair[i] = pair;
     const uint box = tile_box[i], width = box >> (2 * BOX_BITS), low = (1u << BOX_BITS) - 1;
     if (width == BOX_LARGE)

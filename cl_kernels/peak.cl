@@ -3,7 +3,7 @@
  * One item = LANES lanes.  No local memory.  Deterministic. */
 #include "lanes.h"
 
-/* 8 independent chains of multiply-add: 16 * rounds operations a lane. */
+/* 8 independent chains of multiply-add: 16 * rounds operations per lane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void peak_fma(
     __global float *restrict result,  // [items*LANES]
@@ -27,7 +27,7 @@ void peak_fma(
     VSTORE(((a + b) + (c + d)) + ((e + f) + (g + h)), result + i * LANES);
 }
 
-/* The exponential that blending uses: 2 * rounds of them a lane. */
+/* The exponential that blending uses: 2 * rounds per lane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void peak_exp(
     __global float *restrict result,  // [items*LANES]
@@ -45,8 +45,8 @@ void peak_exp(
     VSTORE(sum + other, result + i * LANES);
 }
 
-/* An item copies a vector of LANES, or of four where an item has one lane; then in the largest groups, since a GPU
- * starts small ones too slowly. */
+/* An item copies a vector of LANES values; or, with one lane, of four values and in the largest groups, since GPUs
+ * start small groups too slowly. */
 #if LANES == 1
 #define PIECE 4
 #define COPY_GROUP (TILE * TILE)
@@ -57,7 +57,7 @@ typedef float4 piece_t;
 typedef VF_in_memory piece_t;
 #endif
 
-/* Copy: reads and writes a piece an item. */
+/* Copy one piece per item. */
 __kernel __attribute__((reqd_work_group_size(COPY_GROUP, 1, 1)))
 void peak_copy(
     __global const float *restrict values,  // [items*PIECE]

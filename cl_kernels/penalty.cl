@@ -1,8 +1,8 @@
 /* Penalties on the scales s, in scene units, and the opacities o of Gaussians: value and gradient.
  *
- *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and only through it the shape
+ *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and and only thereby the shape
  *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, whatever the size
- *   scale, opacity     sum_j s_j, and o: a pressure on all, against which only what the images need stays
+ *   scale, opacity     sum_j s_j, and o: a pressure on all Gaussians; only those that images need resist it
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "lanes.h"

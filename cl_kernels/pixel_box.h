@@ -8,8 +8,8 @@
  *   r = 12 k^2 v,  w = (1 + r^2)^(1/4),  e^2 = t^2 + (1 + r - w^2) / 12
  *   alpha = opacity 2 pi s t Z / w (F((dx - k m + w/2) / e) - F((dx - k m - w/2) / e))
  *
- * The last line is the integral over x given y; w and e stand for the pixel's width together with what y varies within
- * the pixel, as one box and one Gaussian with the same second and fourth moments.  F, the cumulative normal
+ * The last line is the integral over x given y; w and e combine the pixel's width with the variation of y within the
+ * pixel, as one box and one Gaussian with the same second and fourth moments.  F, the cumulative normal
  * distribution, is 1 / (1 + e^-P) with an odd polynomial P.  Z, m, w and e belong to a line of pixels (a row, or a
  * column of a turned splat). */
 #ifndef CLSPLAT_PIXEL_BOX_H
@@ -28,7 +28,7 @@
 #define CDF_CUBIC 7.333173e-2f
 #define CDF_QUINTIC (-5.9424e-4f)
 #define CDF_REACH 6.0f     // standard deviations
-#define BOX_UNIFORM 0.4f   // 1 / (2 s) below which m and v are taken from their series: differences cancel there
+#define BOX_UNIFORM 0.4f   // 1 / (2 s) below which m and v use series, since differences cancel there
 #define TWO_PI 6.28318531f
 
 /* F(z + h) - F(z - h) and the derivatives of its logarithm. */
@@ -40,9 +40,9 @@ typedef struct {
 } rise_t;
 
 /* With a, d = (P(z + h) +- P(z - h)) / 2 it is sinh d / (cosh d + cosh a): nothing cancels where h is small. */
-static inline rise_t rise_of(const VF place, const VF h)
+static inline rise_t rise_of(const VF position, const VF h)
 {
-    const VF one = (VF)(1.0f), reach = (VF)(CDF_REACH), size = as_VF(as_VI(place) & 0x7fffffff);
+    const VF one = (VF)(1.0f), reach = (VF)(CDF_REACH), size = as_VF(as_VI(position) & 0x7fffffff);
     const VF end = smaller(size + h, reach), begin = smaller(larger(size - h, -reach), reach);
     const VI clipped = size + h > reach;
     rise_t f;
@@ -66,7 +66,7 @@ static inline rise_t rise_of(const VF place, const VF h)
     const VF even = CDF_SLOPE + 3.0f * CDF_CUBIC * (z2 + h2) + 5.0f * CDF_QUINTIC * ((z2 + 6.0f * h2) * z2 + h2 * h2);
     const VF odd = 2.0f * f.z * f.h * (3.0f * CDF_CUBIC + 10.0f * CDF_QUINTIC * (z2 + h2));
     const VF by_z = by_a * even + by_d * odd;
-    f.by_z = place < 0.0f ? -by_z : by_z;
+    f.by_z = position < 0.0f ? -by_z : by_z;
     f.by_h = by_a * odd + by_d * even;
     f.by_size = f.z * by_z + f.h * f.by_h;
     f.high = (1.0f - ea * ed) / (1.0f + ea * ed);
@@ -86,7 +86,7 @@ typedef struct {
     VF base_long, shift_long, r_long;  // by the mean along the larger variance, px^-1
     VF base_size, shift_size, r_size;  // by ln s
     VF shift_slope, r_slope;           // by k
-    VF fixed, wide, narrow;            // d ln alpha / dr: what is left of it, by w and by e
+    VF fixed, wide, narrow;            // d ln alpha / dr: the constant part, and the parts by w and by e
     VF share;                          // t^2 / e^2
 } slopes_t;
 
@@ -101,14 +101,14 @@ static inline within_t wide_within(const VF dy, const float s)
     within_t w;
     const float inverse2 = 1.0f / (s * s), c = 1.0f / 12.0f - inverse2 * (1.0f / 360.0f);
     const VF tilt = dy * inverse2, tilt2 = tilt * tilt, variance = c - tilt2 * (1.0f / 240.0f);
-    const VI held = variance > 0.0f;
+    const VI positive = variance > 0.0f;
     const VF zero = (VF)(0.0f);
     w.mean = dy - tilt * (c - tilt2 * (1.0f / 720.0f));
     w.mean_y = 1.0f - inverse2 * (c - tilt2 * (1.0f / 240.0f));
     w.mean_s = tilt * (2.0f * c - inverse2 * (1.0f / 180.0f) - tilt2 * (1.0f / 120.0f));
-    w.variance = held ? variance : zero;
-    w.variance_y = held ? -tilt * inverse2 * (1.0f / 120.0f) : zero;
-    w.variance_s = held ? inverse2 * (1.0f / 180.0f) + tilt2 * (1.0f / 60.0f) : zero;
+    w.variance = positive ? variance : zero;
+    w.variance_y = positive ? -tilt * inverse2 * (1.0f / 120.0f) : zero;
+    w.variance_s = positive ? inverse2 * (1.0f / 180.0f) + tilt2 * (1.0f / 60.0f) : zero;
     return w;
 }
 
@@ -122,7 +122,7 @@ static inline VF steepness(const VF x, const VF tanh)
 /* By the logarithm f of Z: m = -s df/dz, v = s^2 (1 - z df/dz - h df/dh - (df/dz)^2). */
 static inline within_t sharp_within(const VF dy, const float s, const rise_t f)
 {
-    const VF zero = (VF)(0.0f), most = (VF)(1.0f / 12.0f), size = dy < 0.0f ? -dy : dy;
+    const VF zero = (VF)(0.0f), max_variance = (VF)(1.0f / 12.0f), size = dy < 0.0f ? -dy : dy;
     const VF z = f.z, h = f.h, by_z = dy < 0.0f ? -f.by_z : f.by_z;
     const VF mean = -s * by_z, bounded = smaller(larger(mean, size - 0.5f), size + 0.5f);
     const VF part = 1.0f - f.by_size - by_z * by_z, variance = s * s * part;
@@ -133,16 +133,16 @@ static inline within_t sharp_within(const VF dy, const float s, const rise_t f)
     const VF hh = lower - upper - f.by_h * f.by_h;
     const VF part_z = -by_z - z * zz - h * zh - 2.0f * by_z * zz;
     const VF part_h = -f.by_h - z * zh - h * hh - 2.0f * by_z * zh;
-    const VI held = (variance > 0.0f) & (variance < most);
+    const VI unclamped = (variance > 0.0f) & (variance < max_variance);
     const VF mean_s = mean == bounded ? s * (z * zz + h * zh - by_z) : zero;
-    const VF variance_y = held ? s * part_z : zero;
+    const VF variance_y = unclamped ? s * part_z : zero;
     within_t w;
     w.mean = dy < 0.0f ? -bounded : bounded;
     w.mean_y = mean == bounded ? -zz : (VF)(1.0f);
     w.mean_s = dy < 0.0f ? -mean_s : mean_s;
-    w.variance = smaller(larger(variance, zero), most);
+    w.variance = smaller(larger(variance, zero), max_variance);
     w.variance_y = dy < 0.0f ? -variance_y : variance_y;
-    w.variance_s = held ? s * s * (2.0f * part - z * part_z - h * part_h) : zero;
+    w.variance_s = unclamped ? s * s * (2.0f * part - z * part_z - h * part_h) : zero;
     return w;
 }
 
@@ -158,7 +158,7 @@ static inline void line_of(const float *splat, const VF center, line_t *line, sl
         y = wide_within(dy, s);
     else
         y = sharp_within(dy, s, f);
-    const float k2 = 12.0f * k * k, t2 = t * t;  // t2 apart: a sum of two products may be joined either way
+    const float k2 = 12.0f * k * k, t2 = t * t;  // t2 apart: sums of two products may be contracted either way
     const VF r = k2 * y.variance, w2 = sqrt(1.0f + r * r), w = sqrt(w2);
     const VF e = sqrt(t2 + (1.0f + r - w2) * (1.0f / 12.0f)), inverse = 1.0f / e;
     line->scale = splat[SPLAT_OPACITY] * (TWO_PI * s * t) * f.value / w;

@@ -1,15 +1,15 @@
-/* The derivatives of the losses by the place and the focal length of a camera, as sums over Gaussians.
+/* The derivatives of the losses by the pose and the focal length of a camera, as sums over Gaussians.
  *
- * To move a camera is to move all Gaussians the other way: turning it by -w about its center c turns means, quaternions
- * and directions of view by w.  What a Gaussian shows in a direction does not turn with them: the derivative by the
- * direction d from c, which is part of dL/dp, is taken out.  With a mean p and a quaternion (a, v), whose derivatives
- * are (g_a, g_v), in world axes
+ * Moving a camera is equivalent to moving all Gaussians the other way: rotating it by -w about its center c rotates
+ * means, quaternions and viewing directions by w.  The view-dependent colors do not rotate with them, so the derivative
+ * by the direction d from c, which is part of dL/dp, is subtracted.  With a mean p and a quaternion (a, v), whose
+ * derivatives are (g_a, g_v), in world axes
  *
  *   shift   sum dL/dp
  *   turn    sum (p - c) x dL/dp - d x dL/dd + 1/2 (a g_v - g_a v + v x g_v)
  *   focal   sum of dL/dln f, where both focal lengths are multiplied by f (backward.h)
  *
- * dL/dq has no part along q, so that the length of q does not matter.  The world filter is round: it does not turn.
+ * dL/dq has no part along q, so the length of q does not matter.  The world filter is isotropic, so it does not rotate.
  *
  * One item = LANES Gaussians; one group of POSE_GROUP items writes its sums, which the host adds in 64 bits in their
  * order.  Local memory: POSE_GROUP * POSE_SUMS * 4 bytes.  Deterministic. */
@@ -18,25 +18,25 @@
 #define POSE_GROUP 32  // items per work-group
 #define POSE_SUMS 7    // shift, turn, focal
 
-/* The terms of LANES Gaussians; zero where they were not drawn. */
+/* The terms of LANES Gaussians; zero where they were not rendered. */
 static inline void pose_terms(
     __global const float *means, __global const float *quats, __constant camera_t *camera, const gradient_t *g,
     const VF *weights, const uint degree, const uint stride, const uint i, VF *terms)
 {
-    VF d[3], gd[3] = {0.0f, 0.0f, 0.0f}, from[3], q[4];
+    VF d[3], gd[3] = {0.0f, 0.0f, 0.0f}, offset[3], q[4];
     view_direction(means, camera, stride, i, d);
     harmonics_direction_gradient(degree, d[0], d[1], d[2], weights, gd, gd + 1, gd + 2);
     for (uint k = 0; k < 3; k++)
-        from[k] = VLOAD(means + k * stride + i) - camera->position[k];
+        offset[k] = VLOAD(means + k * stride + i) - camera->position[k];
     for (uint k = 0; k < 4; k++)
         q[k] = VLOAD(quats + k * stride + i);
     for (uint k = 0; k < 3; k++) {
         const uint m = (k + 1) % 3, n = (k + 2) % 3;
-        const VF moved = from[m] * g->means[n] - from[n] * g->means[m] - (d[m] * gd[n] - d[n] * gd[m]);
-        const VF turned = q[0] * g->quats[1 + k] - g->quats[0] * q[1 + k] +
+        const VF by_position = offset[m] * g->means[n] - offset[n] * g->means[m] - (d[m] * gd[n] - d[n] * gd[m]);
+        const VF by_rotation = q[0] * g->quats[1 + k] - g->quats[0] * q[1 + k] +
                           (q[1 + m] * g->quats[1 + n] - q[1 + n] * g->quats[1 + m]);
         terms[k] = g->touched ? g->means[k] : (VF)(0.0f);
-        terms[3 + k] = g->touched ? moved + 0.5f * turned : (VF)(0.0f);
+        terms[3 + k] = g->touched ? by_position + 0.5f * by_rotation : (VF)(0.0f);
     }
     terms[6] = g->touched ? g->focal : (VF)(0.0f);
 }
@@ -70,9 +70,9 @@ void pose_gradient(
     if (i < count) {
         gradient_t g;
         VF weights[1][16], terms[POSE_SUMS];
-        const uint rest = sh_first(sh_slot, sh_block, i);
+        const uint sh_index = sh_first(sh_slot, sh_block, i);
         color_backward(splats, pixel_sums, stride, count, i, &g);
-        weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
+        weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &sh_index, weights);
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0],
                     near_plane, screen_variance, compensate, degree, stride, i, &g);
         pose_terms(means, quats, camera, &g, weights[0], degree, stride, i, terms);

@@ -3,10 +3,10 @@
  * Kerbl et al. 2023, section 4, with the linearized perspective of Zwicker et al. 2001.  Both filters are numbers:
  * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
- * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant, which changes no derivative by a logit: that is the
- * sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and `compensate` are 0.
+ * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant factor, which does not change the derivative by a
+ * logit: the sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and `compensate` are 0.
  *
- * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes what another reads. */
+ * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes values that another reads. */
 #include "backward.h"
 #include "tiles.h"
 
@@ -38,7 +38,7 @@ static inline void store_records(const VF *fields, const VI visible, const uint 
 #endif
 }
 
-__attribute__((vec_type_hint(VF)))  // in vectors already: a compiler that joins items makes it four times slower
+__attribute__((vec_type_hint(VF)))  // vectorized already; compilers that combine items make it four times slower
 /* Splat records, depth keys, 3-sigma radii and the tiles that each splat touches. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_forward(
@@ -50,7 +50,7 @@ void project_forward(
     __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
     __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global const float *restrict filter_variance,  // [S] scene units^2
-    __global const float *restrict hidden,           // [planes,S] whole numbers: bits of the views that leave it out
+    __global const float *restrict hidden,           // [planes,S] integers: bits of the views that hide a Gaussian
     __constant camera_t *restrict camera,            // [1]
     __global float *restrict splats,                 // [N,RECORD] see splat.h
     __global uint *restrict depth_key,               // [S] bits of z, all ones when culled
@@ -64,8 +64,8 @@ void project_forward(
     const float opacity_factor,                      // 1, or that of the step's dropout
     const uint row_begin,                            // of the band of tiles whose pairs are listed
     const uint row_end,
-    const uint hidden_plane,                         // that has the view
-    const uint hidden_bit,                           // of the view; 0: no Gaussian is left out
+    const uint hidden_plane,                         // of the view
+    const uint hidden_bit,                           // of the view; 0: no Gaussian is hidden
     const uint degree,
     const uint sh_block,                             // values of a block in a slot
     const uint stride,
@@ -91,7 +91,7 @@ void project_forward(
     VSTORE((seen ? r : (VF)(0.0f)), radius + i);
 
     const VF opacity = sigmoid(VLOAD(logit_opacity + i)) * s.energy * opacity_factor;
-#if PIXEL_BOX  // no pixel shows more of it than its whole area
+#if PIXEL_BOX  // a pixel shows at most the whole area of the splat
     const VI opaque = opacity * smaller(TWO_PI * sqrt(s.determinant), (VF)(1.0f)) > ALPHA_MIN;
 #else
     const VI opaque = opacity > ALPHA_MIN;
@@ -113,13 +113,13 @@ void project_forward(
         harmonics_basis(degree, d[0], d[1], d[2], basis);
         for (uint channel = 0; channel < 3; channel++)
             color[channel] += basis[0] * VLOAD(sh_base + channel * stride + i);
-        const uint rest = sh_first(sh_slot, sh_block, i);
+        const uint sh_index = sh_first(sh_slot, sh_block, i);
         if (degree > 0)
-            add_band(1, 4, basis, sh_rest, stride, rest, color);
+            add_band(1, 4, basis, sh_rest, stride, sh_index, color);
         if (degree > 1)
-            add_band(4, 9, basis, sh_rest, stride, rest, color);
+            add_band(4, 9, basis, sh_rest, stride, sh_index, color);
         if (degree > 2)
-            add_band(9, 16, basis, sh_rest, stride, rest, color);
+            add_band(9, 16, basis, sh_rest, stride, sh_index, color);
     }
 
     const VF zero = (VF)(0.0f);
@@ -185,9 +185,9 @@ void project_backward(
         return;
     gradient_t g;
     VF weights[1][16];
-    const uint rest = sh_first(sh_slot, sh_block, i);
+    const uint sh_index = sh_first(sh_slot, sh_block, i);
     color_backward(splats, pixel_sums, stride, count, i, &g);
-    weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
+    weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &sh_index, weights);
     gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);
@@ -201,6 +201,6 @@ void project_backward(
             store_planes(grad_sh_base, coefficients, g.touched, 3, stride, i);
         else if (sh_held(sh_slot, i))
             store_planes(grad_sh_rest + (k - 1) * 3 * SH_STRIDE(stride), coefficients, g.touched, 3, SH_STRIDE(stride),
-                         rest);
+                         sh_index);
     }
 }

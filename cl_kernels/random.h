@@ -1,5 +1,5 @@
-/* Counter-based random numbers: Philox 4x32-10 (Salmon et al. 2011).  A number depends on (seed, step, Gaussian) only,
- * not on the numbers drawn before: a resumed run and any number of cores give the same bits. */
+/* Counter-based random numbers: Philox 4x32-10 (Salmon et al. 2011).  A number depends only on (seed, step, Gaussian),
+ * not on numbers drawn before, so a resumed run and any number of cores give the same bits. */
 #ifndef CLSPLAT_RANDOM_H
 #define CLSPLAT_RANDOM_H
 

@@ -1,4 +1,4 @@
-/* Rays of pixels, each the axis of a cone, and where a ray is cut into samples (Barron et al. 2021, "Mip-NeRF").
+/* Rays of pixels, each the axis of a cone, and the edges of their samples (Barron et al. 2021, "Mip-NeRF").
  *
  *   ray     o the camera's position, d toward the pixel's center with depth 1 in the camera; at a distance t of 1 the
  *           cone has the radius 2 / sqrt(12) of a pixel's width (section 3.1)
@@ -14,12 +14,12 @@
 #define RAY_VALUES 8                  // of a ray: o, d, radius of the cone, |d|
 #define CONE_RADIUS 0.577350269f      // 2 / sqrt(12)
 #define BLUR_PADDING 0.01f            // alpha of equation 18
-#define WEIGHT_FLOOR 1.0e-5f          // least sum of the weights of a ray (released code)
+#define WEIGHT_FLOOR 1.0e-5f          // smallest sum of a ray's weights (released code)
 #define RANDOM_PIXELS 8u              // stream of random numbers, different from those of other kernels
 #define RANDOM_COARSE 9u
 #define RANDOM_FINE 10u
 
-/* A pixel of a photograph for each ray, all equally likely. */
+/* A uniformly random pixel of a photograph for each ray. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void draw_pixels(
     __global uint *restrict pixels,  // [rays] row * width + column
@@ -78,7 +78,7 @@ void spread_edges(
     const uint i = get_global_id(0);
     if (i >= count)
         return;
-    __global float *own = edges + i * (samples + 1);
+    __global float *ray_edges = edges + i * (samples + 1);
     const float width = (far - near) / (float)samples;
     uint bits[4];
     for (uint k = 0; k <= samples; k++) {
@@ -87,16 +87,16 @@ void spread_edges(
             bits[0] = four.x, bits[1] = four.y, bits[2] = four.z, bits[3] = four.w;
         }
         const float low = k == 0 ? 0.0f : (float)k - 0.5f, high = k == samples ? (float)k : (float)k + 0.5f;
-        const float place = drawn ? low + (high - low) * unit_interval(bits[k % 4]) : (float)k;
-        own[k] = near + width * place;
+        const float position = drawn ? low + (high - low) * unit_interval(bits[k % 4]) : (float)k;
+        ray_edges[k] = near + width * position;
     }
 }
 
-/* The blurred weight of a sample, of a ray's weights w. */
+/* The blurred weight of a sample, from a ray's weights w. */
 static inline float blurred_weight(__global const float *w, const uint k, const uint samples)
 {
-    const float before = w[k == 0 ? 0 : k - 1], own = w[k], after = w[k + 1 == samples ? k : k + 1];
-    const float low = before > own ? before : own, high = after > own ? after : own;
+    const float before = w[k == 0 ? 0 : k - 1], weight = w[k], after = w[k + 1 == samples ? k : k + 1];
+    const float low = before > weight ? before : weight, high = after > weight ? after : weight;
     return 0.5f * (low + high) + BLUR_PADDING;
 }
 
@@ -118,13 +118,13 @@ void resample_edges(
     if (i >= count)
         return;
     __global const float *w = weights + i * samples, *t = edges + i * (samples + 1);
-    __global float *own = fine + i * (fine_samples + 1);
+    __global float *ray_edges = fine + i * (fine_samples + 1);
     float total = 0.0f;
     for (uint k = 0; k < samples; k++)
         total += blurred_weight(w, k, samples);
     const float lift = total < WEIGHT_FLOOR ? (WEIGHT_FLOOR - total) / (float)samples : 0.0f;
     total += lift * (float)samples;
-    const float part = 1.0f / (float)(fine_samples + 1), most = 1.0f - FLT_EPSILON;
+    const float part = 1.0f / (float)(fine_samples + 1), max_quantile = 1.0f - FLT_EPSILON;
     uint bits[4], k = 0;
     float below = 0.0f, mass = (blurred_weight(w, 0, samples) + lift) / total;
     for (uint edge = 0; edge <= fine_samples; edge++) {
@@ -132,15 +132,15 @@ void resample_edges(
             const uint4 four = philox((uint4)(first_ray + i, step, RANDOM_FINE, edge / 4), (uint2)(seed, 0));
             bits[0] = four.x, bits[1] = four.y, bits[2] = four.z, bits[3] = four.w;
         }
-        const float even = (float)edge * most / (float)fine_samples;
+        const float even = (float)edge * max_quantile / (float)fine_samples;
         const float within = ((float)edge + unit_interval(bits[edge % 4])) * part;
-        const float wanted = drawn ? (within < most ? within : most) : even;
-        while (k + 1 < samples && below + mass <= wanted) {
+        const float quantile = drawn ? (within < max_quantile ? within : max_quantile) : even;
+        while (k + 1 < samples && below + mass <= quantile) {
             below += mass;
             k++;
             mass = (blurred_weight(w, k, samples) + lift) / total;
         }
-        const float share = (wanted - below) / mass;
-        own[edge] = t[k] + (t[k + 1] - t[k]) * (share > 1.0f ? 1.0f : share);
+        const float fraction = (quantile - below) / mass;
+        ray_edges[edge] = t[k] + (t[k + 1] - t[k]) * (fraction > 1.0f ? 1.0f : fraction);
     }
 }

@@ -1,12 +1,12 @@
-/* A splat seen from the rows of a tile, for CPUs: what a row of pixels needs is computed for all rows of a tile at
- * once, LANES of them together, so that the loops over pixels read numbers that are ready, without a branch.  The
+/* A splat seen from the rows of a tile, for CPUs: the values that a row of pixels needs are precomputed for all rows of
+ * a tile, LANES at once, so that loops over pixels only read them, without a branch.  The
  * formulas are those of splat.h; the bits are those of splat_at_row. */
 #ifndef CLSPLAT_ROWS_H
 #define CLSPLAT_ROWS_H
 #include "splat.h"
 
 #define COLUMNS (TILE / LANES)  // vectors per tile row
-#define SEGMENT 64              // splats of a tile loaded together: one wait for memory, then rows read the cache
+#define SEGMENT 64              // splats of a tile loaded together: one wait for memory, then rows read from the cache
 
 static inline VF pixel_centers(const uint tile_x, const uint column)
 {
@@ -53,7 +53,7 @@ static inline row_splat_t splat_on_lines(const float *splat, const float (*lines
 #define SLOPE_FIELDS 2  // dy, slope
 #define SPLAT_AT(splat, lines, y, column) splat_on_lines(splat, lines, 0, y)
 
-/* What splat_at_row computes, for all rows of a tile; `slopes` is wanted in the backward pass. */
+/* The values of splat_at_row for all rows of a tile; `slopes` is only used in the backward pass. */
 static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
                             float (*slopes)[TILE])
 {

@@ -1,11 +1,11 @@
-/* The splitting matrix of each Gaussian (SteepGS, Wang et al. 2025): what its loss gains when it becomes two.
+/* The splitting matrix of each Gaussian (SteepGS, Wang et al. 2025): how much its loss improves by splitting it.
  *
  * On the screen, with p = dL/dpower, the conic K and d = mean - pixel center:
  *
  *   S2 = sum_pixels dL/dalpha Hessian of alpha by the mean = sum_pixels p (K d d^T K - K)
  *
- * and in the scene S = A^T S2 A with A = d(projected mean)/d(mean), [2,3]: perspective and the form of the splat are
- * taken as constant over the distance of the children.  One item = one Gaussian.  No local memory.  Deterministic. */
+ * and in the scene S = A^T S2 A with A = d(projected mean)/d(mean), [2,3]: perspective and the shape of the splat are
+ * assumed constant over the distance of the children.  One item = one Gaussian.  No local memory.  Deterministic. */
 #include "splat.h"
 
 /* Add the splitting matrix of this view. */
@@ -40,8 +40,8 @@ void accumulate_splitting(
         u[k] = camera->fx * inverse_z * (w[k] - ray_x * w[8 + k]);
         v[k] = camera->fy * inverse_z * (w[4 + k] - ray_y * w[8 + k]);
     }
-    uint place = i;
+    uint index = i;
     for (uint k = 0; k < 3; k++)
-        for (uint j = k; j < 3; j++, place += stride)
-            total[place] += s_xx * u[k] * u[j] + s_xy * (u[k] * v[j] + v[k] * u[j]) + s_yy * v[k] * v[j];
+        for (uint j = k; j < 3; j++, index += stride)
+            total[index] += s_xx * u[k] * u[j] + s_xy * (u[k] * v[j] + v[k] * u[j]) + s_yy * v[k] * v[j];
 }

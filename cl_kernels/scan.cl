@@ -1,14 +1,14 @@
-/* Exclusive prefix sum of unsigned integers: sum each block, then scan inside blocks, each behind the sums before it.
+/* Exclusive prefix sum of unsigned integers: sum each block, then scan inside blocks, after the sums of earlier ones.
  *
  * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
- * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another.  Sums that would wrap stay at
+ * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another.  Sums saturate at
  * UINT_MAX, in any order of additions, so that the total is never a small number by mistake. */
 #include "common.h"
 
-static inline uint added(const uint a, const uint b)
+static inline uint saturating_add(const uint a, const uint b)
 {
     const uint sum = a + b;
-    // Oclgrind 21.10 lacks the saturating addition that compilers make of `sum < a ? UINT_MAX : sum`.
+    // Oclgrind 21.10 lacks the saturating addition into which compilers turn `sum < a ? UINT_MAX : sum`.
     const uint carry = ((a & b) | ((a | b) & ~sum)) >> 31;
     return sum | (0u - carry);
 }
@@ -26,19 +26,19 @@ void scan_blocks(
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
     for (uint i = first; i < first + run && i < count; i++)
-        sum = added(sum, values[i]);
+        sum = saturating_add(sum, values[i]);
     sums[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {
         uint total = 0;
         for (uint i = 0; i < TEAM; i++)
-            total = added(total, sums[i]);
+            total = saturating_add(total, sums[i]);
         block_sum[get_group_id(0)] = total;
     }
 }
 
 /* offset[i] = sum of the values before i; offset[count] = their total.  Each group adds the sums of all blocks before
- * its own: the host keeps them few.  Local memory: TEAM * 8 bytes. */
+ * its own; the host limits their number.  Local memory: TEAM * 8 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void scan_offsets(
     __global const uint *restrict values,     // [count]
@@ -47,38 +47,38 @@ void scan_offsets(
     const uint run,
     const uint count)
 {
-    __local uint sums[TEAM], sums_before[TEAM];  // of the item's values, and of its share of the blocks before
+    __local uint sums[TEAM], sums_before[TEAM];  // of the item's values, and of its part of the earlier blocks
     const uint item = get_local_id(0);
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
-    for (uint i = first; TEAM > 1 && i < first + run && i < count; i++)  // wanted by the items behind
-        sum = added(sum, values[i]);
+    for (uint i = first; TEAM > 1 && i < first + run && i < count; i++)  // for the later items
+        sum = saturating_add(sum, values[i]);
     uint before = 0;
     for (uint block = item; block < get_group_id(0); block += TEAM)
-        before = added(before, block_sum[block]);
+        before = saturating_add(before, block_sum[block]);
     sums[item] = sum;
     sums_before[item] = before;
     barrier(CLK_LOCAL_MEM_FENCE);
     sum = 0;
     for (uint i = 0; i < TEAM; i++)
-        sum = added(sum, added(sums_before[i], i < item ? sums[i] : 0));
+        sum = saturating_add(sum, saturating_add(sums_before[i], i < item ? sums[i] : 0));
     for (uint i = first; i < first + run && i < count; i++) {
         offset[i] = sum;
-        sum = added(sum, values[i]);
+        sum = saturating_add(sum, values[i]);
         if (i + 1 == count)
             offset[count] = sum;
     }
 }
 
-/* Put values in another order, before the scan of a permuted table.  One item = one place. */
+/* Reorder values, before the scan of a permuted table.  One item = one position. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void permute(
     __global const uint *restrict values,  // [N]
-    __global const uint *restrict order,   // [count] index of the value at each place
+    __global const uint *restrict order,   // [count] index of the value at each position
     __global uint *restrict permuted,      // [count]
     const uint count)
 {
-    const uint place = get_global_id(0);
-    if (place < count)
-        permuted[place] = values[order[place]];
+    const uint position = get_global_id(0);
+    if (position < count)
+        permuted[position] = values[order[position]];
 }

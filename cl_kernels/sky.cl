@@ -1,24 +1,24 @@
-/* A background of directions: what is behind the Gaussians, as a picture of all directions from the scene.
+/* An environment map: the color behind the Gaussians for every direction.
  *
- * The picture is an octahedral map (Meyer et al. 2010, "On floating-point normal vectors", section 2.2): with s = |x| +
- * |y| + |z|, a direction (x, y, z) lies at (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z, y - sign(y) z) / s
- * else.  So (u, v) fills the square [-1, 1]^2 without a gap, and the square's edges meet on the sphere.  side *
+ * It is an octahedral map (Meyer et al. 2010, "On floating-point normal vectors", section 2.2): with s = |x| +
+ * |y| + |z|, a direction (x, y, z) maps to (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z, y - sign(y) z) / s
+ * otherwise.  So (u, v) fills the square [-1, 1]^2 without a gap, and the square's edges meet on the sphere.  side *
  * side texels have their centers at -1 + (2 i + 1) / side; between four of them colors are bilinear.  A pixel has the
- * color C + T b, with b the map's color in the direction of its ray and T what the splats leave.
+ * color C + T b, with b the map's color in the direction of its ray and T the transmittance of the splats.
  *
- * The host lists, for each camera, the runs of pixels of a row between the same four texels in one octant: what is read
- * and summed for a run is the same for all its pixels, and only its rays differ.  Each sum has one place and is written
- * once: run by run, then over the runs about each texel in their order.  Deterministic. */
+ * The host lists, for each camera, the runs of pixels of a row between the same four texels in one octant: all pixels
+ * of a run read and update the same texels, and only their rays differ.  Each sum is written once: for each run, then
+ * over the runs around each texel, in order.  Deterministic. */
 #include "adam.h"
 #include "planes.h"
 
 #define RUN_WORDS 8   // of a run: row, first column, column after the last, place, the four texels
-#define CORNERS 4     // texels about a pixel: (i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)
+#define CORNERS 4     // texels around a pixel: (i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)
 #define RUN_SUMS 12   // of a run: for each corner red, green, blue
-#define PLACE_BITS 12 // place: i + 1, j + 1, then a bit for each of x, y, z below 0
-#define SKY_EPSILON 1.0f  // of Adam: the gradient of a pixel that is wrong by any amount in L1 (ours)
+#define PLACE_BITS 12 // of i + 1 and j + 1 in a place; then a bit for each of x, y, z that is negative
+#define SKY_EPSILON 1.0f  // of Adam: the L1 gradient of one wrong pixel (ours)
 #define BORDER 16         // columns of zeros on either side of the matches; rows: 1
-#define MOST_OF_BOX 0.6f  // share of the 3 x 3 pixels about one that must match (splatfacto-w, Xu et al. 2024)
+#define MATCH_FRACTION 0.6f  // of the 3 x 3 pixels around a pixel that must match (splatfacto-w, Xu et al. 2024)
 
 typedef struct {
     float row, i, j;             // of the ray; of the first texel
@@ -43,8 +43,7 @@ static inline run_t run_of(__global const uint *runs, const uint number, const u
     return run;
 }
 
-/* Weights of the four texels in LANES pixels from a column on, and 1 in `inside` where a pixel is one of the run's from
- * `from` on. */
+/* Weights of the four texels for LANES pixels from a column on; `inside` is 1 for pixels of the run from `from` on. */
 static inline void corner_weights(
     const run_t *run, __constant camera_t *camera, const float half_side, const uint column, const uint from,
     VF *weights, VF *inside)
@@ -68,8 +67,8 @@ static inline void corner_weights(
     *inside = lane >= (int)from ? (lane < (int)run->end ? one : zero) : zero;
 }
 
-/* Add T b to the image.  One item = a strip of runs, in order: vectors may reach into its other runs, and no other
- * item's.  No local memory. */
+/* Add T b to the image.  One item = a strip of runs, in order: vectors may reach into other runs of the item, but not
+ * of other items.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_forward(
     __global const uint *restrict runs,            // [R,RUN_WORDS]
@@ -114,7 +113,7 @@ void sky_matches(
     __global const uint *restrict runs,         // [R,RUN_WORDS]
     __global const uint *restrict strips,       // [strips + 1] first run of each
     __global const float *restrict texels,      // [3,side * side]
-    __global const float *restrict free,        // [side * side] 1 for a texel that is learned, else 0
+    __global const float *restrict free,        // [side * side] 1 for learned texels, else 0
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict photograph,  // [3,H',stride]
     __global float *restrict matches,           // [H' + 2,stride + 2 BORDER] all zero before
@@ -136,26 +135,26 @@ void sky_matches(
             VF weights[CORNERS], inside;
             corner_weights(&run, camera, half_side, column, x, weights, &inside);
             const uint at = run.at + column;
-            VF apart = (VF)(0.0f);
+            VF total_difference = (VF)(0.0f);
             for (uint channel = 0; channel < 3; channel++) {
                 __global const float *values = texels + channel * map_plane;
                 VF color = (VF)(0.0f);
                 for (uint k = 0; k < CORNERS; k++)
                     color += weights[k] * values[corners[k]];
-                apart += magnitude(color - VLOAD(photograph + channel * plane + at));
+                total_difference += magnitude(color - VLOAD(photograph + channel * plane + at));
             }
             float learned = 1.0f;
             for (uint k = 0; k < CORNERS; k++)
                 learned *= free[corners[k]];
-            const VF found = apart <= 3.0f * difference ? inside * learned : (VF)(0.0f);
+            const VF matched = total_difference <= 3.0f * difference ? inside * learned : (VF)(0.0f);
             __global float *match = matches + (run.at / stride + 1) * (stride + 2 * BORDER) + BORDER + column;
-            VSTORE(VLOAD(match) + found, match);
+            VSTORE(VLOAD(match) + matched, match);
         }
     }
 }
 
-/* The loss of what covers the sky: weight / (width height) times the sum of 1 - T over pixels of which most of the
- * 3 x 3 about them match.  Writes T dL/dT, which blend_backward reads, and the sum of each row.
+/* The loss of splats that cover the sky: weight / (width height) times the sum of 1 - T over pixels with a 3 x 3
+ * neighborhood that mostly matches.  Writes T dL/dT for blend_backward, and the sum of each row.
  * One group = one row.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void sky_cover(
@@ -170,16 +169,16 @@ void sky_cover(
 {
     __local float sums[TEAM];
     const uint item = get_local_id(0), y = get_group_id(1), columns = y < height ? width : 0;
-    const uint wide = stride + 2 * BORDER;
+    const uint padded_stride = stride + 2 * BORDER;
     VF total = (VF)(0.0f);
     for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
         const uint at = y * stride + x;
         VF box = (VF)(0.0f);
         for (uint row = y; row < y + 3; row++) {
-            __global const float *match = matches + row * wide + BORDER + x;
+            __global const float *match = matches + row * padded_stride + BORDER + x;
             box += VLOAD(match - 1) + VLOAD(match) + VLOAD(match + 1);
         }
-        const VF chosen = box > 9.0f * MOST_OF_BOX ? inside_row(x, columns) : (VF)(0.0f);
+        const VF chosen = box > 9.0f * MATCH_FRACTION ? inside_row(x, columns) : (VF)(0.0f);
         const VF t = magnitude(VLOAD(transmittance + at));
         VSTORE(-scale * (chosen * t), behind + at);
         total += chosen * (1.0f - t);
@@ -234,26 +233,26 @@ void sky_gather(
     __global const float *restrict run_sums,   // [R,RUN_SUMS]
     __global const uint *restrict first_entry, // [shown + 1]
     __global const uint *restrict entries,     // [R * CORNERS] run * CORNERS + corner, by texel
-    __global float *restrict grad_texels,        // [3,shown]
+    __global float *restrict grad_texels,      // [3,shown]
     const uint shown)                          // texels that the view shows
 {
-    const uint place = get_global_id(0), channel = get_global_id(1);
-    if (place >= shown)
+    const uint index = get_global_id(0), channel = get_global_id(1);
+    if (index >= shown)
         return;
     float sum = 0.0f;
-    for (uint k = first_entry[place]; k < first_entry[place + 1]; k++)
+    for (uint k = first_entry[index]; k < first_entry[index + 1]; k++)
         sum += run_sums[entries[k] * 3 + channel];
-    grad_texels[channel * shown + place] = sum;
+    grad_texels[channel * shown + index] = sum;
 }
 
-/* Adam on the texels that the view shows and that are learned, each with the bias of its own updates: 1 - BETA^t, by
- * the recursion of the moments for a gradient of 1.  The gradient is counted in pixels of L1: a texel of which less
- * than a pixel is seen, behind a wall, hardly moves.  One item = one texel. */
+/* Adam on the learned texels that the view shows, each with the bias correction of its own updates: 1 - BETA^t, by the
+ * recursion of the moments for a gradient of 1.  The gradient is in pixels of L1: a texel that is visible in less than
+ * a pixel, as behind a wall, hardly changes.  One item = one texel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_update(
     __global const uint *restrict shown_texels,  // [shown]
-    __global const float *restrict grad_texels,    // [3,shown]
-    __global const float *restrict free,         // [side * side] 1 for a texel that is learned, else 0
+    __global const float *restrict grad_texels,  // [3,shown]
+    __global const float *restrict free,         // [side * side] 1 for learned texels, else 0
     __global float *restrict texels,             // [3,side * side]
     __global float *restrict moment1,            // [3,side * side]
     __global float *restrict moment2,            // [3,side * side]
@@ -263,15 +262,15 @@ void sky_update(
     const uint map_plane,                        // side * side
     const uint shown)
 {
-    const uint place = get_global_id(0);
-    if (place >= shown)
+    const uint index = get_global_id(0);
+    if (index >= shown)
         return;
-    const uint texel = shown_texels[place];
+    const uint texel = shown_texels[index];
     const float bias1 = BETA1 * biases[texel] + (1.0f - BETA1);
     const float bias2 = BETA2 * biases[map_plane + texel] + (1.0f - BETA2);
     for (uint channel = 0; channel < 3; channel++) {
         const uint at = channel * map_plane + texel;
-        const float g = grad_texels[channel * shown + place] * pixels;
+        const float g = grad_texels[channel * shown + index] * pixels;
         const float m = BETA1 * moment1[at] + (1.0f - BETA1) * g;
         const float v = BETA2 * moment2[at] + (1.0f - BETA2) * (g * g);
         moment1[at] = m;

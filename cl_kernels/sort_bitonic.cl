@@ -36,12 +36,12 @@ void fill_tiles(
     if (pair >= count)
         return;
     const uint tile = pair_tile[pair];
-    const uint place = tile_offset[tile] + atomic_inc(tile_fill + tile);
-    tile_depth[place] = depth_key[pair_splat[pair]];
-    tile_pairs[place] = pair;
+    const uint position = tile_offset[tile] + atomic_inc(tile_fill + tile);
+    tile_depth[position] = depth_key[pair_splat[pair]];
+    tile_pairs[position] = pair;
 }
 
-/* The network, for keys and pairs in either address space. */
+/* The sorting network, for keys and pairs in either address space. */
 #define SORT_NETWORK(keys, pairs, count, fence)                                                  \
     for (uint block = 2; (block >> 1) < (count); block <<= 1)                                    \
         for (uint step = block >> 1, flip = 1; step > 0; step >>= 1, flip = 0) {                 \

@@ -1,7 +1,7 @@
 /* One pass of a stable radix sort of (key, value) pairs: count digits, scan the counts (scan.cl), scatter.
  *
  * A block is one work-group; each of its TEAM items owns `run` consecutive pairs, so that the order in a block is the
- * order of items and stability needs no atomics.  On CPUs one item per group sorts a long run with wide digits; on
+ * order of items, and stability needs no atomics.  On CPUs one item per group sorts a long run with wide digits; on
  * GPUs the items of a group sort short runs with narrow digits.  Local memory: 4 << DIGIT_BITS bytes * TEAM.
  * Deterministic. */
 #include "common.h"
@@ -39,7 +39,7 @@ void radix_count(
     }
 }
 
-/* Move every pair to its place.  In the first pass the values are the indices of the keys: 0, 1, 2, ... */
+/* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ... */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_scatter(
     __global const uint *restrict keys,          // [count]
@@ -54,25 +54,25 @@ void radix_scatter(
     const uint blocks,
     const uint count)
 {
-    __local uint places[TEAM << DIGIT_BITS];
+    __local uint positions[TEAM << DIGIT_BITS];
     const uint item = get_local_id(0), block = get_group_id(0);
     const uint first = (block * TEAM + item) * run;
-    if (TEAM > 1)  // a single item starts where its block does
-        count_digits(keys, places, first, run, shift, digits, count);
+    if (TEAM > 1)  // a single item starts at the start of its block
+        count_digits(keys, positions, first, run, shift, digits, count);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint digit = item; digit < digits; digit += TEAM) {
-        uint place = digit_offset[digit * blocks + block];
+        uint position = digit_offset[digit * blocks + block];
         for (uint i = 0; i < TEAM; i++) {
-            const uint here = TEAM > 1 ? places[digit * TEAM + i] : 0;
-            places[digit * TEAM + i] = place;
-            place += here;
+            const uint digits_here = TEAM > 1 ? positions[digit * TEAM + i] : 0;
+            positions[digit * TEAM + i] = position;
+            position += digits_here;
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint i = first; i < first + run && i < count; i++) {
         const uint key = keys[i];
-        const uint place = places[((key >> shift) & (digits - 1)) * TEAM + item]++;
-        sorted_keys[place] = key;
-        sorted_values[place] = first_pass ? i : values[i];
+        const uint position = positions[((key >> shift) & (digits - 1)) * TEAM + item]++;
+        sorted_keys[position] = key;
+        sorted_values[position] = first_pass ? i : values[i];
     }
 }

@@ -7,11 +7,11 @@
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
  * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign.
  *
- * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and has to be >= 1/255.
+ * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and must be >= 1/255.
  *
  * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
- * and the last T: how far a pixel is from showing a single splat.  With INVERSE_DEPTH, never both, it is a fourth
- * channel, D = sum_i w_i / z_i with the depths of the means, and 0 behind the splats. */
+ * and the final T: how far a pixel is from showing a single splat.  With INVERSE_DEPTH, which excludes the former, it
+ * is D = sum_i w_i / z_i with the depths of the means, and 0 behind the splats. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -41,17 +41,17 @@
 #define SUM_RED 6      // w dL/dcolor; then green, blue
 #define SUM_ABS_X 9    // |dL/dx| of the mean, px^-1; this and the next sums exist where PIXEL_SUMS is larger
 #define SUM_ABS_Y 10
-#define SUM_WEIGHT 11  // w, where the texture is known: not below 0
-#define SUM_TEXTURE 12 // w times the texture at the pixel, there
-#define SUM_BLENDED 13 // the texture of the pixels that the splat is blended in, there: with ones, their number
+#define SUM_WEIGHT 11  // w, of pixels with a known texture, >= 0
+#define SUM_TEXTURE 12 // w times the texture, of the same pixels
+#define SUM_BLENDED 13 // the texture of those of them that blend the splat: with a texture of 1, their number
 #define SUM_SQUARE 14  // (dL/dG)^2 with G = e^power, so that alpha = opacity G
-#define SUM_INVERSE_DEPTH 15  // w dL/dD; summed where INVERSE_DEPTH, apart from the others (inverse_depth.cl)
+#define SUM_INVERSE_DEPTH 15  // w dL/dD; only with INVERSE_DEPTH, summed separately (inverse_depth.cl)
 
 /* With PIXEL_BOX p = dL/dln(alpha), and SUM_X to SUM_YY are p times the derivatives of ln(alpha), by x and y of the
  * mean and by k, ln s and ln t of pixel_box.h. */
 
-/* A gradient record is written and read in aligned parts: quads where an item computes one Gaussian, and only those
- * with sums; else whole. */
+/* A gradient record is written and read in aligned parts: with one lane, the quads that contain sums; otherwise the
+ * whole record. */
 #if LANES == 1
 typedef float4 sums_part_t;
 #define SUMS_PARTS (INVERSE_DEPTH ? RECORD / 4 : (PIXEL_SUMS + 3) / 4)
@@ -170,7 +170,7 @@ typedef struct {
 
 #define FOURTH_PLANE (WEIGHT_ENTROPY || INVERSE_DEPTH)
 
-/* ln w; finite for the weight 0 of what is not blended. */
+/* ln w; finite for a weight of 0. */
 static inline VF log_weight(const VF w) { return log_positive(larger(w, (VF)(1.0e-30f))); }
 
 static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *color)

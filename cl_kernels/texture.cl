@@ -1,4 +1,5 @@
-/* Gradient magnitude of an image: |Sobel| / 8 of its luminance (Rec. 601 weights), per px; edges are repeated outwards.
+/* Gradient magnitude of an image: |Sobel| / 8 of its luminance (Rec. 601 weights), per px; edge pixels are repeated
+ * outwards.
  *
  * One item = LANES pixels of a row.  No local memory.  Deterministic. */
 #include "splat.h"
@@ -56,7 +57,7 @@ void image_gradient(
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }
 
-/* Set the magnitude of masked pixels and of their neighbors to -1: it is not known there.  One item = one pixel. */
+/* Set the magnitude of masked pixels and of their neighbors to -1, for unknown.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
     __global const float *restrict mask,  // [H',stride] 0 or 1
@@ -78,10 +79,10 @@ void hide_masked(
 }
 
 /* Add to each visible Gaussian the magnitude at its projected mean, from the nearest pixel of the image; 0 where it is
- * not known. */
+ * unknown. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sample_magnitude(
-    __global const float *restrict magnitude,  // [H',stride] per px, below 0: not known
+    __global const float *restrict magnitude,  // [H',stride] per px, negative: unknown
     __global const float *restrict splats,     // [N,RECORD] see splat.h
     __global const float *restrict radius,     // [S] px, 0 = not seen
     __global float *restrict total,            // [S]
@@ -97,6 +98,6 @@ void sample_magnitude(
     const float x = splat[SPLAT_X], y = splat[SPLAT_Y], right = (float)(width - 1), bottom = (float)(height - 1);
     const uint column = (uint)(x > 0.0f ? (x < right ? x : right) : 0.0f);
     const uint row = (uint)(y > 0.0f ? (y < bottom ? y : bottom) : 0.0f);
-    const float found = magnitude[row * stride + column];
-    total[i] += found > 0.0f ? found : 0.0f;
+    const float sample = magnitude[row * stride + column];
+    total[i] += sample > 0.0f ? sample : 0.0f;
 }

@@ -1,8 +1,8 @@
 /* The tiles that splats touch: LANES splats at once, or one splat in every lane.
  *
  * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  Pairs are
- * made from two numbers: `tile_box`, the rectangle's corner and width, and `tile_mask`, one bit per touched tile,
- * where the rectangle has no more than 32 tiles; larger ones have width BOX_LARGE and are left to large.cl. */
+ * derived from two numbers: `tile_box`, the rectangle's corner and width, and `tile_mask`, one bit per touched tile,
+ * where the rectangle has no more than 32 tiles; larger ones have width BOX_LARGE and are listed by large.cl. */
 #ifndef CLSPLAT_TILES_H
 #define CLSPLAT_TILES_H
 #include "splat.h"
@@ -17,7 +17,7 @@ typedef struct {
     VF along_x, along_y;   // where the ellipse is highest over x, and furthest right over y: -xy/yy, -xy/xx
     VF reach;              // -power where alpha is 1/255, plus EXTENT_SLACK / 2
     VF first_x, first_y;   // corner of the rectangle, tiles
-    VF columns, rows;      // its size, tiles; none when the splat is not visible
+    VF columns, rows;      // its size, tiles; 0 if the splat is not visible
 } footprint_t;
 
 #if PIXEL_BOX  // a splat reaches a pixel where it reaches its edge
@@ -94,7 +94,8 @@ static inline VI touches_tile(const footprint_t *f, const VF column, const VF ro
 
 static inline VI is_large(const footprint_t *f) { return f->columns * f->rows > (float)BOX_TILES_MAX; }
 
-/* How many tiles each splat touches; their mask.  None where the rectangle has more tiles than a mask has bits. */
+/* The number of tiles that each splat touches, and their mask; 0 if the rectangle has more tiles than a mask has bits.
+ * */
 static inline VI count_tiles(const footprint_t *f, VI *mask)
 {
     const VI columns = to_VI(f->columns), zero = (VI)(0);

@@ -1,5 +1,5 @@
-/* Transients, which a photograph shows and the scene does not have: residuals, their histogram, and the mask of pixels
- * without large residuals.
+/* Transients, objects in a photograph that are not part of the scene: residuals, their histogram, and the mask of
+ * pixels without large residuals.
  *
  * A residual is the mean over the channels of |image - photograph|; -1 in pixels that do not count.  Bins are eighths
  * of octaves from 2^-12 on: the upper bits of the float itself.  Planes are [channels,H',W'] with H', W' whole tiles,
@@ -7,7 +7,7 @@
 #include "planes.h"
 
 #define BINS 96        // twelve octaves, up to 1; the first and the last also count values beyond
-#define BIN_SHIFT 20   // bits of the mantissa that a bin does not see: 3 of 23 are left
+#define BIN_SHIFT 20   // low bits of the mantissa that bins ignore; 3 of 23 are left
 #define FIRST_BIN 920  // (127 - 12) * 8: the upper bits of 2^-12
 
 /* Residuals and their histogram.  One group of TEAM items = one row.  Local memory: BINS * 4 bytes. */
@@ -24,10 +24,10 @@ void measure_residuals(
     const uint rows,                            // H'
     const uint stride)
 {
-    __local uint own[BINS];
+    __local uint row_counts[BINS];
     const uint item = get_local_id(0), y = get_group_id(1), plane = rows * stride;
     for (uint k = item; k < BINS; k += TEAM)
-        own[k] = 0;
+        row_counts[k] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint x = item; x < stride; x += TEAM) {
         const uint at = y * stride + x;
@@ -38,22 +38,22 @@ void measure_residuals(
         const float residual = (red + green + blue) * (1.0f / 3.0f);
         residuals[at] = counts ? residual : -1.0f;
         if (counts)
-            atomic_inc(own + clamp((as_int(residual) >> BIN_SHIFT) - FIRST_BIN, 0, BINS - 1));
+            atomic_inc(row_counts + clamp((as_int(residual) >> BIN_SHIFT) - FIRST_BIN, 0, BINS - 1));
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint k = item; k < BINS; k += TEAM)
-        if (own[k] > 0)
-            atomic_add(numbers + k, own[k]);
+        if (row_counts[k] > 0)
+            atomic_add(numbers + k, row_counts[k]);
 }
 
-/* 1 in pixels whose residual, or at least as many of those in the box about them as not, are below a threshold; else 0.
- * One item = one pixel; dimension 1 is the row. */
+/* 1 in pixels whose residual is below a threshold, or with a box around them in which at least as many residuals are
+ * below it as not; else 0.  One item = one pixel; dimension 1 is the row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mask_transients(
     __global const float *restrict residuals,  // [H',stride]
     __global float *restrict mask,             // [H',stride]
     const float threshold,
-    const uint reach,                          // px from the middle of the box to its edges
+    const uint reach,                          // px from the center of the box to its edges
     const uint width,
     const uint height,
     const uint stride)
@@ -61,9 +61,9 @@ void mask_transients(
     const uint x = get_global_id(0), y = get_global_id(1);
     if (x >= stride)
         return;
-    const float own = residuals[y * stride + x];
-    bool kept = !(own < 0.0f);  // NaN stays: the losses find it
-    if (kept && own >= threshold) {
+    const float center = residuals[y * stride + x];
+    bool is_counted = !(center < 0.0f);  // NaN counts, so that the losses detect it
+    if (is_counted && center >= threshold) {
         uint counted = 0, below = 0;
         for (uint row = y > reach ? y - reach : 0; row <= y + reach && row < height; row++)
             for (uint column = x > reach ? x - reach : 0; column <= x + reach && column < width; column++) {
@@ -71,7 +71,7 @@ void mask_transients(
                 counted += residual >= 0.0f;
                 below += residual >= 0.0f && residual < threshold;
             }
-        kept = 2 * below >= counted;
+        is_counted = 2 * below >= counted;
     }
-    mask[y * stride + x] = kept ? 1.0f : 0.0f;
+    mask[y * stride + x] = is_counted ? 1.0f : 0.0f;
 }

@@ -110,7 +110,7 @@ def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
     workspace.device.program("haar.cl").haar_forward(
         items=(camera.stride // 2, camera.rows // 2),
         image=planes.colors,
-        found=filtered,
+        result=filtered,
         **_arguments(planes, scalars, filtered),
     )
     return replace(planes, colors=filtered)

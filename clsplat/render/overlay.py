@@ -33,7 +33,7 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
         layer=frame.image,
         transmittance=frame.transmittance,
         image=image,
-        both=composite,
+        composite=composite,
         behind=behind,
         row_sums=sums,
         scale=scale,

@@ -260,7 +260,7 @@ class GridState(ColorState):
         self.device.program("color_grid_table.cl").color_grid_center(
             groups=ENTRIES * levels,
             values=self.arrays["values"],
-            places=rows * columns,
+            positions=rows * columns,
             photographs=photographs,
         )
 
