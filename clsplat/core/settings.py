@@ -58,8 +58,8 @@ class Settings(BaseModel):
         """Return the names by which `conflicts` of other settings may refer to this one."""
         return {self.family, *(str(getattr(self, tag)) for tag in TAGS if tag in type(self).model_fields)}
 
-    def excluded(self) -> Mapping[str, str]:
-        """Return the conflicts that apply to these values."""
+    def active_conflicts(self) -> Mapping[str, str]:
+        """Return the `conflicts` that apply to these values."""
         return self.conflicts
 
     def check_pipeline(self, pipeline: Any) -> None:

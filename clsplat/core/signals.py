@@ -37,8 +37,8 @@ _received = _Received()
 def exit_on_signals() -> None:
     """Make signals exit the process with a message and exit code 130, except in `stopping_on_signals` blocks.
 
-    For startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
-    some libraries catch every exception.
+    For startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and some
+    libraries catch every exception.
     """
     for number in _handlers():
         signal.signal(number, _exit)

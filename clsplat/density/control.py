@@ -189,9 +189,9 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
     )
 
 
-def keep_rows(gaussians: Gaussians, kept: NDArray[np.int64], cause: str) -> Change:
-    """Remove all Gaussians except the rows `kept`, [n], ascending.  cause: the name in `Change.causes`."""
+def keep_rows(gaussians: Gaussians, rows: NDArray[np.int64], cause: str) -> Change:
+    """Remove all Gaussians except `rows`, [n], ascending.  cause: the name in `Change.causes`."""
     before = gaussians.count
-    source = gaussians.device.upload(kept.astype(np.uint32))
-    gaussians.rearrange(source, gaussians.device.zeros(len(kept), np.uint32), len(kept))
-    return Change(before, len(kept), {cause: before - len(kept)}, {})
+    source = gaussians.device.upload(rows.astype(np.uint32))
+    gaussians.rearrange(source, gaussians.device.zeros(len(rows), np.uint32), len(rows))
+    return Change(before, len(rows), {cause: before - len(rows)}, {})

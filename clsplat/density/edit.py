@@ -263,7 +263,7 @@ class Rule(Settings):
         read = [classes[name] for name in self.statistics if name in classes]
         return [*read, *(classes[kind.divisor] for kind in read if kind.divisor in classes)]
 
-    def excluded(self) -> Mapping[str, str]:
+    def active_conflicts(self) -> Mapping[str, str]:
         conflicts = dict(self.conflicts)
         for kind in self.columns:
             conflicts |= kind.conflicts

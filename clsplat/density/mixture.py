@@ -40,7 +40,7 @@ class Mixtures:
     """The moments of mixtures of two Gaussians, each weighted by its mass."""
 
     mass: Floats  # [pairs] total of both
-    share: Floats  # [pairs, 1] fraction of the mass in the second Gaussian
+    fraction: Floats  # [pairs, 1] of the mass in the second Gaussian
     means: Floats  # [pairs, 3] scene units
     covariance: Floats  # [pairs, 3, 3] scene units²
 
@@ -48,14 +48,14 @@ class Mixtures:
     def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
         """Compute the mixtures of rows `first` and `second`, [pairs].  mass: of all rows, from `masses`."""
         total = mass[first] + mass[second]
-        share = (mass[second] / total)[:, None]
-        means = (1 - share) * tables["means"][first] + share * tables["means"][second]
+        fraction = (mass[second] / total)[:, None]
+        means = (1 - fraction) * tables["means"][first] + fraction * tables["means"][second]
         covariance = np.zeros((len(first), 3, 3))
-        for rows, weight in ((first, 1 - share), (second, share)):
+        for rows, weight in ((first, 1 - fraction), (second, fraction)):
             offset = tables["means"][rows] - means
             covariances = covariance_matrices(tables["quats"][rows], tables["log_scales"][rows])
             covariance += weight[:, :, None] * (covariances + offset[:, :, None] * offset[:, None, :])
-        return cls(total, share, means, covariance)
+        return cls(total, fraction, means, covariance)
 
     def opacity(self, log_scales: Floats, size: Size = volume) -> Floats:
         """Return the opacities that preserve the mass, [pairs], clamped to the range that renderers use."""
@@ -68,12 +68,13 @@ def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = vol
     Each table has the shape [pairs, components].
     """
     mixtures = Mixtures.from_pairs(tables, masses(tables, size), first, second)
-    share = mixtures.share
+    fraction = mixtures.fraction
     variances, axes = np.linalg.eigh(mixtures.covariance)  # scene units²
     log_scales = to_log_scales(variances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
     opacity = mixtures.opacity(log_scales, size)
-    colors = {name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")}
+    harmonics = {name: tables[name] for name in ("sh_base", "sh_rest")}
+    colors = {name: (1 - fraction) * table[first] + fraction * table[second] for name, table in harmonics.items()}
     return {
         "means": mixtures.means,
         "quats": unit_quaternions(axes),

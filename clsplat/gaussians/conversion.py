@@ -326,12 +326,12 @@ def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _link_or_copy(file: Path, other: Path) -> None:
+def _link_or_copy(file: Path, target: Path) -> None:
     """Link a file, or copy it on a file system without links; files are replaced and never changed in place."""
     try:
-        os.link(file, other)
+        os.link(file, target)
     except OSError:
-        shutil.copy2(file, other)
+        shutil.copy2(file, target)
 
 
 def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:

@@ -29,7 +29,7 @@ class CovarianceTrace(Penalty):
     def tables(self) -> set[str]:
         return {INTERVAL2} if self.pixels else set()
 
-    def excluded(self) -> Mapping[str, str]:
+    def active_conflicts(self) -> Mapping[str, str]:
         return AT_REST if self.pixels else {}
 
     def add(self, inputs: PenaltyInputs) -> LossValue:

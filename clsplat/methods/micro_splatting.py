@@ -123,8 +123,8 @@ class SplitOversized(Subdivide):
     def tables(self) -> set[str]:
         return {INTERVAL2} if self.pixels else set()
 
-    def excluded(self) -> Mapping[str, str]:
-        return {**super().excluded(), **(AT_REST if self.pixels else {})}
+    def active_conflicts(self) -> Mapping[str, str]:
+        return {**super().active_conflicts(), **(AT_REST if self.pixels else {})}
 
     def mark(self, edit: Edit) -> None:
         rms = np.sqrt(np.exp(2 * edit.gaussians.get("log_scales")).mean(axis=1))

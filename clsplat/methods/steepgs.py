@@ -37,7 +37,7 @@ class Splitting(Statistic):
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("saddle.cl").accumulate_splitting(
             items=gaussians.count,
-            means=view.frame.drawn.gaussians["means"],
+            means=view.frame.model.gaussians["means"],
             splats=view.frame.splats,
             pixel_sums=view.pixel_sums,
             camera=view.frame.camera.array,

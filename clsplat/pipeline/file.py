@@ -174,7 +174,7 @@ class PipelineFile(Settings):
         parts = list(iter_settings(self))
         for path, part in parts:
             part.check_pipeline(self)
-            for name, reason in part.excluded().items():
+            for name, reason in part.active_conflicts().items():
                 for other, rival in parts:
                     is_elsewhere = other.startswith("stages[") and other.partition(".")[0] != path.partition(".")[0]
                     if name in rival.conflict_names() and not is_elsewhere:
@@ -188,7 +188,7 @@ class PipelineFile(Settings):
     def harmonics(self) -> Harmonics:
         """Where spherical harmonics are stored; `auto`: on the device if a stage needs them there, or at degree 0."""
         setting = self.rasterizer.harmonics
-        is_needed = any(ON_HOST in part.excluded() for _, part in iter_settings(self.stages))
+        is_needed = any(ON_HOST in part.active_conflicts() for _, part in iter_settings(self.stages))
         return "device" if setting == "auto" and (self.model.sh_degree == 0 or is_needed) else setting
 
     @property

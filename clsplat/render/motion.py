@@ -37,13 +37,13 @@ def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCame
         moved_logit=logit,
         degree=_shape(gaussians)[0],
     )
-    moved = {"means": means, "logit_opacity": logit}
+    tables = {"means": means, "logit_opacity": logit}
     if turn := _turn(gaussians):
-        moved["quats"] = workspace.array("moved quats", (4, stride))
+        tables["quats"] = workspace.array("moved quats", (4, stride))
         gaussians.device.program("motion.cl").turn_forward(
-            **_arguments(gaussians, camera), quats=gaussians["quats"], moved_quats=moved["quats"], **turn
+            **_arguments(gaussians, camera), quats=gaussians["quats"], moved_quats=tables["quats"], **turn
         )
-    return replace(model, gaussians=_with_tables(gaussians, moved))
+    return replace(model, gaussians=_with_tables(gaussians, tables))
 
 
 def backpropagate_motion(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
@@ -88,10 +88,10 @@ def _turn(gaussians: Gaussians) -> dict[str, int]:
 
 def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
     """Return a copy of Gaussians with some tables replaced."""
-    moved = copy.copy(gaussians)
+    result = copy.copy(gaussians)
     tables = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
-    moved.tables = {**gaussians.tables, **tables}
-    return moved
+    result.tables = {**gaussians.tables, **tables}
+    return result
 
 
 @cache

@@ -165,7 +165,7 @@ class Frame:
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # of the planes
-    drawn: DeviceModel  # the rendered model: a dynamic one at the timestamp of the camera
+    model: DeviceModel  # the rendered model; a moving one at the timestamp of the camera
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ class Rasterizer:
         for number, band in enumerate(bands):
             lists = frame.lists
             if len(bands) > 1:
-                lists = self._project_band(frame.drawn, frame.camera, band, frame.splats, frame.radius, frame.content)
+                lists = self._project_band(frame.model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
                 self._blend(frame.content, **blend_defines, **model.defines).blend_backward(
@@ -350,7 +350,7 @@ class Rasterizer:
         gradients = self._gradients
         self.device.program("project.cl", **model.defines).project_backward(
             items=-(-model.gaussians.count // self._lanes),
-            **shape_arguments(frame.drawn, frame.camera),
+            **shape_arguments(frame.model, frame.camera),
             splats=frame.splats,
             pixel_sums=pixel_sums,
             **gradients.arguments(),

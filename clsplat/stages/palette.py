@@ -90,7 +90,7 @@ class SharePalette(Scheduled):
     edits: ClassVar[bool] = True
     conflicts = ALL_HARMONICS
 
-    def excluded(self) -> Mapping[str, str]:
+    def active_conflicts(self) -> Mapping[str, str]:
         return self.conflicts if self.every else {}  # no conflict after a training
 
     def run(self, run: Run) -> None:

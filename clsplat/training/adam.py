@@ -130,7 +130,7 @@ class Adam:
         rows = self._effective_rows(rows)
         grad_mean2d = self._mean2d()
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
-        deferred = self._deferred(rows, model, rates)
+        deferred = self._prepare_deferred(rows, model, rates)
         for name in PARAMETERS:
             moment1, moment2 = (gaussians.tables[table].array for table in moment_tables(name))
             rate, correction2 = self._factors(name, rates)
@@ -165,7 +165,7 @@ class Adam:
         Harmonics above the active degree are skipped, since their gradients and moments are zero.
         """
         gaussians, rows = self.gaussians, self._effective_rows(rows)
-        deferred = None if "sh_rest" in without else self._deferred(rows, model, rates)
+        deferred = None if "sh_rest" in without else self._prepare_deferred(rows, model, rates)
         for name in PARAMETERS:
             if name in without or (name == "sh_rest" and not rates[name]):
                 continue
@@ -196,7 +196,7 @@ class Adam:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
-    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
+    def _prepare_deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
         """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none are."""
         gaussians = self.gaussians
         if rows != "deferred":

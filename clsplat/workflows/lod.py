@@ -153,7 +153,7 @@ def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
 
 def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, second: Rows) -> Floats:
     mixtures = Mixtures.from_pairs(tables, mass, first, second)
-    fraction = mixtures.share[:, 0]
+    fraction = mixtures.fraction[:, 0]
     variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
     cost: Floats = (
         to_log_scales(variances).sum(axis=1) - (1 - fraction) * log_volume[first] - fraction * log_volume[second]

@@ -67,9 +67,9 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
     def seconds(launch: Callable[[], None]) -> float:
         times = 1
         time_launches(launch, times)  # the first launch compiles
-        while (taken := time_launches(launch, times)) < MIN_SECONDS:
+        while (elapsed := time_launches(launch, times)) < MIN_SECONDS:
             times *= 4
-        return min([taken, *(time_launches(launch, times) for _ in range(repeats - 1))]) / times
+        return min([elapsed, *(time_launches(launch, times) for _ in range(repeats - 1))]) / times
 
     floats, copy_group = max(lanes, 4), program.peak_copy.group[0]  # per item, and items per group
     rounds = 40_000 if is_cpu else 4000  # enough for the system to distribute the threads
@@ -101,8 +101,8 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
 
-    def floor(operations: float, moved: float) -> float:
-        return 1e3 * max(operations / (1e9 * peaks.gflops), moved / (1e9 * peaks.gbytes))
+    def floor(operations: float, bytes_moved: float) -> float:
+        return 1e3 * max(operations / (1e9 * peaks.gflops), bytes_moved / (1e9 * peaks.gbytes))
 
     vector = 2 * 16  # operations of a multiply-add instruction
     return {

@@ -321,14 +321,14 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     planes = {"image": to_planes(device, camera, layer), "transmittance": to_planes(device, camera, signed[None])}
     frame, label, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
     actual = lay_over(workspace, frame, to_planes(device, camera, image), scale)
-    both, behind = actual.image.get(), actual.behind.get()
+    composite, behind = actual.image.get(), actual.behind.get()
     inside = np.s_[..., :height, :width]
     exact = left.astype(np.float64)
-    yield by_element("lay_over", f"both, {label}", both[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
+    yield by_element("lay_over", f"both, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
     loss, grad_left = ref.layer_cover(exact, scale)
     yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
     yield by_element("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
-    for output in (both, behind):
+    for output in (composite, behind):
         yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, output), 0.0)
     grad_both = to_planes(device, camera, gradient)
     look_behind(workspace, frame, grad_both)

@@ -209,12 +209,12 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
         add_noise(gaussians, rate, below, SEED, STEP)
         opacity = 1 / (1 + np.exp(-p["logit_opacity"][:, 0]))
         gate = np.where(opacity > below + 0.1, 0, rate / (1 + np.exp(-100 * (below - opacity))))
-        moved = np.zeros((count, 3))
+        offsets = np.zeros((count, 3))
         for i in range(count):
             axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
-            moved[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
+            offsets[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
         actual = gaussians.get("means").astype(np.float64)
-        yield by_norm("add_noise", f"means of {count} Gaussians", actual, p["means"] + moved, SUM)
+        yield by_norm("add_noise", f"means of {count} Gaussians", actual, p["means"] + offsets, SUM)
 
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.

@@ -17,9 +17,9 @@ def rendering(device: Device, rng: np.random.Generator) -> Results:
     yield from projection.check_record(device, case, label)
     yield from tiles.check_list(device, case, "radix", label)
     yield from blending.check_blend(device, case, label)
-    many = safe_case(rng, 300, 14, 14, change=blending.make_dim)
-    yield from blending.check_blend(device, many, "300 that cover each other")
-    for scene, name in ((case, label), (many, "300 that cover each other")):
+    crowded = safe_case(rng, 300, 14, 14, change=blending.make_dim)
+    yield from blending.check_blend(device, crowded, "300 that cover each other")
+    for scene, name in ((case, label), (crowded, "300 that cover each other")):
         weights = rng.normal(size=(3, *scene.size[::-1])).astype(np.float32)
         sums = blending.sum_pixels(device, scene, weights)
         yield from blending.check_sum(scene, sums, weights, name)

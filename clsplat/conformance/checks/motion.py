@@ -30,8 +30,8 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     case, fields = random_case(rng, count), motion_fields(width)
     motion = rng.normal(0, 0.3, (count, width))
     center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
-    apart = np.abs(TIME - center) / np.exp(duration)
-    duration[(apart > 3) & (apart < 3.7)] += 0.5  # Gaussians are visible up to 3.33
+    distance = np.abs(TIME - center) / np.exp(duration)
+    duration[(distance > 3) & (distance < 3.7)] += 0.5  # Gaussians are visible up to 3.33
     center[::10], duration[::10] = 0.875, -2.5
     duration[5::10] = STATIC_LOG_DURATION
     motion[:, fields["time_center"]], motion[:, fields["log_duration"]] = center[:, None], duration[:, None]
@@ -45,15 +45,15 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
-    drawn = evaluate_motion(Workspace(device), model, camera).gaussians
+    moved = evaluate_motion(Workspace(device), model, camera).gaussians
     means, quats, logits = ref.move_gaussians(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
     present = np.isfinite(means).all(axis=1)
-    actual = drawn.get("means")
+    actual = moved.get("means")
     yield wrong("move_forward", f"which are present, {label}", np.isfinite(actual).all(axis=1) != present)
     yield by_element("move_forward", f"means, {label}", actual[present], means[present], 1e-6, floor=1.0)
-    actual = drawn.get("logit_opacity")[present, 0]
+    actual = moved.get("logit_opacity")[present, 0]
     yield by_element("move_forward", f"logits, {label}", actual, logits[present], 1e-5, 1.0)
-    yield by_element("turn_forward", f"quaternions, {label}", drawn.get("quats"), quats, 1e-6, floor=1.0)
+    yield by_element("turn_forward", f"quaternions, {label}", moved.get("quats"), quats, 1e-6, floor=1.0)
 
     gradients = GaussianGradients(model.gaussians)
     grads = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}

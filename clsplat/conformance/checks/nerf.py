@@ -96,7 +96,7 @@ class FieldCase:
         pixels = self.rays.pixels.get()
         return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
 
-    def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def encode(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return encoded positions and directions of samples, [S, features]."""
         means, variances = ref.frustums(self.cones, edges.astype(np.float64))
         sines = ref.encode_frustums(means, variances, self.shape.degrees)
@@ -154,13 +154,13 @@ def _check_edge(case: FieldCase, label: str) -> Results:
 
 @CHECKS.add("encode_frustums", "encode_directions")
 def encodings(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the encoded positions and directions that the network reads."""
+    """Compare the encoded positions and directions, the inputs of the network."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0))
         level = next(case.levels.render(case.on_device, case.rays))
-        position, direction = case.encoded(level.edges.get())
+        position, direction = case.encode(level.edges.get())
         (table, first), (seen, row) = (
-            place(level.raw_colors.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
+            rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.seen)
         )
         actual = read_rows(table, first, case.shape.position_rows)
         yield by_element("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
@@ -217,11 +217,11 @@ def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
     return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
 
 
-def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]) -> Results:
-    shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
+def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, positions: NDArray[np.float32]) -> Results:
+    shape, encoding, tiles = case.shape, case.levels.encoding, len(positions)
     assert shape.grid is not None
     label = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
-    encoding.places(tiles).set(places)
+    encoding.places(tiles).set(positions)
     encoding.read_grid(case.on_device, tiles)
     table, first = case.levels.network.position(tiles)
     features = read_rows(table, first, shape.grid_rows)
@@ -236,7 +236,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     for parts, gradient in zip((1, 3), others, strict=True):
         yield equal("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
     by_sample = _by_sample(grad_features)
-    means, variances = np.split(_by_sample(places), [3], axis=1)
+    means, variances = np.split(_by_sample(positions), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
@@ -321,7 +321,7 @@ class _Comparison:
         network = ref.DenseNetwork(case.shape.depth, case.shape.skip)
         weights = case.shape.weights(case.parameters)
         edges, samples = level.edges.get().astype(np.float64), level.samples
-        colors, densities, inputs = network.forward(weights, *case.encoded(edges))
+        colors, densities, inputs = network.forward(weights, *case.encode(edges))
         lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
         composite = ref.Composite(
             colors.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)

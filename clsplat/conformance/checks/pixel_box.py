@@ -64,8 +64,8 @@ def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Res
         yield from check_sum(case, sums, weights, f"splats {label} over the pixel's box")
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
         yield by_norm("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
-    few = sum_pixels(device, case, weights)
-    yield from check_sum(case, few, weights, "without more sums over the pixel's box")
+    default_sums = sum_pixels(device, case, weights)
+    yield from check_sum(case, default_sums, weights, "without more sums over the pixel's box")
 
 
 @CHECKS.add("blend_forward", "blend_backward", "emit_large")

@@ -63,50 +63,50 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     records, keys, radius = project_records(device, case)
     truth, (width, height) = case.project(), case.size
     # the kernel also culls splats that no pixel of the image can see: they must be outside or too faint
-    drawn = records[:, 5] > 0
+    rendered = records[:, 5] > 0
     x, y = truth.mean2d.T
     unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
     yield wrong(
-        kernel, f"which splats are drawn, {label}", (drawn & ~truth.visible) | (truth.visible & ~drawn & ~unseen)
+        kernel, f"which splats are drawn, {label}", (rendered & ~truth.visible) | (truth.visible & ~rendered & ~unseen)
     )
-    drawn &= truth.visible
-    record = records[drawn]
-    yield by_element(kernel, f"means, {label}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
+    rendered &= truth.visible
+    record = records[rendered]
+    yield by_element(kernel, f"means, {label}", record[:, :2], truth.mean2d[rendered], PROJECTION, floor=50)
     conic = record_covariances(record) if case.pixel_box else record[:, 2:5]
-    size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
-    error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
+    size = np.maximum(np.linalg.norm(truth.conic[rendered], axis=1), 1e-30)
+    error = np.linalg.norm(conic - truth.conic[rendered], axis=1) / size
     yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
-    yield by_element(kernel, f"opacities, {label}", record[:, 5], truth.opacity[drawn], PROJECTION)
-    yield by_element(kernel, f"colors, {label}", record[:, 6:9], truth.color[drawn], PROJECTION, floor=1)
-    yield by_element(kernel, f"depths, {label}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
+    yield by_element(kernel, f"opacities, {label}", record[:, 5], truth.opacity[rendered], PROJECTION)
+    yield by_element(kernel, f"colors, {label}", record[:, 6:9], truth.color[rendered], PROJECTION, floor=1)
+    yield by_element(kernel, f"depths, {label}", keys[rendered].view(np.float32), truth.depth[rendered], DEPTH)
     if not case.pixel_box:
-        power_min = -np.log(255 * truth.opacity[drawn])
+        power_min = -np.log(255 * truth.opacity[rendered])
         yield by_element(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
     hidden = records[:, 5] <= 0
     yield wrong(kernel, f"culled splats, {label}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
     # ceil() may jump by a pixel where the radius is close to an integer
     yield wrong(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
     yield wrong(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
-    yield wrong(kernel, f"extents, {label}", _wrong_extents(record, truth, drawn))
+    yield wrong(kernel, f"extents, {label}", _wrong_extents(record, truth, rendered))
 
 
 def record_covariances(record: NDArray[Any]) -> NDArray[Any]:
     """Return covariances, [N, 3], from the fields of records for the box filter."""
-    k, s, t, turned = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
+    k, s, t, swapped = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
     xx, xy, yy = t**2 + k**2 * s**2, k * s**2, s**2
-    return np.stack([np.where(turned > 0, yy, xx), xy, np.where(turned > 0, xx, yy)], axis=1)
+    return np.stack([np.where(swapped > 0, yy, xx), xy, np.where(swapped > 0, xx, yy)], axis=1)
 
 
-def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any]) -> NDArray[Any]:
+def _wrong_extents(record: NDArray[Any], truth: ref.Splats, rendered: NDArray[Any]) -> NDArray[Any]:
     """Return which extents miss pixels where alpha is 1/255 or more, or are much larger than needed."""
-    reach2 = 2 * np.log(255 * truth.opacity[drawn])
-    a, b, c = truth.conic[drawn].T
+    reach2 = 2 * np.log(255 * truth.opacity[rendered])
+    a, b, c = truth.conic[rendered].T
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
     if truth.pixel_box:  # of the covariance, a pixel wider
         half_x, half_y = 0.5 + np.sqrt(reach2 * a), 0.5 + np.sqrt(reach2 * c)
     right = np.ones(len(record), bool)
     for low, high, center, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
-        mean = truth.mean2d[drawn, center]
+        mean = truth.mean2d[rendered, center]
         right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
         right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
     return ~right
@@ -118,9 +118,9 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(model, camera, device.zeros(3))
     gaussians, truth = model.gaussians, case.project()
-    drawn = frame.splats.get()[:, 5] > 0
+    rendered = frame.splats.get()[:, 5] > 0
     pixel_sums = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
-    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * drawn
+    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * rendered
     gradients = rasterizer.gradients(model, frame, device.upload(pixel_sums))
     expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
     for name, array in gradients.arrays.items():
@@ -315,8 +315,8 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str)
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)
-    drawn = frame.splats.get()[:, 5] > 0
-    pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * drawn
+    rendered = frame.splats.get()[:, 5] > 0
+    pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * rendered
     actual = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
     m, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
     grad_mean2d, grad_conic = sums_to_gradients(truth, m)

@@ -52,10 +52,10 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
             )
         adam.step(model, frame, gradients, rates)
     for name in PARAMETERS:
-        moved, label = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
+        max_change, label = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
         actual = model.gaussians.get(name)
         # values are rounded to float32, and their changes to 2e-5 of the largest change
-        yield by_element("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
+        yield by_element("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * max_change / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
         for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
             largest = float(np.abs(expected).max())
@@ -285,8 +285,8 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
         values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
     actual = train(device, case.model(device), seen, gradients, "deferred")
     at_once = train(device, case.model(device), seen, gradients, "all")
-    moved = max(float(np.abs(values - before).max(initial=0)), 1e-6)
-    yield by_element("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * moved / 3e-7)
+    max_change = max(float(np.abs(values - before).max(initial=0)), 1e-6)
+    yield by_element("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
     for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
         yield by_element("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)

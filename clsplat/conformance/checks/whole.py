@@ -131,16 +131,16 @@ def _check_buffer(device: Device, size: int) -> Results:
 @SPEED.add("peak_fma", "peak_exp", "peak_copy")
 def yardsticks(device: Device, rng: np.random.Generator) -> Results:
     lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
-    program, whole = device.program("peak.cl"), 2 * group
-    result = device.empty(whole * lanes)
-    program.peak_fma(items=whole, result=result, factor=0.5, rounds=5)
-    chains = np.arange(whole)[:, None] + np.arange(8.0)
+    program, item_count = device.program("peak.cl"), 2 * group
+    result = device.empty(item_count * lanes)
+    program.peak_fma(items=item_count, result=result, factor=0.5, rounds=5)
+    chains = np.arange(item_count)[:, None] + np.arange(8.0)
     for _ in range(5):
         chains = chains * 0.5 + 0.25
     expected = np.repeat(chains.sum(axis=1), lanes)
     yield by_element("peak_fma", "chains of multiply-adds", result.get(), expected, 1e-6)
-    program.peak_exp(items=whole, result=result, step=1e-3, rounds=4)
-    x = -0.01 * (np.arange(whole) % 8)
+    program.peak_exp(items=item_count, result=result, step=1e-3, rounds=4)
+    x = -0.01 * (np.arange(item_count) % 8)
     sums = sum(np.exp(x - 1e-3 * k) + np.exp(x - 0.5 - 1e-3 * k) for k in range(4))
     yield by_element("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
     items = 2 * program.peak_copy.group[0]

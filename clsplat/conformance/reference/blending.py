@@ -268,7 +268,7 @@ class Margin(NamedTuple):
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Return how far blending stays from its thresholds, so that a test can choose a scene without flips."""
+    """Return the distance of blending from its thresholds, so that a test can choose a scene without flips."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.splat] * step.falloff
@@ -366,16 +366,16 @@ def inverse_depth_loss(
 # A layer in front of an image: the composite, the gradient of the image, and the loss on the layer's opacity.
 
 
-def overlay(layer: NDArray[Any], left: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
+def overlay(layer: NDArray[Any], transmittance: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
     """Return the composite of a layer, [3, H, W] on black, and an image behind it."""
-    return np.concatenate([layer + left * image[:3], image[3:]])
+    return np.concatenate([layer + transmittance * image[:3], image[3:]])
 
 
-def gradient_behind(left: NDArray[Any], gradient: NDArray[Any]) -> NDArray[Any]:
+def gradient_behind(transmittance: NDArray[Any], gradient: NDArray[Any]) -> NDArray[Any]:
     """Return the gradient of the image behind from the gradient of the composite."""
-    return np.concatenate([left * gradient[:3], gradient[3:]])
+    return np.concatenate([transmittance * gradient[:3], gradient[3:]])
 
 
-def layer_cover(left: NDArray[Any], scale: float) -> tuple[float, NDArray[Any]]:
+def layer_cover(transmittance: NDArray[Any], scale: float) -> tuple[float, NDArray[Any]]:
     """Return the loss, scale times the sum of 1 - T, and its gradient with respect to T."""
-    return scale * float((1 - left).sum()), np.full_like(left, -scale)
+    return scale * float((1 - transmittance).sum()), np.full_like(transmittance, -scale)

@@ -127,26 +127,26 @@ def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[A
     for y in range(-min(reach, height - 1), min(reach, height - 1) + 1):
         for x in range(-min(reach, width - 1), min(reach, width - 1) + 1):
             weight = math.exp(-falloff * (x * x + y * y))
-            to = np.s_[max(0, -y) : height - max(0, y), max(0, -x) : width - max(0, x)]
-            at = np.s_[max(0, y) : height - max(0, -y), max(0, x) : width - max(0, -x)]
-            sums[:, *to] += weight * counts[at] * image[:, *at]
-            weights[to] += weight * counts[at]
+            target = np.s_[max(0, -y) : height - max(0, y), max(0, -x) : width - max(0, x)]
+            source = np.s_[max(0, y) : height - max(0, -y), max(0, x) : width - max(0, -x)]
+            sums[:, *target] += weight * counts[source] * image[:, *source]
+            weights[target] += weight * counts[source]
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), image)
 
 
-# One level of the Haar transform and back, with a separate high-pass analysis filter: matrices of whole lines.
+# One level of the Haar transform and its inverse, with a separate high-pass analysis filter, as matrices of lines.
 
 LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
 
 
 def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
-    """The matrix [length, length] of analysis with the high-pass filter `taps`, then synthesis with Haar's filters."""
-    there, back = np.zeros((length, length)), np.zeros((length, length))
+    """Return the matrix, [length, length], of analysis with the high-pass filter `taps` and synthesis with Haar's."""
+    analysis, synthesis = np.zeros((length, length)), np.zeros((length, length))
     for pair in range(length // 2):
-        at = slice(2 * pair, 2 * pair + 2)
-        there[pair, at], there[length // 2 + pair, at] = LOW, taps
-        back[at, pair], back[at, length // 2 + pair] = LOW, HIGH
-    return back @ there
+        columns = slice(2 * pair, 2 * pair + 2)
+        analysis[pair, columns], analysis[length // 2 + pair, columns] = LOW, taps
+        synthesis[columns, pair], synthesis[columns, length // 2 + pair] = LOW, HIGH
+    return synthesis @ analysis
 
 
 def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:

@@ -1,7 +1,8 @@
 """Compute moving Gaussians at one time, and the gradient of their motion, one Gaussian at a time.
 
 A row of motion: velocity [3], time center, log of the duration, then acceleration [3] and jerk [3] where the degree is
-2 or 3, then the turn [4] where Gaussians turn.  FreeTimeGS (Wang et al. 2025), Spacetime Gaussians (Li et al. 2024).
+2 or 3, then the time derivative of the quaternion [4] where Gaussians rotate.  FreeTimeGS (Wang et al. 2025), Spacetime
+Gaussians (Li et al. 2024).
 """
 
 from typing import Any

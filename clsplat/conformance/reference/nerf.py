@@ -128,17 +128,17 @@ def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Float
     return (np.array(words[:count], np.float64) // 256 + 1) / 2**24
 
 
-def coarse_edges(near: float, far: float, samples: int, drawn: Floats | None = None) -> Floats:
-    """Return the edges of a ray's coarse samples, [samples + 1]; drawn: [samples + 1] in (0, 1], for training."""
+def coarse_edges(near: float, far: float, samples: int, offsets: Floats | None = None) -> Floats:
+    """Return the edges of a ray's coarse samples, [samples + 1]; offsets: [samples + 1] in (0, 1], for training."""
     edges = np.linspace(near, far, samples + 1)
-    if drawn is None:
+    if offsets is None:
         return edges
     middles = (edges[1:] + edges[:-1]) / 2
     low, high = np.concatenate([edges[:1], middles]), np.concatenate([middles, edges[-1:]])
-    return np.asarray(low + (high - low) * drawn)
+    return np.asarray(low + (high - low) * offsets)
 
 
-def fine_edges(edges: Floats, weights: Floats, samples: int, drawn: Floats | None = None) -> Floats:
+def fine_edges(edges: Floats, weights: Floats, samples: int, offsets: Floats | None = None) -> Floats:
     """Return the edges of a ray's fine samples, [samples + 1], distributed by the coarse weights (equation 18)."""
     padded = np.concatenate([weights[:1], weights, weights[-1:]])
     largest = np.maximum(padded[:-1], padded[1:])
@@ -146,10 +146,10 @@ def fine_edges(edges: Floats, weights: Floats, samples: int, drawn: Floats | Non
     blurred = blurred + max(0.0, WEIGHT_FLOOR - blurred.sum()) / len(blurred)
     distribution = np.concatenate([[0.0], np.cumsum(blurred / blurred.sum())])
     distribution[-1] = 1.0
-    if drawn is None:
+    if offsets is None:
         quantiles = np.linspace(0, MAX_UNIT, samples + 1)
     else:
-        quantiles = np.minimum((np.arange(samples + 1) + drawn) / (samples + 1), MAX_UNIT)
+        quantiles = np.minimum((np.arange(samples + 1) + offsets) / (samples + 1), MAX_UNIT)
     return np.interp(quantiles, distribution, edges)
 
 

@@ -151,8 +151,8 @@ def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degr
 
 def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, height: int) -> float:
     """Return the radius of 3DGS, three standard deviations, or 0 if it reaches no tile."""
-    middle = (dilated[0, 0] + dilated[1, 1]) / 2
-    largest = middle + np.sqrt(max(0.1, middle**2 - determinant(dilated)))
+    mean_variance = (dilated[0, 0] + dilated[1, 1]) / 2
+    largest = mean_variance + np.sqrt(max(0.1, mean_variance**2 - determinant(dilated)))
     radius = np.ceil(3 * np.sqrt(largest))
     index = mean2d - 0.5  # the reference implementation counts pixels from their centers
     grid = np.ceil(np.array([width, height]) / RADIUS_TILE)
@@ -308,8 +308,8 @@ def project_backward(
 
         # Color: SH, its direction, max(0, .)
         direction, distance = view_direction(camera, gaussians.means[n])
-        not_clamped = unclamped_color(gaussians, n, camera, degree) > 0
-        grad_c = grad_color[n] * not_clamped
+        is_unclamped = unclamped_color(gaussians, n, camera, degree) > 0
+        grad_c = grad_color[n] * is_unclamped
         basis, basis_gradient = sh_basis(direction, degree), sh_basis_gradient(direction, degree)
         used = len(basis)
         grad["sh"][n, :used] = np.outer(basis, grad_c)
@@ -348,8 +348,8 @@ def sampling_interval(
                 and -margin * camera.height <= v <= (1 + margin) * camera.height
             ):
                 intervals[n] = min(intervals[n], z / f)
-    seen = np.isfinite(intervals)
-    intervals[~seen] = intervals[seen].max(initial=0)
+    is_seen = np.isfinite(intervals)
+    intervals[~is_seen] = intervals[is_seen].max(initial=0)
     return intervals
 
 

@@ -206,7 +206,7 @@ def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray
 def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
     """Replace each row by the weighted mean of the rows with its label; return [N,c].
 
-    values: [N,c]; labels, weights: [N].  If all weights of a label are zero, its first row replaces the mean.
+    values: [N,c]; labels, weights: [N].  If all weights of a label are zero, its first row is used instead.
     """
     means = np.empty(values.shape)
     for label in np.unique(labels):

@@ -177,7 +177,7 @@ class TrainingModule(Settings):
         """Return whether the module has an effect for a scene; without a scene, whether it has one for every scene."""
         return True
 
-    def excluded(self) -> Mapping[str, str]:
+    def active_conflicts(self) -> Mapping[str, str]:
         return self.conflicts if self.is_active() else {}
 
     def check_losses(self, losses: Sequence[Loss]) -> None:

@@ -335,7 +335,7 @@ def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
     sums = workspace.array("pose sums", (SUMS, -(-items // GROUP)))
     device.program("poses.cl", **model.defines).pose_gradient(
-        items=items, **shape_arguments(frame.drawn, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
+        items=items, **shape_arguments(frame.model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
     )
     group_sums = sums.get_later()
     return lambda: np.cumsum(group_sums(), axis=1, dtype=np.float64)[:, -1]

@@ -120,13 +120,13 @@ class DistractorsState(ModuleState):
             return
         layer, sums = saved
         frame = replace(layer.frame, image=layer.image)  # the gradient of blending needs the combined colors
-        sums += [frame, self.rasterizer.pixel_sums(frame.drawn, frame, step.gradient, behind=layer.behind)]
+        sums += [frame, self.rasterizer.pixel_sums(frame.model, frame, step.gradient, behind=layer.behind)]
         look_behind(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved(self)) and step.view is not None:
             frame, pixel_sums = saved[1]
-            self.adams[self._rows[step.view]].update(frame.drawn, frame, pixel_sums, RATES)
+            self.adams[self._rows[step.view]].update(frame.model, frame, pixel_sums, RATES)
 
 
 def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:

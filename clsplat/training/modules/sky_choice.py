@@ -27,8 +27,8 @@ def sky_fraction(run: Run) -> float | None:
     if _reason_unknown(run):
         return None
     background = run.model_settings.background
-    shown, count = _count(run, (background if isinstance(background, Auto) else Auto()).share)
-    return shown / count
+    sky_count, count = _count(run, (background if isinstance(background, Auto) else Auto()).share)
+    return sky_count / count
 
 
 def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
@@ -97,12 +97,12 @@ def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     """Decide whether there is a sky; return the decision and its reason."""
     if reason := _reason_unknown(run):
         return "off", reason
-    shown, count = _count(run, background.share)
+    sky_count, count = _count(run, background.share)
     text = (
-        f"{shown} of {count} photographs show bright or blue regions above the horizon, without points, in "
+        f"{sky_count} of {count} photographs show bright or blue regions above the horizon, without points, in "
         f"{background.share:.0%} or more of their upper third"
     )
-    is_sky = shown >= background.photographs * count
+    is_sky = sky_count >= background.photographs * count
     return ("on" if is_sky else "off"), f"{text}; {'' if is_sky else 'not '}{background.photographs:.0%} of them"
 
 
