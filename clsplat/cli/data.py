@@ -18,7 +18,7 @@ DATASET = f"The folder of a dataset: {format_names()}."
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
-Out = Annotated[Path, typer.Argument(help="Folder to make.")]
+Out = Annotated[Path, typer.Argument(help="Folder to write.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")]
 
 
@@ -31,20 +31,20 @@ def data() -> None:
 def synthetic(
     out: Out,
     size: Annotated[
-        int | None, typer.Option(min=8, help="Width and height of the images, pixels; default: 256, moving 160.")
+        int | None, typer.Option(min=8, help="Width and height of the images, pixels; default: 256, --moving: 160.")
     ] = None,
     train: Annotated[
-        int | None, typer.Option(min=1, help="Number of training views, moving: cameras; default: 60, moving 10.")
+        int | None, typer.Option(min=1, help="Training views, or with --moving cameras; default: 60, or 10.")
     ] = None,
     test: Annotated[
-        int | None, typer.Option(min=1, help="Number of held-out views, moving: cameras; default: 12, moving 2.")
+        int | None, typer.Option(min=1, help="Held-out views, or with --moving cameras; default: 12, or 2.")
     ] = None,
     seed: Seed = 0,
     moving: Annotated[
-        bool, typer.Option("--moving", help="A ball flies, a book turns, a lamp pulses; in the layout of D-NeRF.")
+        bool, typer.Option("--moving", help="Make a dynamic scene (D-NeRF): a ball flies, a book turns, a lamp pulses.")
     ] = False,
     times: Annotated[
-        int | None, typer.Option(min=2, help="With --moving: moments, every fifth held out; default: 30.")
+        int | None, typer.Option(min=2, help="With --moving: times, every fifth held out; default: 30.")
     ] = None,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
@@ -60,7 +60,7 @@ def synthetic(
 @app.command()
 def multiscale(
     source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
-    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write.")],
     levels: Annotated[int, typer.Option(min=1, max=8, help="Number of sizes: full, half, quarter, …")] = 4,
 ) -> None:
     """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
@@ -69,14 +69,14 @@ def multiscale(
 
 @app.command()
 def photos(
-    source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
+    source: Annotated[Path, typer.Argument(help="Folder of photographs; nothing is written to it.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
-    long_side: Annotated[int, typer.Option(min=64, help="Pixels to look for features at.")] = 1600,
+    long_side: Annotated[int, typer.Option(min=64, help="Image size for features: pixels of the long side.")] = 1600,
     camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
     matching: Annotated[Matching, typer.Option(help="Which pairs of photographs are matched.")] = "auto",
-    mapper: Annotated[Mapper, typer.Option(help="Method that places the cameras.")] = "incremental",
+    mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",
 ) -> None:
-    """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
+    """Find the cameras of photographs by structure from motion, and write a COLMAP folder."""
     from clsplat.prepare.cache import place_photographs
 
     count = place_photographs(source, out, long_side, camera_model, matching, mapper)
@@ -88,14 +88,14 @@ def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
     frames: Annotated[
-        int, typer.Option(min=1, help="Parts with the same motion; the sharpest frame of each is written.")
+        int, typer.Option(min=1, help="Number of frames: the sharpest of each part; all parts have equal motion.")
     ] = 100,
-    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     times: Annotated[
         bool, typer.Option("--times", help="For a dynamic scene: also write times.json, the time of each frame.")
     ] = False,
 ) -> None:
-    """Take sharp frames of a video, with the same motion between them."""
+    """Extract sharp frames from a video, with the same motion between them."""
     from clsplat.data_tools.video import write_frames
 
     print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")
@@ -103,9 +103,9 @@ def video(
 
 @app.command()
 def sync_frames(
-    scene: Annotated[Path, typer.Argument(help="Folder that holds videos/NAME.mp4 of each camera.")],
+    scene: Annotated[Path, typer.Argument(help="Folder with videos/NAME.mp4 for each camera.")],
     frames: Annotated[int, typer.Option(min=2, help="Frames of each video, evenly spaced.")] = 60,
-    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
 ) -> None:
     """Extract synchronized frames from the videos of several cameras."""
     from clsplat.data_tools.sync_frames import write_sync_frames
@@ -116,13 +116,13 @@ def sync_frames(
 @app.command()
 def undistort(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
-    out: Annotated[Path, typer.Argument(help="Folder for the scene of pinhole cameras.")],
-    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    out: Annotated[Path, typer.Argument(help="Folder for the scene with pinhole cameras.")],
+    long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     undefined_pixels: Annotated[
         UndefinedPixels, typer.Option(help="Crop away pixels that no photo covers, or keep and mask them.")
     ] = "crop",
 ) -> None:
-    """Undistort the photographs of a scene, of fisheye lenses too."""
+    """Undistort the photographs of a scene, including those of fisheye lenses."""
     from clsplat.prepare.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images in {out}")
@@ -134,9 +134,9 @@ def cameras(
     out: Annotated[Path, typer.Argument(help="Folder for the files.")],
     format_: Annotated[
         Literal["colmap", "nerfstudio", "inria"],
-        typer.Option("--format", help="sparse/0/*.txt, transforms.json, or cameras.json of the first 3DGS."),
+        typer.Option("--format", help="sparse/0/*.bin, transforms.json, or cameras.json of the original 3DGS."),
     ] = "colmap",
-    images: Annotated[Literal["none", "copy"], typer.Option(help="Photographs: stay, or are copied too.")] = "none",
+    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photographs, too.")] = "none",
 ) -> None:
     """Write the cameras of a scene for other programs."""
     from clsplat.api.pictures import write_cameras
@@ -149,10 +149,10 @@ def cameras(
 @app.command()
 def fetch(
     name: Annotated[str, typer.Argument(help="mipnerf360, tandt_db, or the address of a ZIP or TAR archive.")],
-    out: Annotated[Path, typer.Argument(help="Folder to make.")],
-    sha256: Annotated[str, typer.Option(help="The checksum of an archive given by its address.")] = "",
+    out: Annotated[Path, typer.Argument(help="Folder to write.")],
+    sha256: Annotated[str, typer.Option(help="Checksum of an archive that is given by its address.")] = "",
 ) -> None:
-    """Download a public data set; a second call continues an interrupted download."""
+    """Download a public data set, or continue an interrupted download."""
     from clsplat.data_tools.fetch import WebArchive, named
     from clsplat.data_tools.fetch import fetch as download
 

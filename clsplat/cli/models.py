@@ -105,7 +105,7 @@ def view(
     out: Annotated[Path, typer.Option(metavar="FILE.html", help="The page to write.")] = Path("viewer.html"),
     photographs: Annotated[Literal["none", "test", "all"], typer.Option(help="Which photos to include.")] = "test",
     photograph_budget: Annotated[
-        float, typer.Option(min=0, metavar="MB", help="Limit of the total size of photos; some are left out if needed.")
+        float, typer.Option(min=0, metavar="MB", help="Maximum total size of the photos; some are left out if needed.")
     ] = 4.0,
     splats: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Include only the N most important Gaussians; default: all.")
@@ -147,11 +147,11 @@ def convert(
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
     ] = 0.0,
     time: Annotated[
-        float | None, typer.Option(metavar="T", help="Moving model: write it at this time, 0 to 1.")
+        float | None, typer.Option(metavar="T", help="Dynamic model: write it at this time, 0 to 1.")
     ] = None,
     frames: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Moving model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
+        typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
     ] = None,
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates instead of an origin.")] = False,
 ) -> None:
@@ -190,12 +190,12 @@ def compress(
     format_: Annotated[Literal["sog", "spz"], typer.Option("--format", help="Format of the files.")] = "sog",
     keep: Annotated[
         str | None,
-        typer.Option(metavar="SHARE,…", help="Fractions of the Gaussians to try; default: 1,0.7,0.5,0.35,0.25,0.18."),
+        typer.Option(metavar="F,…", help="Fractions of the Gaussians to try; default: 1,0.7,0.5,0.35,0.25,0.18."),
     ] = None,
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Training steps after each pruning, and a fifth for each palette; default: 1000."
+            min=1, metavar="N", help="Training steps per pruning, and a fifth of them per palette; default: 1000."
         ),
     ] = None,
     device: DeviceOption = None,
@@ -216,18 +216,16 @@ def compress(
 @command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")
 def lod(
     model: Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file, or a run folder.")],
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to create, with lod-meta.json.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write, with lod-meta.json.")],
     levels: Annotated[int, typer.Option(metavar="N", help="Number of levels, including the model itself.")] = 4,
-    keep: Annotated[
-        float, typer.Option(metavar="SHARE", help="Fraction of the Gaussians of the previous level.")
-    ] = 0.5,
+    keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the Gaussians of the previous level.")] = 0.5,
     scene: SceneOption = None,
     steps: Annotated[
-        int | None, typer.Option(metavar="N", help="Training steps of each coarser level; 0: none; default: 500.")
+        int | None, typer.Option(metavar="N", help="Training steps for each coarser level, or 0; default: 500.")
     ] = None,
     downscale: Annotated[
         float | None,
-        typer.Option(metavar="N", help="Divisor of the image size in this training; default: that of the run."),
+        typer.Option(metavar="N", help="Divisor of the image size for this training; default: that of the run."),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
@@ -271,7 +269,7 @@ PathOption = Annotated[
 ]
 SideOption = Annotated[
     str | None,
-    typer.Option(metavar="photograph|MODEL", help="Video: show the nearest photo, or another model, next to it."),
+    typer.Option(metavar="photograph|MODEL", help="Video: nearest photo, or another model, next to the render."),
 ]
 
 
@@ -281,7 +279,7 @@ SizeOption = Annotated[
     typer.Option(metavar="WxH", help="Video: size of a frame in pixels, even numbers; default: that of the photos."),
 ]
 TimeOption = Annotated[
-    float | None, typer.Option(metavar="T", help="Moving model: time, 0 to 1; default: the time of each view.")
+    float | None, typer.Option(metavar="T", help="Dynamic model: time, 0 to 1; default: the time of each view.")
 ]
 TimesOption = Annotated[
     str | None, typer.Option(metavar="A..B", help="Video: times of the first and last frame; default: 0..1.")
@@ -303,8 +301,8 @@ def render(
     scale: ScaleOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the images.")] = Path("renders"),
     format_: FormatOption = "png",
-    depth: Annotated[bool, typer.Option("--depth", help="Write depths too, as NAME_depth; red is near.")] = False,
-    alpha: Annotated[bool, typer.Option("--alpha", help="Write opacities too, as NAME_alpha.")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="Also write depths, as NAME_depth; red is near.")] = False,
+    alpha: Annotated[bool, typer.Option("--alpha", help="Also write opacities, as NAME_alpha.")] = False,
     path: PathOption = None,
     frames: Annotated[int | None, typer.Option(metavar="N", help="Video: number of frames; default: 120.")] = None,
     fps: Annotated[float | None, typer.Option(metavar="F", help="Video: frames per second; default: 30.")] = None,

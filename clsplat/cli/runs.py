@@ -12,7 +12,7 @@ from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputErro
 
 OnOption = Annotated[
     Path | None,
-    typer.Option("--on", metavar="FILE", help="Where cells or blocks run: engine, store, devices."),
+    typer.Option("--on", metavar="FILE", help="YAML file: where cells or blocks run (engine, store, devices)."),
 ]
 
 
@@ -42,7 +42,7 @@ def run(
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Train in as many steps as fit into this time, within about 15 %."),
+        typer.Option(metavar="M", help="Choose the number of steps to fit this time, within about 15 %."),
     ] = None,
     on: OnOption = None,
 ) -> None:
@@ -70,7 +70,7 @@ def run(
 def resume(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or a matrix.")],
     scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where its photos are now; default: where they were.")
+        Path | None, typer.Option(metavar="DIR", help="Where the photos are now, if they were moved.")
     ] = None,
     device: DeviceOption = None,
     steps: Annotated[
@@ -78,8 +78,8 @@ def resume(
         typer.Option(
             min=1,
             metavar="N",
-            help="Train up to this step, to train longer than before; equal to a run planned as long, unless a reset "
-            "or pruning was due at the old last step.",
+            help="Train up to this step; the result equals that of a run planned for it, unless a reset or pruning "
+            "was due at the old last step.",
         ),
     ] = None,
     set_: SetOption = None,
@@ -255,11 +255,11 @@ def blocks(
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
-        typer.Option(metavar="FRACTION", help="A view trains blocks that cover more of it."),
+        typer.Option(metavar="FRACTION", help="A block gets the views of which it covers more."),
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
-        typer.Option(help="Steps per block: all of the pipeline, or a share by its views."),
+        typer.Option(help="Steps per block: all of the pipeline, or in proportion to its views."),
     ] = "each",
     plan: Annotated[bool, typer.Option("--plan", help="Only train the coarse model and show the plan.")] = False,
     set_: SetOption = None,
@@ -321,7 +321,7 @@ def cell(
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Run one cell of a matrix, unless its result is in the store; for job arrays of any queue."""
+    """Run one cell of a matrix, unless its result is in the store; for the job arrays of any scheduler."""
     commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 
@@ -351,5 +351,5 @@ def worker(
         bool, typer.Option("--insecure", help="Without TLS.  Anyone who reaches the scheduler's port can run code.")
     ] = False,
 ) -> None:
-    """Offer the devices of this machine to a Dask scheduler, one process per device, until it ends."""
+    """Offer this machine's devices to a Dask scheduler, one process per device, until the scheduler ends."""
     commands.run_worker(scheduler, device, tls=(tls_ca, tls_cert, tls_key), insecure=insecure)

@@ -33,7 +33,7 @@ def doctor(
         Path | None, typer.Option("--html", metavar="FILE", help="Write an HTML report, to attach to an issue.")
     ] = None,
 ) -> None:
-    """Check that a device computes what the float64 reference does; exit code 4 if not."""
+    """Compare every kernel with the float64 reference; exit code 4 if the device computes wrongly."""
     from clsplat.conformance.doctor import check_html_path, write_page
 
     if as_json:
@@ -76,12 +76,12 @@ def inspect(
     count: Annotated[
         int | None,
         typer.Option(
-            "--blocks", metavar="N", help="Only show how the points would be cut into N blocks: views, memory, time."
+            "--blocks", metavar="N", help="Only show how N blocks would partition the points: views, memory, time."
         ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Report whether a dataset or photos can be trained on, and their problems; exit code 3 if not."""
+    """Report problems of a dataset or photos, and whether they can be trained on; exit code 3 if not."""
     from clsplat.prepare.inspect.findings import show
     from clsplat.workflows.blocks import table
 
