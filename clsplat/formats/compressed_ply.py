@@ -54,7 +54,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
             require_size(path, size, section.start + length, f"{section.count} rows of '{name}'")
             file.seek(section.start)
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
-    chunks, vertices = _checked(path, header, tables)
+    chunks, vertices = _require_match(path, header, tables)
     require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
     per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
     color, alpha = _colors(vertices, chunks, per_splat)
@@ -69,7 +69,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
     return SplatFile(parameters, rendering_of(path, header), render_mode(header))
 
 
-def _checked(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the chunks and vertices.  Raises DataError if they do not match."""
     if not {"chunk", "vertex"} <= tables.keys() or not set(_ENDS[:12]) <= set(tables["chunk"].dtype.names or ()):
         raise DataError(f"{path}: a compressed PLY needs the ranges of its splats in 'element chunk'; export it again")

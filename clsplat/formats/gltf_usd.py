@@ -43,7 +43,7 @@ from clsplat.formats.splats import (
     transform,
     unit,
 )
-from clsplat.formats.spz import ALIKE, RATIO, decode_spz
+from clsplat.formats.spz import MIN_LIMIT, RATIO, decode_spz
 
 # The parts of glTF with Gaussians: primitives, the transforms of their nodes, and accessors.
 
@@ -81,20 +81,20 @@ class Gltf:
 
     def parameters(self) -> Parameters:
         """Return all Gaussians in the axes of a PLY, before the transform `placement`."""
-        return concatenate([self._placed(primitive, matrix) for primitive, matrix in self.primitives])
+        return concatenate([self._place(primitive, matrix) for primitive, matrix in self.primitives])
 
-    def _placed(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
-        """Return the Gaussians of a primitive where its transform, relative to the first one, puts them."""
+    def _place(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
+        """Return the Gaussians of a primitive, transformed relative to the first primitive."""
         part, first = flip_axes(self._part(primitive)), self.primitives[0][1]
         if np.allclose(matrix, first, rtol=1e-7):
             return part
         relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
         scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
         try:
-            moved = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
+            transformed = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
         except ValueError as error:
             raise DataError(f"{self.path}: the transform of a node is not supported: {error}") from error
-        return part | {name: table.astype(np.float32) for name, table in moved.items()}
+        return part | {name: table.astype(np.float32) for name, table in transformed.items()}
 
     def _part(self, primitive: dict[str, Any]) -> Parameters:
         """Return the Gaussians of one primitive, in the axes of glTF."""
@@ -121,13 +121,13 @@ class Gltf:
     def _spz(self, view: Any, names: dict[str, Any]) -> Parameters:
         """Return the Gaussians of an SPZ file in a view, in the axes of glTF.
 
-        They are to be unpacked to x left, y up, z front; some programs keep the axes of SPZ, which the bounds show.
+        The axes should be x left, y up, z front after unpacking; some programs keep those of SPZ, as the bounds show.
         """
         data, start, length, _ = self._view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])
         self.is_mip |= splats.mode == "mip"
         self.unpacked += sum(table.nbytes for table in splats.parameters.values())
-        if self.unpacked > 4 * max(RATIO * sum(map(len, self.files.values())), ALIKE):  # as much as a single SPZ
+        if self.unpacked > 4 * max(RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as much as a single SPZ
             raise DataError(f"{self.path}: its SPZ data unpack to {self.unpacked} bytes; export it again")
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
         position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
@@ -265,7 +265,7 @@ class Gltf:
         return matrix
 
     def _roots(self) -> list[int]:
-        """Return the root nodes of the scene; without a scene, those without a parent."""
+        """Return the root nodes of the scene; without a scene, the nodes without a parent."""
         if "scenes" in self.tree and (roots := self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"]):
             return list(roots)
         nodes = self.tree["nodes"]

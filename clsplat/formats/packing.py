@@ -66,9 +66,9 @@ def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
     return (levels < -0.5) | (levels > 255.5)
 
 
-def warn_clipped(path: Path, name: str, ranges: str, beyond: NDArray[np.bool_]) -> None:
+def warn_clipped(path: Path, name: str, ranges: str, is_clipped: NDArray[np.bool_]) -> None:
     """Warn how many Gaussians, rows of `beyond`, have values outside of a format's range."""
-    if count := int(beyond.any(axis=1).sum()):
+    if count := int(is_clipped.any(axis=1).sum()):
         LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
 
@@ -89,8 +89,8 @@ def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     image[:, 3] = 255
     image[: len(pixels)] = pixels
     bgra = np.ascontiguousarray(image[:, BGRA].reshape(height, width, 4))
-    done, data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
-    if not done or not np.array_equal(_rgba(data), image):
+    is_encoded, data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
+    if not is_encoded or not np.array_equal(_rgba(data), image):
         raise OutputError(f"{path}: OpenCV {cv2.__version__} cannot write lossless WebP here; install another version")
     return bytes(data.tobytes())
 

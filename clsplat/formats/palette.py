@@ -60,15 +60,15 @@ class _Cells:
         """Merge the cheapest pair of cells and split the worst cell, as long as that reduces the error."""
         for _ in range(ENTRIES):
             errors = self.errors(cuts[:-1], cuts[1:])
-            joined = self.errors(cuts[:-2], cuts[2:]) - errors[:-1] - errors[1:]
+            loss = self.errors(cuts[:-2], cuts[2:]) - errors[:-1] - errors[1:]
             middle = np.clip(
                 np.searchsorted(self.ordered, self.means(cuts)), cuts[:-1], cuts[1:]
             )  # clipped for empty cells
             gain = errors - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
             worst = int(gain.argmax())
-            joined[max(worst - 1, 0) : worst + 1] = np.inf  # neighbors of the split cell
-            cheap = int(joined.argmin())
-            if gain[worst] <= joined[cheap] * (1 + 1e-9):
+            loss[max(worst - 1, 0) : worst + 1] = np.inf  # neighbors of the split cell
+            cheap = int(loss.argmin())
+            if gain[worst] <= loss[cheap] * (1 + 1e-9):
                 break
             cuts = np.sort(np.append(np.delete(cuts, cheap + 1), middle[worst]))
         return cuts
@@ -77,8 +77,8 @@ class _Cells:
 def _sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return prefix sums, [N + 1], relative to the middle, which keeps their precision there."""
     middle = len(values) // 2
-    before, after = np.cumsum(values[:middle][::-1])[::-1], np.cumsum(values[middle:])
-    return np.concatenate([-before, [0.0], after])
+    lower, upper = np.cumsum(values[:middle][::-1])[::-1], np.cumsum(values[middle:])
+    return np.concatenate([-lower, [0.0], upper])
 
 
 def _first_cuts(ordered: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -107,23 +107,23 @@ def palette(
     """
     if (exact := unique_points(points, entries)) is not None:
         return exact
-    whole = _whole_numbers(points)
-    chosen = _sample_rows(len(points), SAMPLE * entries, weights)
-    sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
+    integers = _whole_numbers(points)
+    rows = _sample_rows(len(points), SAMPLE * entries, weights)
+    sample, integer_sample = points[rows].astype(np.float64), integers[rows]
     starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
-    vectors, moved = sample[starts], sample_whole[starts]
+    vectors, centers = sample[starts], integer_sample[starts]
     for _ in range(PALETTE_ROUNDS):
-        labels, distance = _nearest_vectors(sample_whole, moved)
+        labels, distance = _nearest_vectors(integer_sample, centers)
         counts = np.bincount(labels, minlength=entries)
-        sums = [np.bincount(labels, column, minlength=entries) for column in sample_whole.T]
-        moved = np.rint(np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]).astype(np.float32)
+        sums = [np.bincount(labels, column, minlength=entries) for column in integer_sample.T]
+        centers = np.rint(np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]).astype(np.float32)
         empty = np.flatnonzero(counts == 0)
         farthest = np.argsort(-distance, kind="stable")[: len(empty)]
-        moved[empty] = sample_whole[farthest]
+        centers[empty] = integer_sample[farthest]
     for column in range(points.shape[1]):
         vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(counts, 1)
     vectors[empty] = sample[farthest]
-    return vectors, _nearest_vectors(whole, moved)[0]
+    return vectors, _nearest_vectors(integers, centers)[0]
 
 
 def _nearest_vectors(

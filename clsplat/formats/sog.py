@@ -137,7 +137,7 @@ def sog_files(path: Path) -> Iterator[Files]:
 
 
 PIXELS_PER_BYTE = 2  # of all images; real files have less than one
-ALIKE = 1 << 19  # splats that any file may have: 0.1 GB in memory
+MIN_LIMIT = 1 << 19  # splats that any file may have: 0.1 GB in memory
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
@@ -162,7 +162,7 @@ def read_sog(path: Path) -> SplatFile:
 
 def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
     """Raise DataError if files of `size` bytes cannot have `count` splats, and MemoryLimitError."""
-    if count > ALIKE + PIXELS_PER_BYTE * size:
+    if count > MIN_LIMIT + PIXELS_PER_BYTE * size:
         raise DataError(f"{path}: declares {count} splats, but its files have only {size} bytes; copy it again")
     require_memory(path, count, degree)
 
@@ -224,16 +224,16 @@ class _Sog:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels; export it again")
         labels = packing.decode(self.path, "labels of shN", files[1], self.count, SLACK + 4 * self.count)
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
-        used = entries = 1 + int(chosen.max(initial=0))
+        used_entries = entries = 1 + int(chosen.max(initial=0))
         if self.old:
             degree = self._degree_of_width(files[0])
         else:
-            entries = self._whole_number("shN.count", self._part("shN").get("count", used), MAX_PALETTE)
+            entries = self._whole_number("shN.count", self._part("shN").get("count", used_entries), MAX_PALETTE)
             degree = self._whole_number("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
         size = sh_coefficients(degree) - 1
-        if used > entries:
+        if used_entries > entries:
             raise DataError(
-                f"{self.path}: labels of shN use {used} centroids, but shN.count is {entries}; export it again"
+                f"{self.path}: labels of shN use {used_entries} centroids, but shN.count is {entries}; export it again"
             )
         limit = SLACK + 4 * size * MAX_PALETTE
         centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, limit)
@@ -346,7 +346,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     weights: base-2 logarithms, [N], of `log_weights` of the whole model, of which the splats may be a part.
     """
     in_folder = path.name == META
-    p, harmonics = _quantized(splats.parameters, weights, options)
+    p, harmonics = _quantize(splats.parameters, weights, options)
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
@@ -367,14 +367,14 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     largest, others = smallest_three(unit(p["quats"]))
     levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5)), 0, 255)
     meta["quats"] = {"files": [image("quats", *levels.T, ROTATED + largest)]}
-    for name, table, more in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
+    for name, table, alpha in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
         entries = codebook(p[table])
         planes = nearest_entries(p[table], entries).T
-        meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
+        meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *alpha)]}
     if harmonics is not None:
         meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
-    return _write_folder(path, images) if in_folder else write_bytes(path, _zipped(images))
+    return _write_folder(path, images) if in_folder else write_bytes(path, _zip(images))
 
 
 def _write_folder(path: Path, images: dict[str, bytes]) -> str:
@@ -430,7 +430,7 @@ class Harmonics:
         weights: weights of errors, [N].  better: refines a palette [E, c] and returns it with the label of each splat.
         step: rounding of codebook numbers, used if few enough remain.
         """
-        vectors, labels = palette(rest, _few(len(rest), quality), weights)
+        vectors, labels = palette(rest, _training_entries(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = better(vectors)
         return cls.from_vectors(vectors, labels, step)
@@ -449,12 +449,12 @@ class Harmonics:
         return self.numbers.astype(np.float32)[self.palette][self.labels]
 
 
-def _few(count: int, quality: Quality) -> int:
+def _training_entries(count: int, quality: Quality) -> int:
     """Return the number of palette entries for training."""
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 
-def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
+def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
     """Return the rounded tables and a palette of the SH.
 
     SH that already form a palette stay unchanged, and so do the tables, which were then rounded in training.
@@ -462,7 +462,7 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     """
     rest, base = p["sh_rest"], p["sh_base"]
     relative = int(RELATIVE_PALETTES[options.quality] * len(rest))
-    max_entries = min(MAX_PALETTE, max(_few(len(rest), options.quality), relative))
+    max_entries = min(MAX_PALETTE, max(_training_entries(len(rest), options.quality), relative))
     exact = unique_points(rest, max_entries) if rest.shape[1] else None
     harmonics = None if exact is None else Harmonics.from_vectors(*exact)
     if harmonics and rest.any():
@@ -494,7 +494,7 @@ def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
     return float(Context(8, rounding).create_decimal(float(number)))
 
 
-def _zipped(images: dict[str, bytes]) -> bytes:
+def _zip(images: dict[str, bytes]) -> bytes:
     """Return a ZIP without timestamps, operating system, and compression."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:

@@ -19,7 +19,7 @@ from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
 Floats = NDArray[np.floating]
 LEVELS = 65535  # of a position
 TINY = 2.0**-40  # levels, replaces a size of 0
-MOST_BITS = 8  # last bits of a position that may be zeroed
+MAX_ZERO_BITS = 8  # last bits of a position that may be zeroed
 _SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
 # rotations that map axes onto axes, [24, 4]; a quaternion and its negative are the same
 _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
@@ -39,8 +39,8 @@ def round_means(
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
-    wanted = np.log2(fraction * sizes) - log_weights[:, None] / 2
-    step = np.exp2(np.clip(np.floor(wanted), 0, MOST_BITS))
+    bits = np.log2(fraction * sizes) - log_weights[:, None] / 2
+    step = np.exp2(np.clip(np.floor(bits), 0, MAX_ZERO_BITS))
     return _positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
 
 
@@ -216,29 +216,29 @@ def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], e
         new[chosen] = np.arange(len(chosen))
         rows = np.flatnonzero(new[labels] >= 0)
         cluster = new[labels[rows]]
-        beyond = away[rows, spread.argmax(axis=1)[labels[rows]]] > 0
-        beyond = _halves(points[rows], weights[rows], cluster, beyond)
-        labels[rows[beyond]] = parts + cluster[beyond]
+        is_second = away[rows, spread.argmax(axis=1)[labels[rows]]] > 0
+        is_second = _bisect(points[rows], weights[rows], cluster, is_second)
+        labels[rows[is_second]] = parts + cluster[is_second]
         parts += len(chosen)
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
-def _halves(
-    points: NDArray[np.float32], weights: NDArray[np.float64], cluster: Labels, beyond: NDArray[np.bool_]
+def _bisect(
+    points: NDArray[np.float32], weights: NDArray[np.float64], cluster: Labels, is_second: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Run Lloyd's iteration with two means per cluster; return which points are in the second half."""
     parts = int(cluster.max()) + 1
     for _ in range(LLOYD_STEPS):
-        half = 2 * cluster + beyond
+        half = 2 * cluster + is_second
         totals = np.maximum(np.bincount(half, weights, minlength=2 * parts), TINY_WEIGHT)
         means = (_sums(half, weights, points, 2 * parts) / totals[:, None]).reshape(parts, 2, -1)
-        across = means[:, 1] - means[:, 0]
-        middle = (across * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)
-        along = np.zeros(len(points))
+        axis = means[:, 1] - means[:, 0]
+        threshold = (axis * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)
+        projection = np.zeros(len(points))
         for column in range(points.shape[1]):
-            along += points[:, column] * across[cluster, column]
-        beyond = along > middle[cluster]
-    return beyond
+            projection += points[:, column] * axis[cluster, column]
+        is_second = projection > threshold[cluster]
+    return is_second
 
 
 def _sums(

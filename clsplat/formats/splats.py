@@ -86,7 +86,9 @@ MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-MOST = 0.5  # fraction of values outside of their range that shows another unit; mirrored axes have negative scales
+MIN_OUTSIDE = (
+    0.5  # fraction of values outside of their range that shows another unit; mirrored axes have negative scales
+)
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
@@ -122,9 +124,9 @@ class SplatFile:
         """Whether some Gaussians are a sky, as clsplat/gaussians/conversion.py marks in the comment."""
         return bool(self.rendering.get("sky") == "splats")
 
-    def rows(self, chosen: Any) -> "SplatFile":
+    def rows(self, indices: Any) -> "SplatFile":
         """Return the Gaussians at the given rows, in that order."""
-        return replace(self, parameters={name: table[chosen] for name, table in self.parameters.items()})
+        return replace(self, parameters={name: table[indices] for name, table in self.parameters.items()})
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ def with_degree(parameters: Parameters, degree: int) -> Parameters:
 
 
 def concatenate(parts: Sequence[Parameters]) -> Parameters:
-    """Return the rows of several tables one after the other, with the largest SH degree of them."""
+    """Concatenate the rows of several tables, with their largest SH degree."""
     degree = max(sh_degree_of(part["sh_rest"].shape[1]) for part in parts)
     tables = [with_degree(part, degree) for part in parts]
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
@@ -266,18 +268,18 @@ def usual_near(means: NDArray[np.floating]) -> float:
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:
     """Return which Gaussians have finite log scales, SH coefficients, or motions beyond MAX_VALUE, [N]."""
-    return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED if name in parameters], axis=0))
+    return np.asarray(np.any([_exceeds_limit(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
 def too_large_message(parameters: Parameters) -> str:
     """Return how many Gaussians have values that are too large, and in which tables; '' if none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
-    names = ", ".join(name for name in LIMITED if name in parameters and _beyond(parameters[name]).any())
+    names = ", ".join(name for name in LIMITED if name in parameters and _exceeds_limit(parameters[name]).any())
     return f"{count:,} of {len(parameters['means']):,} Gaussians have {names} beyond {MAX_VALUE:g}"
 
 
-def _beyond(table: Floats) -> NDArray[np.bool_]:
+def _exceeds_limit(table: Floats) -> NDArray[np.bool_]:
     """Return which rows have finite values beyond MAX_VALUE, [N]."""
     size = np.abs(table)
     return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
@@ -299,7 +301,7 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
 
 def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
     """Return logarithms of scales; if most are negative, they are logarithms already, as a note says."""
-    if np.count_nonzero(scales < 0) > MOST * scales.size:
+    if np.count_nonzero(scales < 0) > MIN_OUTSIDE * scales.size:
         notes.add("its scales are negative: they are read as logarithms")
         return scales.astype(np.float32)
     return logs(np.abs(scales))
@@ -307,7 +309,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
     """Return logits of opacities; if most are outside of [0, 1], they are logits already, as a note says."""
-    if np.count_nonzero((alpha < 0) | (alpha > 1)) > MOST * alpha.size:
+    if np.count_nonzero((alpha < 0) | (alpha > 1)) > MIN_OUTSIDE * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)
     return logits(alpha)
@@ -318,15 +320,15 @@ def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFi
 
     Raises DataError.
     """
-    bad = not_finite(splats.parameters)
+    is_invalid = not_finite(splats.parameters)
     if options.not_finite == "drop":
         if message := too_large_message(splats.parameters):
             LOG.warning("%s: %s; they are dropped", path, message)
-        if bad.any():
-            LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(bad.sum()):,}")
-        bad |= too_large(splats.parameters)
-        return splats.rows(~bad) if bad.any() else splats
-    if options.not_finite == "keep" or not bad.any():
+        if is_invalid.any():
+            LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(is_invalid.sum()):,}")
+        is_invalid |= too_large(splats.parameters)
+        return splats.rows(~is_invalid) if is_invalid.any() else splats
+    if options.not_finite == "keep" or not is_invalid.any():
         return splats
     names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
     raise DataError(

@@ -166,25 +166,25 @@ def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.roll(xyzw, 1, axis=1)
 
 
-def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
+def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) -> int:
     """Return the number of fractional bits with which all positions fit into 24 bits; warn if it is small.
 
     Raises DataError for positions that do not fit even without fractional bits.
     """
     largest = float(np.abs(means).max(initial=0))
-    more = max(0, round(-math.log2(typical_size(means))) - COARSE)  # in a small unit of length
-    wanted = min((FINE_FRACTION if fine else FRACTION) + more, MAX_FRACTION)
-    bits = min(wanted, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
+    extra = max(0, round(-math.log2(typical_size(means))) - COARSE)  # in a small unit of length
+    target = min((FINE_FRACTION if is_fine else FRACTION) + extra, MAX_FRACTION)
+    bits = min(target, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
     if bits < 0:
         raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {largest:g}; crop it")
-    if bits < min(FRACTION + more, MAX_FRACTION):
+    if bits < min(FRACTION + extra, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
             "crop the model for more precision",
             path,
             largest,
             2.0**-bits,
-            2.0**-wanted,
+            2.0**-target,
         )
     return bits
 
@@ -311,7 +311,7 @@ HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
 CODE_RATIO = 1032  # largest compression ratio of deflate
 RATIO = 32  # largest accepted compression ratio; that of real files is below 8
-ALIKE = 1 << 26  # bytes of planes that any file may decode to: 0.3 GB in memory
+MIN_LIMIT = 1 << 26  # bytes of planes that any file may decode to: 0.3 GB in memory
 BLOCK = 1 << 16  # bytes read at once
 GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without time and system, so that the same model gives the same bytes
 AXES_RECORD = 0xADBE0003  # an extension of Adobe: the number, from 1, of a name in AXES
@@ -353,7 +353,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     require_in_range(path, splats, "SPZ")  # one invalid value would spoil the SH of all Gaussians
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
-    fraction = fraction_of(path, p["means"], options.quality == "high")
+    fraction = choose_fraction_bits(path, p["means"], options.quality == "high")
     planes = encode(path, flip_axes(p), weights, fraction, options)
     numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
@@ -373,7 +373,7 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     header = SpzHeader.parse(path, stream.read(HEADER))
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
-    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _most(data)))
+    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded(data)))
 
     def read(size: int) -> bytes:
         if len(part := stream.read(size)) < size:
@@ -432,7 +432,7 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
             f"{path}: has {streams} streams and their table at byte {table}; expected {len(present)} streams within "
             f"{len(data)} bytes; copy or export it again"
         )
-    _check_size(path, header, _most(data))
+    _check_size(path, header, _max_decoded(data))
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
     start, frames = table + 16 * streams, []
     for number, size in enumerate(present):
@@ -449,9 +449,9 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     return header, decode(header, [frame.read for frame in frames]), axes
 
 
-def _most(data: bytes) -> int:
+def _max_decoded(data: bytes) -> int:
     """Return how many bytes of planes a compressed file may decode to."""
-    return max(len(data) * RATIO, ALIKE)
+    return max(len(data) * RATIO, MIN_LIMIT)
 
 
 def _check_size(path: Path, header: SpzHeader, limit: int) -> None:

@@ -134,7 +134,7 @@ def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
                 raise DataError(
                     f"{path}: a leaf refers to level {quote(name)}; expected 0 to {len(levels) - 1}; export it again"
                 )
-            file, offset, count = (_whole(path, key, run) for key in ("file", "offset", "count"))
+            file, offset, count = (_whole_number(path, key, run) for key in ("file", "offset", "count"))
             levels[numbers[name]].setdefault(file, []).append((offset, count))
     for level, runs in enumerate(levels):
         if max(runs, default=-1) >= len(meta["filenames"]):
@@ -164,7 +164,7 @@ def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
             raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods; export it again")
 
 
-def _whole(path: Path, key: str, run: Any) -> int:
+def _whole_number(path: Path, key: str, run: Any) -> int:
     value = run.get(key) if isinstance(run, dict) else None
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number; export it again")

@@ -229,8 +229,8 @@ def writing_format(path: Path) -> Codec:
         raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
     codec = format_of_name(path)
     if codec is None or codec.write is None:
-        how = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
-        fault = f"{codec.name} {how}" if codec else f"no format has the name {quote(path.name)}"
+        remedy = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
+        fault = f"{codec.name} {remedy}" if codec else f"no format has the name {quote(path.name)}"
         raise ConfigError(f"{shorten(str(path))}: {fault}; give a name that ends in {', '.join(endings())}")
     return codec
 
@@ -248,9 +248,9 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         raise ValueError(f"{path}: {codec.name} cannot store a world filter; call baked() first")
     if not codec.keeps_all:
         require_static(path, splats, codec.name)
-    if not codec.keeps_all and (bad := int(not_finite(splats.parameters).sum())):
+    if not codec.keeps_all and (count := int(not_finite(splats.parameters).sum())):
         raise DataError(
-            f"{path}: {bad:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them, "
+            f"{path}: {count:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them, "
             "or write a PLY"
         )
     options = options or Writing()
@@ -270,8 +270,8 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
             path,
             codec.name,
         )
-    if not codec.keeps_numbers and (lost := _unusual(splats)):
-        LOG.warning("%s: %s does not store %s; PLY, SOG, and GLB do", path, codec.name, lost)
+    if not codec.keeps_numbers and (losses := _unusual_numbers(splats)):
+        LOG.warning("%s: %s does not store %s; PLY, SOG, and GLB do", path, codec.name, losses)
     if (origin := splats.rendering.get("origin")) and not (codec.keeps_numbers or codec.keeps_origin):
         LOG.warning(
             "%s: %s does not store the origin (%s) of the coordinates; PLY, SOG, GLB, and OpenUSD do",
@@ -282,7 +282,7 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
 USUAL = 10  # largest ratio of a near plane to that of a file without one, and its inverse, that a file need not store
 
 
-def _unusual(splats: SplatFile) -> str:
+def _unusual_numbers(splats: SplatFile) -> str:
     """Describe the numbers for rendering that differ from the defaults of files without them."""
     near, default = splats.rendering.get("near"), usual_near(splats.parameters["means"])
     usual: dict[str, Any] = {} if near and default / USUAL < near < default * USUAL else {"near": near and default}

@@ -88,7 +88,7 @@ class GrowScored(ByScore):
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
-        # first the clones, which keep the original, with their part of the room; then the splits with what remains
+        # first the clones, which keep the original, with their part of the room; then the splits with the remainder
         for kind, part in ((keep, (is_undone & keep).sum() / is_undone.sum()), (~keep, 1.0)):
             order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)

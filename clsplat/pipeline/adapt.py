@@ -24,7 +24,7 @@ class Decision(Settings):
     reason: str
     """The measurement and its consequence, in one sentence."""
     matters: bool = True
-    """Whether the decision changes this run; only then the log gives the reason."""
+    """Whether the decision changes this run; only then is the reason logged."""
 
     @property
     def override(self) -> str:
@@ -41,7 +41,7 @@ class Adaptation(Settings):
     keep: list[str] = Field([])
     """Keys that are not decided; `--set` of a key adds it here."""
     decisions: list[Decision] | None = None
-    """Decisions, written by a run.  A run that has decisions makes no new ones."""
+    """Decisions, written by a run.  A run with decisions does not make new ones."""
 
     @abstractmethod
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
@@ -78,7 +78,10 @@ class Photos(Adaptation):
         reason = "the hull of few silhouettes is too large, so points start at random"
         reason = f"{count}: {reason if few else 'points start in the hull of the silhouettes'}"
         yield Decision(
-            key="init.transparent", value="random" if few else "hull", reason=reason, matters=has_alpha and lacks_points
+            key="init.transparent",
+            value="random" if few else "hull",
+            reason=reason,
+            matters=has_alpha and lacks_points,
         )
         yield Decision(key="init.count", value=100_000 if few else 60_000, reason=reason, matters=False)
 

@@ -28,7 +28,7 @@ class Placement(Settings):
     """Which devices may run which cells."""
 
     bits: Literal["same", "any"] = "same"
-    """same: all cells on devices that give the same bits, the largest such group; any: each cell within one group."""
+    """same: all cells on the largest group of devices that give the same bits; any: each cell within one group."""
 
 
 class Tls(Settings):

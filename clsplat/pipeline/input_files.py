@@ -25,7 +25,8 @@ Change = Callable[[str, Path], str]  # of a path as text, and as the path it ref
 def with_content_hashes(pipeline: Pipeline) -> dict[str, Any]:
     """Return the resolved pipeline with the content hash instead of the path of each file that it reads.
 
-    The folder of the scene is left out, as a scene is identified otherwise.  Raises DataError for unreadable files.
+    The folder of the scene is left out, since a scene is identified by its content.  Raises DataError for unreadable
+    files.
     """
     return _map_paths(pipeline, lambda text, path: hash_content(path) or text, None).resolved()
 

@@ -64,7 +64,7 @@ class Pipeline:
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
 
     def preparation(self, out: Path) -> list[PlannedStep]:
-        """Return the preparation steps before a run in `out`, and why each is due.  Raises DataError or ConfigError."""
+        """Return the preparation steps of a run in `out`, with reasons to run.  Raises DataError or ConfigError."""
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:
             raise ConfigError(
@@ -141,14 +141,14 @@ def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineF
 
 def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
     """Raise the error of the file without overrides, or that of the first invalid override."""
-    known = [key.key_path for key in list_keys(_validate(data, path, document))]
+    known_paths = [key.key_path for key in list_keys(_validate(data, path, document))]
     conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
     for override in overrides:
         names, _ = split(override)
         try:
             key_path = apply(data, override, PipelineFile)
         except NoSuchKey as error:
-            raise OverrideError(override, error.reason + suggestion(names, known)) from error
+            raise OverrideError(override, error.reason + suggestion(names, known_paths)) from error
         try:
             settings = PipelineFile.model_validate(data)
             _check_order(path, settings)
@@ -166,7 +166,7 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
         raise OverrideError(conflict[0], one_line(conflict[1]).removeprefix(f"{path}: ")) from conflict[1]
 
 
-# Settings that follow from the photos: decided once, like `--set`, and decided again for other photos.
+# Settings that follow from the photos: decided once, as if by `--set`, and decided again for other photos.
 
 AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
 

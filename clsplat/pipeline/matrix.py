@@ -31,7 +31,7 @@ from clsplat.pipeline.explanation import explain, key_path_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.stretching import in_steps
+from clsplat.pipeline.stretching import stretch_to_steps
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
 # Short labels for the values of a matrix, from which the names of its cells are made.
@@ -222,7 +222,7 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
 
 
 def _in_steps(cell: Cell, steps: int) -> Cell:
-    return replace(cell, pipeline=replace(cell.pipeline, settings=in_steps(cell.pipeline.settings, steps)))
+    return replace(cell, pipeline=replace(cell.pipeline, settings=stretch_to_steps(cell.pipeline.settings, steps)))
 
 
 def _check_choices(

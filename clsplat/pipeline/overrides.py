@@ -102,7 +102,7 @@ class _Node:
                 raise NoSuchKey(text, f"no {quote(name)} in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
             is_list = isinstance(default, list)
-            self.data[name] = _as_written(default) if isinstance(default, BaseModel) else [] if is_list else {}
+            self.data[name] = _to_plain(default) if isinstance(default, BaseModel) else [] if is_list else {}
         return self._key(name)
 
     def is_keyed(self, name: str) -> bool:
@@ -192,7 +192,7 @@ class _Node:
         return matches[0] if matches else None
 
 
-def _as_written(default: BaseModel) -> dict[str, Any]:
+def _to_plain(default: BaseModel) -> dict[str, Any]:
     """Return a default as in a file: its tag, and the keys whose values are not their defaults."""
     written = default.model_dump(mode="json", exclude_defaults=True)
     return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
@@ -203,16 +203,16 @@ def _address(key_path: KeyPath) -> str:
     return ".".join(str(part) for i, part in enumerate(key_path) if not (i and isinstance(key_path[i - 1], int)))
 
 
-def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
+def suggestion(names: Sequence[str], key_paths: Sequence[str]) -> str:
     """Return '; did you mean …?' with the known key paths that end with `names` or resemble them; '' without any."""
     key_path = ".".join(names)
-    near = [path for path in known if path.endswith(f".{key_path}")]
-    near = near or difflib.get_close_matches(key_path, known, n=1)
-    near = near or [path for path in known if path.rpartition(".")[2] == names[-1]]
-    if not near:
-        last = difflib.get_close_matches(names[-1], [path.rpartition(".")[2] for path in known], n=1)
-        near = [path for path in known if path.rpartition(".")[2] in last]
-    return f"; did you mean {' or '.join(near[:MAX_SUGGESTIONS])}?" if near else ""
+    similar = [path for path in key_paths if path.endswith(f".{key_path}")]
+    similar = similar or difflib.get_close_matches(key_path, key_paths, n=1)
+    similar = similar or [path for path in key_paths if path.rpartition(".")[2] == names[-1]]
+    if not similar:
+        last = difflib.get_close_matches(names[-1], [path.rpartition(".")[2] for path in key_paths], n=1)
+        similar = [path for path in key_paths if path.rpartition(".")[2] in last]
+    return f"; did you mean {' or '.join(similar[:MAX_SUGGESTIONS])}?" if similar else ""
 
 
 # The keys of a pipeline that `--set` can change, in its syntax.

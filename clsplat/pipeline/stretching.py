@@ -22,8 +22,8 @@ from clsplat.training.stage import Scheduled, Training
 
 Value = TypeVar("Value")
 Kind = TypeVar("Kind", bound=Training)
-MAX_STEP = 2**63 - 1  # that a file can hold
-PARTS = 10**6  # of a step: intervals are multiples of one part, which a file holds exactly
+MAX_STEP = 2**63 - 1  # that a file can store
+PARTS = 10**6  # of a step: intervals are multiples of one part, which a file stores exactly
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Axis:
 
     @classmethod
     def from_factor(cls, factor: float | Fraction) -> "Axis":
-        """Return the axis of a factor; a float counts as the decimal number that it prints as."""
+        """Return the axis of a factor; a float stands for its shortest decimal representation."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
@@ -120,9 +120,9 @@ def min_steps(training: Training) -> int:
     return -(-training.steps // gap)
 
 
-def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
+def stretch_to_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     """Return settings stretched to a number of steps of the first training.  Raises ConfigError if no stage trains."""
-    return stretched(settings, Fraction(steps, settings.training.steps))
+    return stretch(settings, Fraction(steps, settings.training.steps))
 
 
 def _stretch_rest(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
@@ -142,24 +142,24 @@ def map_trainings(settings: PipelineFile, kind: type[Kind], change: Callable[[Ki
     return settings.model_copy(update={"stages": stages})
 
 
-def stretched(value: Value, factor: float | Fraction) -> Value:
+def stretch(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; the `step_keys` of each class are scaled."""
-    return _stretched(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
+    return _stretch(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
 
 
-def _stretched(value: Any, axis: Axis) -> Any:
+def _stretch(value: Any, axis: Axis) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
-        return _points(value, axis) if is_points else [_stretched(item, axis) for item in value]
+        return _points(value, axis) if is_points else [_stretch(item, axis) for item in value]
     if isinstance(value, dict):
-        return {key: _stretched(entry, axis) for key, entry in value.items()}
+        return {key: _stretch(entry, axis) for key, entry in value.items()}
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}
     keys = {key for base in type(value).__mro__ if issubclass(base, Settings) for key in base.step_keys}
     every = fields["every"] if "every" in keys else None
     changed = {
-        name: _steps(name, field, axis, every) if name in keys else _stretched(field, axis)
+        name: _steps(name, field, axis, every) if name in keys else _stretch(field, axis)
         for name, field in fields.items()
     }
     changed |= {name: divide(changed[name], float(axis.exact)) for name in type(value).rate_keys if axis.exact != 1}

@@ -26,7 +26,7 @@ from clsplat.training.run import Run
 PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian of a training step, on one AVX-512 core
 WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per weight of a field and per level of its grid, for each sample
 LAUNCHES = 1.0e-3  # s per step, whatever its size
-SLOWER = 6.0  # factor for older processors and larger Gaussians than in the benchmark
+SLOWER = 6.0  # factor for slower processors and larger Gaussians than in the benchmark
 MIN_GAUSSIANS = 5000  # initial number for a small capture, while the points are unknown
 MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; typical captures end at 0.1 to 1
 

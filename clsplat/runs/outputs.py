@@ -124,8 +124,8 @@ def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path]
     """Raise ConfigError if a file that a run or a matrix would write is outside of its folder, or not from a run."""
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
     require_inside(out, files)
-    written = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
-    leftovers = {out / name for name in written}  # of a run that has not started
+    early_files = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
+    leftovers = {out / name for name in early_files}  # of a run that has not started
     for path in files if state.phase < Phase.BEGUN else ():
         if path not in leftovers and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
             raise ConfigError(f"{path}: exists, and is not from a run; use another folder for the run")
@@ -159,5 +159,5 @@ def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -
 
 def declared_outputs(pipeline: Pipeline) -> list[str]:
     """Return the output files that the stages of a pipeline name, as paths in the run folder."""
-    fields = [(stage, *named) for stage in pipeline.stages for named in stage.named_outputs().items()]
+    fields = [(stage, *entry) for stage in pipeline.stages for entry in stage.named_outputs().items()]
     return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

@@ -34,18 +34,18 @@ def run_status(state: RunState) -> dict[str, Any]:
     if not (status := dict(state.status)):
         raise DataError(f"{out}: has no readable status.json; expected a run folder")
     try:
-        known = parse_status(status)
+        parsed = parse_status(status)
     except DataError as error:
         raise DataError(
             f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` checks the other files"
         ) from error
-    if known is None:
+    if parsed is None:
         raise DataError(f"{out / STATUS}: was written by a newer version; update clsplat to read it")
     status["state"] = state.state_name
     for key in ("silent", "ahead"):
         status.pop(key, None)
     if status["state"] not in (*END_STATES, "killed"):
-        silent = round(time.time() - known.time)
+        silent = round(time.time() - parsed.time)
         status["silent"] = max(0, silent)
         if silent <= -HEARTBEAT_TIMEOUT:
             status["ahead"] = -silent
@@ -113,18 +113,18 @@ def _progress(status: dict[str, Any]) -> str:
     amount, count = status.get("progress"), ""
     if isinstance(amount, dict) and amount.get("unit") != "steps":
         count = f", {amount.get('done')} of {amount.get('total')} {amount.get('unit')}"
-    left = status.get("seconds_left")
+    seconds_left = status.get("seconds_left")
     if status["state"] in END_STATES:
         return f" at step {step}{steps if status['state'] != 'done' else ''}"
     stage = f", {status['stage']}{count}" if status.get("stage") else ""
-    time_left = f", {left:.0f} s left" if isinstance(left, int | float) else ""
+    time_left = f", {seconds_left:.0f} s left" if isinstance(seconds_left, int | float) else ""
     return f" at step {step}{steps}{stage}{time_left}"
 
 
 def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
-    shown = {name: values[name] for name in names if isinstance(values.get(name), int | float)}
+    numbers = {name: values[name] for name in names if isinstance(values.get(name), int | float)}
     return ", ".join(
-        f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}" for name, value in shown.items()
+        f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}" for name, value in numbers.items()
     )
 
 

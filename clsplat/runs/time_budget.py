@@ -20,7 +20,7 @@ from clsplat.core.progress import Progress, log_level
 from clsplat.core.signals import stop_if_signaled
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
-from clsplat.pipeline.stretching import last_edit, map_trainings, min_steps, stretched, with_steps
+from clsplat.pipeline.stretching import last_edit, map_trainings, min_steps, stretch, with_steps
 from clsplat.runs.run_folder import Start
 from clsplat.runs.runner import check_run, run_stages, write_pipeline
 from clsplat.stages.optimize import ValidatedTraining
@@ -81,7 +81,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         raise _too_short(minutes, pipeline)
     reason = f"--minutes {minutes:g}: {planned:,} steps instead of {steps:,}, by a rehearsal"
     LOG.info("%s", reason)
-    plan = replace(pipeline, settings=_reporting(stretched(pipeline.settings, Fraction(planned, steps))), reason=reason)
+    plan = replace(pipeline, settings=_reporting(stretch(pipeline.settings, Fraction(planned, steps))), reason=reason)
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
         planned, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
@@ -154,7 +154,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
     until: deadline, s, on the clock.  Raises ConfigError as soon as it is clear that the minimum steps do not fit.
     """
     LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
-    short = stretched(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
+    short = stretch(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
     short_pipeline, started = replace(pipeline, settings=_reporting(short)), time.perf_counter()
     reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
 

@@ -90,7 +90,7 @@ def make_video(
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     loaded = _read(model)
-    used_scene = _scene(model, scene, loaded, downscale, needed=not request.is_file or extras.side == PHOTOGRAPH)
+    used_scene = _scene(model, scene, loaded, downscale, is_required=not request.is_file or extras.side == PHOTOGRAPH)
     origin = used_scene.origin if used_scene else loaded.origin
     loaded = loaded.in_scene(used_scene) if used_scene else loaded
     plan = plan_video(request, used_scene, points_of(loaded, used_scene), moves=is_moving(loaded), origin=origin)
@@ -120,14 +120,14 @@ def _read(model: Path) -> Loaded:
     return read(file if is_field(file) else model)
 
 
-def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
-    """Return the scene of a model at the image size of its run; None if it is unknown and not needed."""
-    if not needed and scene is None and not has_pipeline(model):
+def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, is_required: bool) -> Scene | None:
+    """Return the scene of a model at the image size of its run; None if it is unknown and not required."""
+    if not is_required and scene is None and not has_pipeline(model):
         return None
     try:
         source = ModelSource.of(model, scene)
     except DataError as error:
-        if needed or scene is not None:
+        if is_required or scene is not None:
             raise
         LOG.warning("%s; continuing without a scene, with the background of the model and the size of the path", error)
         return None
@@ -141,9 +141,9 @@ def _side(
     if name is None:
         return None
     if name != PHOTOGRAPH:
-        other = _read(Path(name))
-        other = other.in_scene(scene) if scene else other.with_origin(origin)
-        return Canvas(make_painter(other, device, other.rendering.background or background)).picture
+        model = _read(Path(name))
+        model = model.in_scene(scene) if scene else model.with_origin(origin)
+        return Canvas(make_painter(model, device, model.rendering.background or background)).picture
     assert scene is not None
     photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
     if not photo_views:

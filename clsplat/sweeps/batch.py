@@ -98,7 +98,7 @@ class Batch:
         """Called when a cell has started, with its name, or has ended, with None."""
 
     def require_held(self) -> None:
-        """Raise OutputError if the folder belongs to another process by now."""
+        """Raise OutputError if the folder now belongs to another process."""
 
     def run(self, execution: Execution, device: str | None) -> None:
         """Run every cell whose result is not in the store; `failures` collects the failed ones.

@@ -208,9 +208,9 @@ class Cluster:
         if self._slots:
             self._last_worker = now
         elif now - self._last_worker > NO_DEVICE_TIMEOUT_S:
-            others = f" ({len(workers)} of another version get no cells)" if workers else ""
+            hint = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker of this version for {NO_DEVICE_TIMEOUT_S:.0f} s{others}; start some with "
+                f"no worker of this version for {NO_DEVICE_TIMEOUT_S:.0f} s{hint}; start some with "
                 "`clsplat worker --scheduler ADDRESS`; the store keeps all progress"
             )
 

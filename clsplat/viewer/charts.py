@@ -201,9 +201,9 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
     centers = np.stack([view.position for view in all_views])
     reach = MAX_POINT_DISTANCE * float(np.abs(centers - centers.mean(axis=0)).max())
     sample = points[:: max(1, len(points) // MAX_PLAN_POINTS)].astype(np.float64)
-    near = sample[(np.abs(sample - centers.mean(axis=0)) < max(reach, 1e-9)).all(axis=1)]
+    nearby = sample[(np.abs(sample - centers.mean(axis=0)) < max(reach, 1e-9)).all(axis=1)]
     planes = {"cameras from above": np.cross(right, up), "cameras from the side": -up}
-    return [_plan(title, views, near, np.stack([right, down])) for title, down in planes.items()]
+    return [_plan(title, views, nearby, np.stack([right, down])) for title, down in planes.items()]
 
 
 def _plan(
@@ -237,7 +237,7 @@ def _plan(
 
 def _triangle(center: NDArray[np.float64], direction: NDArray[np.float64]) -> str:
     """Return the SVG path of a camera, foreshortened by its direction.  center, direction: [2]."""
-    ahead = LENGTH * direction
-    aside = SPREAD * LENGTH * np.array([-direction[1], direction[0]]) / (float(np.linalg.norm(direction)) or 1.0)
-    (x, y), (a, b), (c, d) = center, center + ahead + aside, center + ahead - aside
+    forward = LENGTH * direction
+    sideways = SPREAD * LENGTH * np.array([-direction[1], direction[0]]) / (float(np.linalg.norm(direction)) or 1.0)
+    (x, y), (a, b), (c, d) = center, center + forward + sideways, center + forward - sideways
     return f"M{x:.1f} {y:.1f}L{a:.1f} {b:.1f}L{c:.1f} {d:.1f}Z"

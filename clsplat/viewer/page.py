@@ -115,9 +115,9 @@ class Page:
         room = max(0.0, MAX_SIZE - (self.size - splats))
         low, high = 0, max(packed.count for packed in self.models.values())
         while low < high:  # a model with fewer splats keeps all of them
-            middle = (low + high + 1) // 2
-            size = sum(len(p.data) * 4 / 3e6 * min(1, middle / max(p.count, 1)) for p in self.models.values())
-            low, high = (middle, high) if size <= MARGIN * room else (low, middle - 1)
+            count = (low + high + 1) // 2
+            size = sum(len(p.data) * 4 / 3e6 * min(1, count / max(p.count, 1)) for p in self.models.values())
+            low, high = (count, high) if size <= MARGIN * room else (low, count - 1)
         return low
 
     def write(self, path: Path) -> None:

@@ -11,7 +11,7 @@ from clsplat.core.schedule import divide, schedule_values
 from clsplat.gaussians.model import MODEL
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.stretching import map_trainings, stretched
+from clsplat.pipeline.stretching import map_trainings, stretch
 from clsplat.pipeline.yaml_file import Document
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
@@ -109,7 +109,7 @@ def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFil
             return training
         return training.model_copy(update={"rates": training.rates.times(float(fraction) ** -0.5)})
 
-    return map_trainings(stretched(settings, fraction), Optimize, with_rates)
+    return map_trainings(stretch(settings, fraction), Optimize, with_rates)
 
 
 def _count_until_last_edit(pipeline: Pipeline) -> int:

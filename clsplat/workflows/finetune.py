@@ -27,7 +27,7 @@ from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.stretching import stretch
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
@@ -64,7 +64,7 @@ class Tuning:
         if self.steps is None:
             return pipeline
         first = next(stage for stage in data["stages"] if _has_name(stage, TRAINING))[TRAINING]["steps"]
-        return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
+        return replace(pipeline, settings=stretch(pipeline.settings, Fraction(self.steps, first)))
 
     def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
         """Run a pipeline in a folder as `train_in_folder` does; return the file that it writes."""
@@ -126,12 +126,12 @@ def require_steps(steps: int) -> None:
 
 def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
     """Return the stages with these names, in order, with start steps relative to the first of them."""
-    chosen, remaining, skipped = [], iter(stages), 0
+    selected, remaining, earlier_steps = [], iter(stages), 0
     for name in names:
         while not _has_name(stage := next(remaining), name):
-            skipped += stage[TRAINING]["steps"] if _has_name(stage, TRAINING) else 0
-        chosen.append(_shift_start(stage, skipped) if _has_name(stage, TRAINING) else stage)
-    return chosen
+            earlier_steps += stage[TRAINING]["steps"] if _has_name(stage, TRAINING) else 0
+        selected.append(_shift_start(stage, earlier_steps) if _has_name(stage, TRAINING) else stage)
+    return selected
 
 
 def _shift_start(training: Any, steps: int) -> Any:
@@ -203,16 +203,16 @@ def _is_leftover(name: str) -> bool:
 class Measurer:
     """Measures models at the test views of a scene, or at its training views if there are no test views."""
 
-    def __init__(self, opened: ModelFile) -> None:
-        self.opened = opened
-        self.split = "test" if opened.scene.split("test") else "train"
+    def __init__(self, model: ModelFile) -> None:
+        self.opened = model
+        self.split = "test" if model.scene.split("test") else "train"
         if self.split == "train":
             LOG.warning(
                 "%s: has no test views, so the training views are measured; scene.holdout sets views aside for testing",
-                opened.scene.path,
+                model.scene.path,
             )
-        self.rasterizer = Rasterizer(opened.device)
-        self.photographs = Photographs(opened.device, opened.background)
+        self.rasterizer = Rasterizer(model.device)
+        self.photographs = Photographs(model.device, model.background)
 
     def identity(self) -> str:
         """Return a hash of the photos, cameras, and points.  Raises DataError if a photo is damaged."""

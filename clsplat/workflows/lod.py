@@ -68,11 +68,11 @@ class DetailLevel:
 class LevelTrainer:
     """Fine-tunes levels on the photos of their scene, and measures them."""
 
-    def __init__(self, opened: ModelFile, folder: Path, plan: LodPlan) -> None:
-        self.folder, self.plan, self.source = folder, plan, opened.source
+    def __init__(self, model: ModelFile, folder: Path, plan: LodPlan) -> None:
+        self.folder, self.plan, self.source = folder, plan, model.source
         self.steps = STEPS if plan.steps is None else plan.steps
-        self.measurer = Measurer(opened)
-        self.tuning = Tuning("lod", opened.source, opened.gaussians, self.steps, opened.device)
+        self.measurer = Measurer(model)
+        self.tuning = Tuning("lod", model.source, model.gaussians, self.steps, model.device)
 
     def lock(self) -> AbstractContextManager[None]:
         """Return a context that locks the training folder, if anything is trained."""
@@ -115,8 +115,8 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
     plain = model.baked()
-    if bad := int(not_finite(plain.tables()).sum()):
-        raise DataError(f"{bad} Gaussians have values that are not finite; drop them with `clsplat convert`")
+    if invalid := int(not_finite(plain.tables()).sum()):
+        raise DataError(f"{invalid} Gaussians have values that are not finite; drop them with `clsplat convert`")
     target = min(len(plain), max(1, int(keep * len(plain) + 0.5)))
     if target == len(plain):
         return plain
@@ -214,7 +214,7 @@ def levels_of_detail(
     """
     plan = plan or LodPlan()
     require_free(folder)
-    opened, first = _opened(model, scene, plan, device)
+    opened, first = _open_model(model, scene, plan, device)
     if not len(first):
         raise DataError(f"{model}: the model has no Gaussians to merge")
     require_static(model, first.to_splat_file(), "SOG")
@@ -239,7 +239,7 @@ def levels_of_detail(
     }
 
 
-def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
+def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
     """Return the model with its photos, or None if it has none, and its Gaussians with the world filter baked in."""
     run = find_run(model) if scene is None else None
     if scene is None and run is None:

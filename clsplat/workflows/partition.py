@@ -40,8 +40,8 @@ class PartitionCell:
     def extended(self, fraction: float) -> Box:
         """Return the box extended on each side by half of `fraction` of the cell's size."""
         step = 0.5 * fraction * self.size
-        low = [None if b is None else _rounded(b - by) for b, by in zip(self.box.low, step, strict=True)]
-        high = [None if b is None else _rounded(b + by) for b, by in zip(self.box.high, step, strict=True)]
+        low = [None if b is None else _round(b - by) for b, by in zip(self.box.low, step, strict=True)]
+        high = [None if b is None else _round(b + by) for b, by in zip(self.box.high, step, strict=True)]
         return Box(low=low, high=high)
 
 
@@ -53,7 +53,7 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Part
     if not len(means):
         raise DataError("the model has no Gaussians to partition")
     weights = weights if weights.any() else np.ones(len(means))
-    return _cut(means.astype(np.float64), weights, Box(), count)
+    return _split_box(means.astype(np.float64), weights, Box(), count)
 
 
 def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) -> NDArray[np.int64]:
@@ -77,7 +77,7 @@ def quantile(values: Floats, weights: Floats, fraction: float) -> float:
     return float(values[order[min(int(np.searchsorted(total, fraction * total[-1])), len(order) - 1)]])
 
 
-def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
+def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
     """Split a box recursively, with the Gaussians inside it, into `count` cells."""
     bounds = np.array(
         [[quantile(means[:, axis], weights, fraction) for axis in range(3)] for fraction in SIZE_QUANTILES]
@@ -86,25 +86,25 @@ def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[Partition
     if count == 1:
         return [PartitionCell(box, size)]
     axis, count_below = int(size.argmax()), count // 2
-    cut = _rounded(quantile(means[:, axis], weights, count_below / count))
-    below = means[:, axis] < cut
+    position = _round(quantile(means[:, axis], weights, count_below / count))
+    below = means[:, axis] < position
     if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
         raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; give fewer --blocks")
     halves = ((below, "high", count_below), (~below, "low", count - count_below))
     return [
         cell
         for rows, side, cells_in_half in halves
-        for cell in _cut(means[rows], weights[rows], _with_bound(box, side, axis, cut), cells_in_half)
+        for cell in _split_box(means[rows], weights[rows], _with_bound(box, side, axis, position), cells_in_half)
     ]
 
 
-def _with_bound(box: Box, side: str, axis: int, cut: float) -> Box:
+def _with_bound(box: Box, side: str, axis: int, position: float) -> Box:
     bounds = list(getattr(box, side))
-    bounds[axis] = cut
+    bounds[axis] = position
     return box.model_copy(update={side: bounds})
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     """Round a value to the digits stored in files."""
     return float(f"{value:.{DIGITS}g}")
 

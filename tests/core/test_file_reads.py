@@ -33,7 +33,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/core/lock.py:check_free": "locks what it opens",
     "clsplat/core/lock.py:_open_lock_file": "opens for writing too",
     "clsplat/formats/sog.py:sog_files": "takes the bytes that `reading` has read",
-    "clsplat/formats/sog.py:_zipped": "writes",
+    "clsplat/formats/sog.py:_zip": "writes",
     "clsplat/viewer/video/encoding.py:open_video": "syncs what it has written",
     "clsplat/viewer/video/encoding.py:count_frames": "decodes what was written before",
     "clsplat/viewer/video/encoding.py:fix_track_ids": "changes what was written before",

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import at_step
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import apply_adaptation, load
-from clsplat.pipeline.stretching import in_steps
+from clsplat.pipeline.stretching import stretch_to_steps
 from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
@@ -69,7 +69,7 @@ def test_photos_recipe_adapts_to_image_count_and_sky(photographs, sky, most):
 
 def test_photos_recipe_shortens_schedules_with_steps():
     asked = load("photos")
-    short = replace(asked, settings=in_steps(asked.settings, 1700))
+    short = replace(asked, settings=stretch_to_steps(asked.settings, 1700))
     modules = {one.type: one for one in apply_adaptation(short, Measures(9, 2.0)).settings.optimize.modules}
     assert at_step(modules["dropout"].probability, 730) == 0.2
     assert (modules["camera_optimizer"].start, modules["exposure"].min_spread) == (250, 0.03)

@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import fire_steps, fires_at
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.stretching import Axis, in_steps, last_edit, min_steps, with_steps
+from clsplat.pipeline.stretching import Axis, last_edit, min_steps, stretch_to_steps, with_steps
 from clsplat.training.stage import Training
 from tests.support.pipelines import SCHEDULED
 
@@ -41,7 +41,7 @@ def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
     """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
     recipe, old = recipe_and_edits(name)
     fewest, steps = min_steps(recipe.training), recipe.training.steps
-    new = edits(in_steps(recipe, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
+    new = edits(stretch_to_steps(recipe, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
     assert [place for _, place in new] == [place for _, place in old]
     for before, after in zip(pairwise(old), pairwise(new), strict=True):
         assert (before[0][0] == before[1][0]) == (after[0][0] == after[1][0]), (before, after)
@@ -55,8 +55,8 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
     means each step in any number of them."""
     recipe, old = recipe_and_edits(name)
     fewest, steps = min_steps(recipe.training) + 1, recipe.training.steps
-    between = in_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
-    new = edits(in_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
+    between = stretch_to_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
+    new = edits(stretch_to_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
     assert [place for _, place in new] == [place for _, place in old]
 
 
@@ -69,7 +69,7 @@ def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     factor = Axis.from_factor(Fraction(steps, recipe.training.steps)).factor
     old, new = (
         {(step, place) for step, place in one if place != -1}  # at least one change of the size stays
-        for one in (old, edits(in_steps(recipe, steps).training, recipe.training))
+        for one in (old, edits(stretch_to_steps(recipe, steps).training, recipe.training))
     )
     assert new == {(math.floor(step * factor), place) for step, place in old if step * factor >= 1}
 
@@ -77,7 +77,7 @@ def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
 @pytest.mark.parametrize("steps", [1, 200])
 def test_averaging_starts_after_growth_even_in_few_steps(steps):
     """It began before in 200 steps: 40 cadences of 2.9 steps, each cut to 2, end sooner than 2 of 47."""
-    training = in_steps(load("fast").settings, steps).training
+    training = stretch_to_steps(load("fast").settings, steps).training
     last = [max([0, *(n for n in range(1, steps) if stage.due(n))]) for stage in training.during]
     (average,) = [stage for stage in training.during if stage.stage == "average"]
     assert all(

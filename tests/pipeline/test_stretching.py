@@ -11,7 +11,7 @@ from clsplat.core.settings import Settings
 from clsplat.photos.detail import DetailDivisor
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.stretching import in_steps, last_edit, stretched, with_steps
+from clsplat.pipeline.stretching import last_edit, stretch, stretch_to_steps, with_steps
 from tests.support.pipelines import KINDS, SCHEDULED, flat
 
 STEPS = ("steps", "start", "stop", "over", "until", "every")
@@ -20,7 +20,7 @@ STEPS = ("steps", "start", "stop", "over", "until", "every")
 def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
     pipeline = load(name)
     old, new = (
-        flat(one.resolved()) for one in (pipeline, replace(pipeline, settings=stretched(pipeline.settings, factor)))
+        flat(one.resolved()) for one in (pipeline, replace(pipeline, settings=stretch(pipeline.settings, factor)))
     )
     assert old.keys() == new.keys()
     return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
@@ -28,7 +28,7 @@ def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
 
 def test_stretched_long_recipe_equals_the_short_one():
     """Except for the cadence and the end of growth, which splat_7k sets."""
-    new = stretched(load("splat").settings, 7000 / 30000).training
+    new = stretch(load("splat").settings, 7000 / 30000).training
     assert (new.steps, new.rates.means.over) == (7000, 7000)
     raise_sh, densify, reset, white = new.during[:4]
     assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233.334, 23.3334, 116, 3500)
@@ -63,7 +63,7 @@ def test_only_steps_change_and_all_of_them(name):
 )
 def test_stages_that_end_act_equally_often(name, factor):
     settings = load(name).settings
-    old, new = settings.training, stretched(settings, factor).training
+    old, new = settings.training, stretch(settings, factor).training
     for before, after in zip(old.during, new.during, strict=True):
         if before.stop is None or before.every == 1:
             continue
@@ -75,20 +75,20 @@ def test_stages_that_end_act_equally_often(name, factor):
 
 
 def test_per_step_stages_end_at_the_same_fraction():
-    new = in_steps(load("mcmc_7k").settings, 2000).training
+    new = stretch_to_steps(load("mcmc_7k").settings, 2000).training
     (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
     assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
 
 
 @pytest.mark.parametrize(("name", "steps"), [("fast", 1), ("blocks", 2000), ("splat", 7001)])
 def test_recipe_has_the_requested_steps(name, steps):
-    assert in_steps(load(name).settings, steps).training.steps == steps
+    assert stretch_to_steps(load(name).settings, steps).training.steps == steps
 
 
 @pytest.mark.parametrize(("name", "factor"), list(zip(SCHEDULED, cycle((0.01, 0.13, 1.0, 3.7)), strict=False)))
 def test_every_stretched_recipe_is_valid(name, factor):
     settings = load(name).settings
-    new = stretched(settings, factor)
+    new = stretch(settings, factor)
     assert type(settings).model_validate(new.model_dump()) == new
     assert factor != 1 or new == settings
 
@@ -103,8 +103,8 @@ def checked_again(name: str, settings: PipelineFile, folder: Path) -> Pipeline:
 @pytest.mark.parametrize("steps", [340, 5000])
 def test_stretched_average_starts_at_the_same_fraction(tmp_path, steps):
     settings = load("fast").settings
-    new = checked_again("fast", in_steps(settings, steps), tmp_path).settings.training
-    assert new == in_steps(settings, steps).training
+    new = checked_again("fast", stretch_to_steps(settings, steps), tmp_path).settings.training
+    assert new == stretch_to_steps(settings, steps).training
     (average,) = [stage for stage in new.during if stage.stage == "average"]
     assert average.start == 2000 * steps // 3400
     assert sum(average.due(step) for step in range(1, steps)) == 27
@@ -144,22 +144,22 @@ def test_detail_schedule_is_not_cut_before_full_size():
 
 
 def test_rate_of_modules_scales_with_their_updates():
-    (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.modules
+    (haar,) = stretch_to_steps(load("auto_opti3dgs").settings, 7000).training.modules
     (short,) = load("auto_opti3dgs_7k").settings.training.modules
     assert haar.rate == pytest.approx(1e-4 * 30 / 7)
     assert short.rate == pytest.approx(haar.rate, rel=0.01)
-    (points,) = stretched([haar.model_copy(update={"rate": [[0, 1e-3], [100, 1e-4]]})], 0.5)
+    (points,) = stretch([haar.model_copy(update={"rate": [[0, 1e-3], [100, 1e-4]]})], 0.5)
     assert points.rate == [[0, 2e-3], [50, 2e-4]]
 
 
 def test_never_is_a_number_that_yaml_can_store():
     never = load("splat_7k", [f"densify.stop={2**63 - 1}"]).settings
-    assert stretched(never, 3.0).training.during[1].stop == 2**63 - 1
-    assert stretched(load("splat_7k", ["densify.every=9e18"]).settings, 3.0).training.during[1].every == 2**63 - 1
+    assert stretch(never, 3.0).training.during[1].stop == 2**63 - 1
+    assert stretch(load("splat_7k", ["densify.every=9e18"]).settings, 3.0).training.during[1].every == 2**63 - 1
 
 
 def test_coinciding_schedule_points_merge():
     class Holder(Settings):
         values: list[list[float]]
 
-    assert stretched(Holder(values=[[0, 1.0], [10, 2.0], [14, 3.0]]), 0.1).values == [[0, 1.0], [1, 3.0]]
+    assert stretch(Holder(values=[[0, 1.0], [10, 2.0], [14, 3.0]]), 0.1).values == [[0, 1.0], [1, 3.0]]

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.stretching import stretch
 from clsplat.runs.state import RunState
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
@@ -27,7 +27,7 @@ def short(name: str, scene: Path, *overrides: str, saved: int = 4) -> Pipeline:
     """A recipe in STEPS steps, with edits every 4, a checkpoint every `saved`, without pictures and pages."""
     opaque, sensitive = "init.opacity=0.3", SENSITIVE.get(name.removesuffix("_7k"), [])  # faint ones have no time
     pipeline = load(name, [f"scene.path='{scene}'", opaque, *sensitive, *overrides])
-    settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
+    settings = stretch(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
     stages = [with_frequent_edits(old, stage, saved) if isinstance(stage, Optimize) else stage for old, stage in pairs]
     kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]

@@ -18,7 +18,7 @@ from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ViewGradients, ViewLosses
 from clsplat.opencl.device import Array
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.stretching import stretch
 from clsplat.runs import opening
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
@@ -143,7 +143,7 @@ def test_invalid_fraction_is_refused(least):
 
 
 def test_stretched_recipe_skips_later_with_the_same_warm_up():
-    skip = stretched(load("splat_7k", ["optimize.modules.skip_backward.start=4000"]).settings, 2.0).training.modules[0]
+    skip = stretch(load("splat_7k", ["optimize.modules.skip_backward.start=4000"]).settings, 2.0).training.modules[0]
     assert skip == SkipBackward(start=8000, decay=0.95, warm_up=500, min_fraction="auto")
     assert load("splat_7k").settings.training.modules == []
 

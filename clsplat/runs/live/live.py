@@ -138,7 +138,7 @@ class Live:
             return
         started = time.perf_counter()
         run.device.finish()
-        # on a GPU, the wait for its queue counts as well, because training stands still
+        # on a GPU, the wait for its queue counts as well, because training waits too
         if run.device.info.kind == "CPU":
             started = time.perf_counter()
         self._deliver(request, preview)

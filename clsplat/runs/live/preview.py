@@ -30,7 +30,7 @@ from clsplat.viewer.page import LARGEST, THUMBNAIL
 # The queue of preview requests.
 
 MAX_WAITING = 4  # requests
-Pace = Literal["moving", "still", "again"]  # the camera moves; it just stopped; it stands still
+Pace = Literal["moving", "still", "again"]  # the camera moves, has just stopped, or does not move
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,10 @@ class Rig:
         """Return the rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
         if not views:
             raise DataError("a camera path needs the cameras of a scene, but there are none")
-        stray = outlier_cameras(views)
+        is_outlier = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         step = -(-len(finite) // MAX_POINTS) or 1
-        return cls([view for view, far in zip(views, stray, strict=True) if not far], finite[::step])
+        return cls([view for view, is_far in zip(views, is_outlier, strict=True) if not is_far], finite[::step])
 
     @cached_property
     def positions(self) -> Floats:
@@ -73,11 +73,11 @@ class Rig:
 
         Raises DataError if most cameras look away from it.
         """
-        middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
-        focus = nearest_to_axes(self.positions, self.forwards, middle)
+        center = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
+        focus = nearest_to_axes(self.positions, self.forwards, center)
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
-        ahead = float(np.median(self._depths_of(focus)))
-        if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < ahead < far * DEPTH_MARGIN:
+        depth = float(np.median(self._depths_of(focus)))
+        if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < depth < far * DEPTH_MARGIN:
             focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
         if (self._depths_of(focus) > 0).mean() < MIN_FACING:
             raise DataError(
@@ -92,8 +92,8 @@ class Rig:
     @cached_property
     def depths(self) -> tuple[float, float]:
         """Near and far, scene units: quantiles of the visible depths."""
-        sampled = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
-        depths = np.concatenate(sampled)
+        per_view = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
+        depths = np.concatenate(per_view)
         if not len(depths):
             return 1.0, 10.0
         near, far = np.quantile(depths, QUANTILES)
@@ -289,18 +289,18 @@ def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
     The half axes are the 90th percentiles of the offsets along the principal axes of the horizontal plane, as in
     Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
     """
-    across, offsets, height = _ring(rig)
+    axes, offsets, height = _ring(rig)
     half = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
     if min(half) <= 1e-6 * max(half):
         half = np.maximum(half, 0.05 * max(half, default=0.0))
     angles = _sweep(np.arctan2(offsets[:, 1] / half[1], offsets[:, 0] / half[0]), frames)
     flat = np.stack([half[0] * np.cos(angles), half[1] * np.sin(angles)], axis=1)
-    return _look_at(rig, rig.focus + flat @ across + height.mean() * rig.up, rig.focus, size)
+    return _look_at(rig, rig.focus + flat @ axes + height.mean() * rig.up, rig.focus, size)
 
 
 def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
     """Circle the focus once at the cameras' median distance and height, like a turntable."""
-    across, offsets, height = _ring(rig)
+    axes, offsets, height = _ring(rig)
     radius = float(np.median(np.linalg.norm(offsets, axis=1)))
     camera_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
     if (gap := _gap(camera_angles)[0]) > MAX_GAP:
@@ -310,7 +310,7 @@ def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
         )
     angles = camera_angles[0] + 2 * np.pi * np.arange(frames) / frames
     flat = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return _look_at(rig, rig.focus + flat @ across + np.median(height) * rig.up, rig.focus, size)
+    return _look_at(rig, rig.focus + flat @ axes + np.median(height) * rig.up, rig.focus, size)
 
 
 def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
@@ -318,19 +318,19 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
 
     Formulas of Local Light Field Fusion (Mildenhall et al. 2019).
     """
-    forward, middle = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
+    forward, center = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
     if np.linalg.norm(forward) < MIN_AGREEMENT:
         raise DataError("the cameras look in many directions, so a spiral has no front; use ellipse or through")
     forward = unit(forward)
     right = unit(np.cross(forward, rig.up))
     axes = np.stack([right, np.cross(forward, right), forward])
     near, far = rig.depths
-    target = middle + forward / ((1 - FOCUS_DEPTH) / near + FOCUS_DEPTH / far)
-    radii = np.percentile(np.abs((rig.positions - middle) @ axes.T), PERCENTILE, axis=0)
-    radii *= min(1.0, MAX_RADIUS * float(np.linalg.norm(target - middle)) / max(float(radii.max()), 1e-30))
+    target = center + forward / ((1 - FOCUS_DEPTH) / near + FOCUS_DEPTH / far)
+    radii = np.percentile(np.abs((rig.positions - center) @ axes.T), PERCENTILE, axis=0)
+    radii *= min(1.0, MAX_RADIUS * float(np.linalg.norm(target - center)) / max(float(radii.max()), 1e-30))
     turn = 2 * np.pi * TURNS * np.arange(frames) / frames
     steps = np.stack([np.cos(turn), np.sin(turn), np.sin(turn / 2)], axis=1) * radii
-    positions = middle + steps @ axes
+    positions = center + steps @ axes
     return looking_views(
         positions, np.broadcast_to(target, positions.shape), np.broadcast_to(rig.up, positions.shape), rig, size
     )
@@ -338,10 +338,10 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
 
 def through(rig: Rig, frames: int, size: Size) -> list[View]:
     """Fly along the views on a smooth curve, by name or from neighbor to neighbor, whichever is shorter."""
-    chosen = tour_order(rig)
+    order = tour_order(rig)
     distance = float(np.median(rig.depths))
-    places = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[chosen]
-    track = smooth(places, frames, distance)
+    keyframes = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[order]
+    track = smooth(keyframes, frames, distance)
     return looking_views(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
 
 
@@ -355,8 +355,8 @@ def views(rig: Rig, frames: int, size: Size) -> list[View]:
 
 def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
     """Stay at the most central camera, for moving scenes."""
-    middle = np.median(rig.positions, axis=0)
-    return stay(rig.views[int(np.linalg.norm(rig.positions - middle, axis=1).argmin())], frames, size)
+    center = np.median(rig.positions, axis=0)
+    return stay(rig.views[int(np.linalg.norm(rig.positions - center, axis=1).argmin())], frames, size)
 
 
 def stay(view: View, frames: int, size: Size) -> list[View]:
@@ -394,8 +394,8 @@ def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
     flat = offsets - height[:, None] * rig.up
     _, vectors = np.linalg.eigh(flat.T @ flat + 1e6 * float((flat**2).sum() + 1e-30) * np.outer(rig.up, rig.up))
     first = vectors[:, 1] * (1.0 if vectors[:, 1] @ offsets[0] >= 0 else -1.0)
-    across = np.stack([first, np.cross(rig.up, first)])
-    return across, flat @ across.T, height
+    axes = np.stack([first, np.cross(rig.up, first)])
+    return axes, flat @ axes.T, height
 
 
 def _sweep(angles: Floats, frames: int) -> Floats:
