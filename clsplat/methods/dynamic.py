@@ -103,7 +103,7 @@ class MotionL2(Penalty):
     """Mean over Gaussians of min(s, 1) |v|, in extents: the distance traveled during the duration s (ours).
 
     For velocities that the images hardly determine.  On the synthetic scene it cost 0.3 to 0.5 dB together with
-    `short_duration` (docs/moving.md), and no recipe uses it.
+    `short_duration` (docs/results/moving.md), and no recipe uses it.
     """
 
     type: Literal["motion_l2"] = "motion_l2"

@@ -56,7 +56,7 @@ class Order(Settings):
 
 
 class Uniform(Order):
-    """All views at all sizes, in a new random order in each epoch."""
+    """Draw all views at all sizes, in a new random order in each epoch."""
 
     type: Literal["uniform"] = "uniform"
 
@@ -65,8 +65,8 @@ class Uniform(Order):
 
 
 class ShuffleOrder(Order):
-    """Views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021, whose
-    protocol Mip-Splatting follows)."""
+    """Draw views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021,
+    whose protocol Mip-Splatting follows)."""
 
     type: Literal["shuffle"] = "shuffle"
 
@@ -75,7 +75,7 @@ class ShuffleOrder(Order):
 
 
 class StackOrder(Order):
-    """A random view of the finest size replaces 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
+    """Replace 30 % of the steps by a random view of the finest size: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
     released code of Mip-Splatting)."""
 
     type: Literal["stack"] = "stack"

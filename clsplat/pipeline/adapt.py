@@ -33,7 +33,7 @@ class Decision(Settings):
 
 
 class Adaptation(Settings):
-    """Decides settings based on the photos, before the first step of a run."""
+    """Decide settings based on the photos, before the first step of a run."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"decisions"})
 
@@ -64,8 +64,8 @@ DROPOUT_UNTIL, POSES_START = 1460, 500
 
 
 class Photos(Adaptation):
-    """Decides for folders of photos.  With fewer than 40: dropout, fewer Gaussians, perhaps a sky.  With a reprojection
-    error of a pixel or more: optimized poses."""
+    """Decide settings for folders of photos.  With fewer than 40: dropout, fewer Gaussians, perhaps a sky.  With a
+    reprojection error of a pixel or more: optimized poses."""
 
     type: Literal["photos"] = "photos"
 

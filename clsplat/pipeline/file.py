@@ -163,7 +163,7 @@ class PipelineFile(Settings):
     prepare: list[OneOf[Step]] = Field([])
     """Steps from photos to a scene; later runs reuse their results."""
     adapt: OneOf[Adaptation] | None = None
-    """Decides settings based on the photos, before the first step."""
+    """Decide settings based on the photos, before the first step."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})

@@ -199,7 +199,7 @@ class ModelSettings(Settings):
     """Smallest depth in scene units that is rendered; `auto`: 4% of the scene's extent, or half of the 1% quantile of
     the depths of observed points, if that is less.  A run writes the number."""
     near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
-    """Written by a run: the number that `auto` chose.  While `near` is that number, other photos choose again."""
+    """Written by a run: the number that `auto` chose.  While `near` equals it, other photos lead to a new choice."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()

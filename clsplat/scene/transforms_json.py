@@ -300,7 +300,7 @@ TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 class BlenderReader(Reader):
     """A Blender scene; the test views are those of transforms_test.json, and none without that file.
 
-    With a `time` in every frame of both files, the scene moves (D-NeRF): the first timestamp is 0, the last is 1.
+    With a `time` in every frame of both files, the scene is dynamic (D-NeRF): the first timestamp is 0, the last is 1.
     """
 
     name = "Blender"
@@ -336,7 +336,7 @@ class NerfstudioReader(Reader):
 
     The lists `train_filenames` and `test_filenames` are the split if the file has one of them; images on neither
     list are left out.  Otherwise, every `holdout`-th view is for testing.  With a `time` in every frame, the scene
-    moves.
+    is dynamic.
     """
 
     name = "nerfstudio"

@@ -41,8 +41,8 @@ class Export(Scheduled):
     quality: Quality = "balanced"
     """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""
     sky: Literal["sidecar", "splats"] = "sidecar"
-    """A learned sky (`model.background`): `sidecar`, a file next to the model, or `splats`, 10 000 Gaussians on a far
-    sphere, which every viewer shows."""
+    """A learned sky (`model.background`): `sidecar`, a file next to the model, or `splats`, 10,000 Gaussians on a
+    distant sphere, which every viewer shows."""
 
     @model_validator(mode="after")
     def _quality_of_its_format(self) -> "Export":
@@ -99,7 +99,7 @@ class Cameras(Stage):
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})
 
     formats: Annotated[list[Literal["colmap", "nerfstudio", "inria"]], Field(min_length=1)] = Field(["inria"])
-    """Formats to write: a COLMAP model as text, transforms.json, cameras.json."""
+    """Formats to write: a binary COLMAP model, transforms.json, cameras.json."""
     folder: Annotated[str, path_in_run()] = "cameras"
     """Path inside the run folder."""
 
