@@ -1,1 +1,1 @@
-"""Fields (Mip-NeRF and its grid): a network instead of Gaussians, behind the protocol that training knows."""
+"""Fields (Mip-NeRF, optionally with a hash grid): a network instead of Gaussians, with the same interface."""

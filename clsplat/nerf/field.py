@@ -35,13 +35,13 @@ class Rays:
     """Pixels of a camera, with their cones."""
 
     camera: DeviceCamera
-    pixels: Array  # [counted] row * width + column
+    pixels: Array  # [ray_count] row * width + column
     cones: Array  # [count, RAY_VALUES]
     count: int  # including padding to whole tiles
     draw: Draw | None
 
     @property
-    def counted(self) -> int:
+    def ray_count(self) -> int:
         return self.pixels.shape[0]
 
 
@@ -138,7 +138,7 @@ class Levels:
             stride=camera.stride,
             plane=camera.rows * camera.stride,
             samples=level.samples,
-            counted=rays.counted,
+            counted=rays.ray_count,
             rays=rays.count,
         )
         grad_grid = self.network.backward(parameters, grad_colors, grad_densities, gradient)
@@ -148,14 +148,14 @@ class Levels:
         """Write the colors of a level's rays to their pixels in an image, [3, rows, stride]."""
         camera = level.rays.camera
         self._composite.place_colors(
-            items=level.rays.counted,
+            items=level.rays.ray_count,
             colors=level.colors,
             pixels=level.rays.pixels,
             image=image,
             width=camera.width,
             stride=camera.stride,
             plane=camera.rows * camera.stride,
-            rays=level.rays.counted,
+            rays=level.rays.ray_count,
         )
 
     def _coarse_edges(self, rays: Rays) -> Array:
@@ -208,7 +208,7 @@ class Levels:
 
 
 def rays_per_pass(shape: FieldShape) -> int:
-    """Return how many rays one pass renders."""
+    """Return the number of rays that one pass renders."""
     return max(RAYS, PASS_SAMPLES // max(shape.coarse_samples, shape.fine_samples) // RAYS * RAYS)
 
 
@@ -252,11 +252,11 @@ class Field:
         for pixels, fine in self._passes(camera):
             self.levels.write_colors(fine, image)
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
-            covered, summed = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
-            alpha[pixels] = np.minimum(covered, 1)  # rounding may exceed 1
-            depths[pixels] = np.divide(summed, covered, out=np.zeros_like(covered), where=covered > 0)
-        shown = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
-        return Layers(shown, alpha.reshape(size), depths.reshape(size) if depth else None)
+            opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
+            alpha[pixels] = np.minimum(opacity, 1)  # rounding may exceed 1
+            depths[pixels] = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
+        rgb = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
+        return Layers(rgb, alpha.reshape(size), depths.reshape(size) if depth else None)
 
     def _empty(self, camera: DeviceCamera) -> Array:
         image = self.workspace.array("field picture", (3, camera.rows, camera.stride))

@@ -66,7 +66,7 @@ class FieldModel:
         return self.with_origin(scene.origin)
 
     def with_origin(self, origin: NDArray[np.floating]) -> "FieldModel":
-        """Return the field, which cannot be moved.  Raises DataError for an origin other than its own."""
+        """Return the field, which cannot be moved.  Raises DataError if its origin differs."""
         if np.array_equal(self.origin, origin):
             return self
         raise DataError(f"the field has the origin {self.origin}, the scene {origin}; give the scene it was trained on")
@@ -78,13 +78,13 @@ class FieldModel:
 
     def save(self, path: str | Path) -> str:
         """Write the file; return its SHA-256.  Raises OutputError when it cannot be written."""
-        path, shown = Path(path), self.rendering
+        path, rendering = Path(path), self.rendering
         notes = Notes(
             format=FORMAT,
             version=__version__,
             shape=self.shape,
-            background=shown.background or "black",
-            alpha=shown.alpha,
+            background=rendering.background or "black",
+            alpha=rendering.alpha,
         )
         origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
         with open_atomic(path) as file:

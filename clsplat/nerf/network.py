@@ -47,26 +47,26 @@ class Network:
             return self._table("position", tiles, self.shape.position_rows), 0
         return self._hidden(skip, tiles), width
 
-    def seen(self, tiles: int) -> tuple[Array, int]:
+    def direction(self, tiles: int) -> tuple[Array, int]:
         """Return the table with the encoded direction, as `position` does."""
         rows = self.shape.width + self.shape.direction_rows
-        return self._table("seen", tiles, rows), self.shape.width
+        return self._table("direction", tiles, rows), self.shape.width
 
     def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
         """Return raw colors and raw densities for the encodings in the tables, each [tiles, COLOR_ROWS, SAMPLES], valid
         until the next call."""
         x = _Table(*self.position(tiles))
         for i, layer in enumerate([self._first, *self._trunk]):
-            after = self._hidden(i, tiles)
-            self._apply(layer, parameters, x, after, RELU)
-            x = _Table(after)
+            outputs = self._hidden(i, tiles)
+            self._apply(layer, parameters, x, outputs, RELU)
+            x = _Table(outputs)
         densities = self._table("densities", tiles, COLOR_ROWS)
         colors = self._table("colors", tiles, COLOR_ROWS)
-        seen, behind = self.seen(tiles)[0], self._table("conditioned", tiles, self.shape.color_width)
+        direction, conditioned = self.direction(tiles)[0], self._table("conditioned", tiles, self.shape.color_width)
         self._apply(self._density, parameters, x, densities, NO_LIMIT)
-        self._apply(self._bottleneck, parameters, x, seen, NO_LIMIT)
-        self._apply(self._condition, parameters, _Table(seen), behind, RELU)
-        self._apply(self._color, parameters, _Table(behind), colors, NO_LIMIT)
+        self._apply(self._bottleneck, parameters, x, direction, NO_LIMIT)
+        self._apply(self._condition, parameters, _Table(direction), conditioned, RELU)
+        self._apply(self._color, parameters, _Table(conditioned), colors, NO_LIMIT)
         return colors, densities
 
     def backward(self, parameters: Array, grad_colors: Array, grad_densities: Array, gradient: Array) -> Array:
@@ -75,26 +75,26 @@ class Network:
         Returns the gradient of the grid's features, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
         tiles, width = grad_colors.shape[0], self.shape.width
-        last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
-        behind = _Table(self._table("conditioned", tiles, self.shape.color_width))
-        grad_behind = self._table("by conditioned", tiles, self.shape.color_width)
-        grad_seen, grad_x = self._table("by seen", tiles, width), self._table("by hidden", tiles, width)
-        self._sum(self._color, behind, grad_colors)
-        self._derive(self._color, parameters, grad_colors, behind, grad_behind, RELU)
-        self._sum(self._condition, seen, grad_behind)
-        self._derive(self._condition, parameters, grad_behind, seen, grad_seen, NO_LIMIT)
+        last, direction = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.direction(tiles)[0])
+        conditioned = _Table(self._table("conditioned", tiles, self.shape.color_width))
+        grad_conditioned = self._table("by conditioned", tiles, self.shape.color_width)
+        grad_direction, grad_x = self._table("by direction", tiles, width), self._table("by hidden", tiles, width)
+        self._sum(self._color, conditioned, grad_colors)
+        self._derive(self._color, parameters, grad_colors, conditioned, grad_conditioned, RELU)
+        self._sum(self._condition, direction, grad_conditioned)
+        self._derive(self._condition, parameters, grad_conditioned, direction, grad_direction, NO_LIMIT)
         self._sum(self._density, last, grad_densities)
-        self._sum(self._bottleneck, last, grad_seen)
+        self._sum(self._bottleneck, last, grad_direction)
         self._derive(self._density, parameters, grad_densities, last, grad_x, NO_LIMIT)
-        self._derive(self._bottleneck, parameters, grad_seen, last, grad_x, RELU, kept=1)
+        self._derive(self._bottleneck, parameters, grad_direction, last, grad_x, RELU, kept=1)
         for i in range(len(self._trunk), 0, -1):
-            before, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
-            self._sum(layer, before, grad_x)
+            inputs, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
+            self._sum(layer, inputs, grad_x)
             if i - 1 == self.shape.skip:
                 self._derive_grid(layer, parameters, grad_x, self.shape.width, kept=0)
-            grad_before = self._table(f"by hidden {i % 2}", tiles, width)
-            self._derive(layer, parameters, grad_x, before, grad_before, RELU)
-            grad_x = grad_before
+            grad_inputs = self._table(f"by hidden {i % 2}", tiles, width)
+            self._derive(layer, parameters, grad_x, inputs, grad_inputs, RELU)
+            grad_x = grad_inputs
         self._sum(self._first, _Table(*self.position(tiles)), grad_x)
         grad_grid = self._derive_grid(self._first, parameters, grad_x, 0, kept=int(self.shape.skip is not None))
         count = self.shape.network_parameters
@@ -116,8 +116,8 @@ class Network:
 
     def _hidden(self, i: int, tiles: int) -> Array:
         """Return the outputs of layer i of the trunk, with room for the encoded position if it is appended there."""
-        more = self.shape.position_rows if i == self.shape.skip else 0
-        return self._table(f"hidden {i}", tiles, self.shape.width + more)
+        extra = self.shape.position_rows if i == self.shape.skip else 0
+        return self._table(f"hidden {i}", tiles, self.shape.width + extra)
 
     def _table(self, name: str, tiles: int, rows: int) -> Array:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
@@ -216,12 +216,12 @@ class Samples:
     edges: Array  # [rays, samples + 1]
 
     @property
-    def of_ray(self) -> int:
+    def per_ray(self) -> int:
         return self.edges.shape[1] - 1
 
     @property
     def count(self) -> int:
-        return self.edges.shape[0] * self.of_ray
+        return self.edges.shape[0] * self.per_ray
 
     @property
     def tiles(self) -> int:
@@ -237,18 +237,18 @@ class Encoding:
         self._program, self._grid = device.program("encode.cl"), device.program("grid.cl")
         self._lanes = int(device.tuning["LANES"])
         self._levels = device.upload(shape.grid.table) if shape.grid else None
-        self.parts = parts_of_levels(device, shape.grid.levels) if shape.grid else 0
+        self.parts = parts_per_level(device, shape.grid.levels) if shape.grid else 0
 
     def forward(self, parameters: Array, samples: Samples) -> None:
         """Write the encoded positions and directions."""
         if self.shape.grid:
-            self._place(samples)
+            self._locate(samples)
             self.read_grid(parameters, samples.tiles)
         shape, (features, first) = self.shape, self.network.position(samples.tiles)
         shared: dict[str, Any] = {
             "items": samples.count // self._lanes,
             "cones": samples.cones,
-            "samples": samples.of_ray,
+            "samples": samples.per_ray,
             "count": samples.count,
         }
         if shape.degrees:
@@ -261,7 +261,7 @@ class Encoding:
                 written=in_blocks(6 * shape.degrees),
                 **shared,
             )
-        features, first = self.network.seen(samples.tiles)
+        features, first = self.network.direction(samples.tiles)
         self._program.encode_directions(
             features=features,
             rows=features.shape[1],
@@ -282,7 +282,7 @@ class Encoding:
         count = self.shape.grid.levels * self.parts
         self._grid.grid_backward(
             groups=-(-count // int(self.workspace.device.tuning["TEAM"])),
-            places=self.places(tiles),
+            places=self.grid_positions(tiles),
             levels=self._levels,
             grad_features=grad_position,
             gradient=gradient,
@@ -293,7 +293,7 @@ class Encoding:
             count=count,
         )
 
-    def places(self, tiles: int) -> Array:
+    def grid_positions(self, tiles: int) -> Array:
         """Return the positions of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES]; `forward` sets them."""
         return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
 
@@ -304,7 +304,7 @@ class Encoding:
         count = grid.levels * tiles * SAMPLES // self._lanes
         self._grid.grid_forward(
             items=count,
-            places=self.places(tiles),
+            places=self.grid_positions(tiles),
             levels=self._levels,
             parameters=parameters,
             features=features,
@@ -315,7 +315,7 @@ class Encoding:
             count=count,
         )
 
-    def _place(self, samples: Samples) -> None:
+    def _locate(self, samples: Samples) -> None:
         """Write the positions of samples in the grid's cube."""
         grid = self.shape.grid
         assert grid is not None
@@ -324,18 +324,18 @@ class Encoding:
             items=samples.count // self._lanes,
             cones=samples.cones,
             edges=samples.edges,
-            places=self.places(samples.tiles),
+            places=self.grid_positions(samples.tiles),
             corner_x=x,
             corner_y=y,
             corner_z=z,
             side=grid.side,
-            samples=samples.of_ray,
+            samples=samples.per_ray,
             count=samples.count,
         )
 
 
-def parts_of_levels(device: Device, levels: int) -> int:
-    """Return in how many parts the entries of each level are summed; the sums do not depend on it.
+def parts_per_level(device: Device, levels: int) -> int:
+    """Return the number of parts in which the entries of each level are summed; the sums do not depend on it.
 
     Each part reads all samples, so that a CPU uses only enough parts to keep its cores busy.
     """

@@ -71,21 +71,21 @@ class LearnedField(TrainedField):
     def from_tables(
         cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array
     ) -> Self:
-        """Return the field of a checkpoint, from what `tables` returned."""
-        checked = _shape_of(shape)
+        """Return the field of a checkpoint from the result of `tables`."""
+        checked = _parse_shape(shape)
         field = cls(Field(checked, background.device.zeros(checked.parameters), background))
         for name, array in field._arrays.items():
             array.set(tables[name][:, 0])
         return field
 
     @classmethod
-    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
+    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, extra: Tables) -> None:
         """Raise DataError for tables that do not fit a shape."""
-        if others:
-            raise DataError(f"it contains {next(iter(others))} in addition to a field")
+        if extra:
+            raise DataError(f"it contains {next(iter(extra))} in addition to a field")
         if tables.keys() != set(TABLES):
             raise DataError(f"its field does not have the tables {', '.join(TABLES)}")
-        parameters = _shape_of(shape).parameters
+        parameters = _parse_shape(shape).parameters
         for name, table in tables.items():
             if table.dtype != np.float32 or table.shape != (parameters, 1):
                 raise DataError(f"{name} of its field is not [{parameters}, 1] float32")
@@ -120,25 +120,25 @@ class LearnedField(TrainedField):
             )
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
-    def step(self, shown: Sequence[RayPhotograph], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
-        """Do one update (Barron et al. 2021, section 3.3).
+    def step(self, photos: Sequence[RayPhotograph], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
+        """Train for one step on rays of photographs (Barron et al. 2021, section 3.3).
 
         The loss is the loss of the fine level plus `coarse_weight` times the loss of the coarse level.  Each is the
         mean squared difference of the rays, weighted by the areas of their pixels.
         """
-        total = CHANNELS * sum(photo.rays * photo.weight for photo in shown)
+        total = CHANNELS * sum(photo.rays * photo.weight for photo in photos)
         self.rate = adam.rate
         self._gradient.fill(0)
-        errors = self._errors(sum(photo.rays for photo in shown))
-        self._scales, first = [(photo.rays, photo.weight / total) for photo in shown], 0
-        for photo in shown:
+        errors = self._errors(sum(photo.rays for photo in photos))
+        self._scales, first = [(photo.rays, photo.weight / total) for photo in photos], 0
+        for photo in photos:
             self._differentiate(photo, photo.weight / total, coarse_weight, Draw(seed, step, first), errors)
             first += photo.rays
         self.updates += 1
         self.update(self._gradient, adam, self.updates)
 
     def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
-        """Update the parameters by Adam with a gradient, [P].  number: of the update, counted from 1."""
+        """Update the parameters with Adam and a gradient, [P].  number: of the update, counted from 1."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,
@@ -170,25 +170,25 @@ class LearnedField(TrainedField):
         return [self.field.workspace.array(f"field {name} errors", rays) for name in ("coarse", "fine")]
 
     def _differentiate(
-        self, shown: RayPhotograph, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]
+        self, photo: RayPhotograph, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]
     ) -> None:
         """Add the gradient for the rays of one photograph, in passes."""
         levels, count = self.field.levels, rays_per_pass(self.field.shape)
-        colors = shown.photograph.planes(self.field.workspace).colors
+        colors = photo.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
-        for first in range(0, shown.rays, count):
+        for first in range(0, photo.rays, count):
             key = Draw(draw.seed, draw.step, draw.first + first)
-            rays = levels.sample_rays(shown.camera, key, min(count, shown.rays - first))
+            rays = levels.sample_rays(photo.camera, key, min(count, photo.rays - first))
             rendered = levels.render(self.field.parameters, rays)
-            for level, of_level, squares in zip(rendered, scales, errors, strict=True):
-                target = RayTarget(colors, of_level, squares)
+            for level, level_scale, squares in zip(rendered, scales, errors, strict=True):
+                target = RayTarget(colors, level_scale, squares)
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
-def _shape_of(written: Mapping[str, Any]) -> FieldShape:
+def _parse_shape(data: Mapping[str, Any]) -> FieldShape:
     """Return the shape of a field in a checkpoint.  Raises DataError if it is invalid."""
     try:
-        return _WRITTEN.validate_json(json.dumps(written))
+        return _WRITTEN.validate_json(json.dumps(data))
     except ValidationError as error:
         raise DataError(f"the shape of its field: {error.errors()[0]['msg']}") from None
 
@@ -241,20 +241,20 @@ def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
     return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.network_parameters, photographs)
 
 
-# Check that photographs show the cube of a field's grid: elsewhere nothing is trained.
+# Check that photographs show the cube of a field's grid, since nothing is trained outside it.
 
 Floats = NDArray[np.float64]
 UNIT = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
 
 
-def require_seen(shape: FieldShape, scene: Scene) -> None:
-    """Raise ConfigError if no training view sees the grid's cube between near and far, or if the scene has points and
-    none is in the cube."""
+def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
+    """Raise ConfigError if no training view sees the grid's cube between near and far, or if all points of the scene
+    are outside the cube."""
     cube, views, points = shape.grid, scene.split("train"), scene.points
     if cube is None or not views:
         return
     corner, side = np.array(cube.corner), cube.side
-    if not any(_meet(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
+    if not any(_intersect(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
         fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
     elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64)).any():
         fault = f"none of the scene's {len(points):,} points is in it"
@@ -275,21 +275,21 @@ def _inside(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
 def _corners(view: View, near: float, far: float) -> Floats:
     """Return the corners of a view's frustum between two depths, [8, 3], ordered as UNIT: columns, rows, depth."""
     camera = view.camera
-    across = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    positions = np.column_stack([across, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
+    directions = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    positions = np.column_stack([directions, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
     rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
     return np.asarray((positions - translation) @ rotation)
 
 
-def _meet(cube: Floats, frustum: Floats) -> bool:
+def _intersect(cube: Floats, frustum: Floats) -> bool:
     """Return whether two bodies, given by corners ordered as UNIT, intersect: no axis separates them (Gottschalk, Lin
     and Manocha 1996)."""
     axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
     faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])
     candidates = np.vstack([axes, faces, np.cross(axes[:, None], edges[None]).reshape(-1, 3)])
-    of_cube, of_frustum = cube @ candidates.T, frustum @ candidates.T
-    apart = (of_cube.max(axis=0) < of_frustum.min(axis=0)) | (of_frustum.max(axis=0) < of_cube.min(axis=0))
-    return not bool(apart.any())
+    cube_x, frustum_x = cube @ candidates.T, frustum @ candidates.T
+    is_separating = (cube_x.max(axis=0) < frustum_x.min(axis=0)) | (frustum_x.max(axis=0) < cube_x.min(axis=0))
+    return not bool(is_separating.any())
 
 
 def _point_text(point: NDArray[np.floating]) -> str:

@@ -13,7 +13,7 @@ from clsplat.core.settings import OneOf
 from clsplat.gaussians.model import Rendering
 from clsplat.nerf.files import ENDING, FILE, FieldModel, load_field
 from clsplat.nerf.shape import FieldShape
-from clsplat.nerf.training import AdamStep, LearnedField, RayPhotograph, field_plan, require_seen
+from clsplat.nerf.training import AdamStep, LearnedField, RayPhotograph, field_plan, require_visible_grid
 from clsplat.photos.sampling import Order, Uniform, ViewPool
 from clsplat.stages.optimize import report
 from clsplat.training import checkpoint
@@ -77,7 +77,7 @@ class TrainField(Training):
         the stages in `during`.
         """
         super().check_run(run)
-        require_seen(self.field, run.scene)
+        require_visible_grid(self.field, run.scene)
         views = run.scene.split("train")
         image_bytes = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         field_plan(self.field, image_bytes).check(run.device.info)

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.nerf.shape import FieldShape, GridShape
-from clsplat.nerf.training import require_seen
+from clsplat.nerf.training import require_visible_grid
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
@@ -23,7 +23,7 @@ def scene_of(tmp_path, *views: View, points: PointCloud | None = None) -> Scene:
 def is_seen(scene: Scene, corner, side: float) -> bool:
     shape = FieldShape(near=NEAR, far=FAR, grid=GridShape(corner=[float(v) for v in corner], side=side))
     try:
-        require_seen(shape, scene)
+        require_visible_grid(shape, scene)
     except ConfigError:
         return False
     return True
@@ -67,9 +67,9 @@ def test_message_reports_the_scene_position(tmp_path):
     with pytest.raises(
         ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3 .* the cameras look at \(1, 2, 3\)"
     ):
-        require_seen(shape, scene)
-    require_seen(shape.model_copy(update={"grid": None}), scene)
-    require_seen(replace_grid(shape, corner=[-3.0, -3.0, -3.0], side=6.0), replace(scene, points=None))
+        require_visible_grid(shape, scene)
+    require_visible_grid(shape.model_copy(update={"grid": None}), scene)
+    require_visible_grid(replace_grid(shape, corner=[-3.0, -3.0, -3.0], side=6.0), replace(scene, points=None))
 
 
 def replace_grid(shape: FieldShape, **values) -> FieldShape:

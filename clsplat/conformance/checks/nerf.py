@@ -160,7 +160,7 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
         level = next(case.levels.render(case.on_device, case.rays))
         position, direction = case.encode(level.edges.get())
         (table, first), (seen, row) = (
-            rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.seen)
+            rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.direction)
         )
         actual = read_rows(table, first, case.shape.position_rows)
         yield by_element("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
@@ -197,7 +197,7 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
         means, variances = case.places(level.edges.get())
-        actual = read_rows(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
+        actual = read_rows(case.levels.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield by_element("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
         yield by_element("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
@@ -221,7 +221,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
     shape, encoding, tiles = case.shape, case.levels.encoding, len(positions)
     assert shape.grid is not None
     label = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
-    encoding.places(tiles).set(positions)
+    encoding.grid_positions(tiles).set(positions)
     encoding.read_grid(case.on_device, tiles)
     table, first = case.levels.network.position(tiles)
     features = read_rows(table, first, shape.grid_rows)
@@ -327,7 +327,7 @@ class _Comparison:
             colors.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
         )
         differences = composite.colors()
-        differences[: case.rays.counted] -= case.target_colors()
+        differences[: case.rays.ray_count] -= case.target_colors()
         return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
     def deviations(self, label: str) -> Results:
