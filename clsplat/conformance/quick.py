@@ -29,7 +29,7 @@ SORTS = ("radix", "bitonic")  # each has a record
 def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
     """Open a device as `open_device` does, log its name, and ensure that it computes correctly.
 
-    All code that renders or trains opens its device here.
+    Call this to open the device before rendering or training.
     """
     opened = open_device(device, schedule)
     LOG.info("device: %s", opened.text)

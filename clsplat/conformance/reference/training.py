@@ -24,7 +24,7 @@ def adam_step(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the new parameter and moments (Kingma and Ba 2015), with epsilon outside the root, as in PyTorch.
 
-    step: counted from 1.  Rows that are not `seen`, [N], stay as they are.
+    step: counted from 1.  Rows that are not `seen`, [N], are unchanged.
     """
     first = beta1 * moment1 + (1 - beta1) * grad
     second = beta2 * moment2 + (1 - beta2) * grad**2
