@@ -120,7 +120,7 @@ class Densify(Scheduled):
         if self.patience is None or best is None or run.is_refit:  # a refit has the step in its pipeline
             return False
         if best.growth_ended is None and best.since_best >= self.patience:
-            best = run.best = best.model_copy(update={"growth_ended": run.step, "since": 0})
+            best = run.best = best.model_copy(update={"growth_ended": run.step, "since_best": 0})
             LOG.info("step %d: growth ends, since the model was best at step %d", run.step, best.measured.step)
         return best.growth_ended is not None
 

@@ -371,6 +371,14 @@ NOW = Scores(step=8, train=30.0, validation=20.0)
 FOUND = Best(measured=NOW, degree=0, metrics={}, evaluations=1, since_best=0, first_overfit=None, last=NOW)
 
 
+def test_end_of_growth_restarts_the_patience(pipeline):
+    during = load(pipeline, ["densify.patience=2"]).settings.training.during
+    density = next(stage for stage in during if stage.stage == "densify")
+    run = SimpleNamespace(step=12, is_refit=False, best=FOUND.model_copy(update={"since_best": 2}))
+    assert density._has_growth_ended(run)
+    assert (run.best.growth_ended, run.best.since_best) == (12, 0)
+
+
 def test_checkpoint_without_its_best_model_is_damaged(best_run):
     state, tables = checkpoint.load(best_run / "checkpoints" / "step_000014.npz")
     own, _ = split(tables, best_model.FOLDER)
