@@ -41,11 +41,11 @@ class Axis:
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
-    def at(self, step: int) -> int:
+    def scale(self, step: int) -> int:
         """Return a stretched step."""
         return min(math.floor(step * self.factor), MAX_STEP)
 
-    def every(self, every: float) -> float:
+    def scale_interval(self, every: float) -> float:
         """Return a stretched interval; 1 stays 1, and no interval becomes shorter."""
         interval = Fraction(str(every)) * self.factor
         if every == 1 or interval <= 1:
@@ -53,26 +53,26 @@ class Axis:
         bounded = min(interval, Fraction(MAX_STEP))
         return int(bounded) if bounded.denominator == 1 else float(bounded)
 
-    def start(self, start: int, every: float) -> int:
+    def scale_start(self, start: int, every: float) -> int:
         """Return a stretched `start`: between the last action that it excludes and the first that it allows."""
         number = count_fired(every, start)
         return max(
-            0, min(max(self.at(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
+            0, min(max(self.scale(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
         )
 
-    def stop(self, stop: int, every: float) -> int:
+    def scale_stop(self, stop: int, every: float) -> int:
         """Return a stretched `stop`: after the last action that it allows."""
         number = count_fired(every, stop - 1)
         return min(
-            max(self._action_step(every, number) + 1, min(self.at(stop), self._action_step(every, number + 1))),
+            max(self._action_step(every, number) + 1, min(self.scale(stop), self._action_step(every, number + 1))),
             MAX_STEP,
         )
 
-    def until(self, until: int, every: float) -> int:
+    def scale_until(self, until: int, every: float) -> int:
         """Return a stretched `until`: after the actions before it, and not after the next one."""
         number = count_fired(every, until - 1)
         return max(
-            1, min(max(self._action_step(every, number) + 1, self.at(until)), self._action_step(every, number + 1))
+            1, min(max(self._action_step(every, number) + 1, self.scale(until)), self._action_step(every, number + 1))
         )
 
     def _action_step(self, every: float, number: int) -> int:
@@ -171,13 +171,13 @@ def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
     if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":
-        return axis.every(steps)
+        return axis.scale_interval(steps)
     if name == "steps":
         return max(1, math.floor(steps * axis.exact))
-    limits = {"start": axis.start, "stop": axis.stop, "until": axis.until}
+    limits = {"start": axis.scale_start, "stop": axis.scale_stop, "until": axis.scale_until}
     if name in limits and every not in (None, 1):
         return limits[name](int(steps), every)
-    return max(1, axis.at(int(steps)))
+    return max(1, axis.scale(int(steps)))
 
 
 def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
