@@ -63,7 +63,7 @@ class ViewTable:
         return np.array([scalars.get(key, 0.0) for key in self.keys(view)])
 
     def is_in(self, scalars: Mapping[str, float]) -> bool:
-        """Return whether the dictionary holds the table."""
+        """Return whether the dictionary contains the table."""
         return self.keys(self.views[0])[0] in scalars
 
     def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:

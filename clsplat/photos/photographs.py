@@ -42,7 +42,7 @@ class Photograph:
         return np.asarray(self.colors.get().transpose(1, 2, 0))
 
     def counted(self) -> Mask | None:
-        """Return which pixels count, [height, width]; None if all do."""
+        """Return the mask of unmasked pixels, [height, width]; None if there is no mask."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
     def planes(

@@ -86,7 +86,7 @@ def _good_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> list[_Pair
 
 
 def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
-    """Return whether two photographs show no motion, as copies, which say nothing about the camera."""
+    """Return whether two photographs show no motion; such copies say nothing about the camera."""
     return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel)
 
 

@@ -389,7 +389,7 @@ def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequenc
 
 
 def find_models(path: Path) -> list[Path]:
-    """Return the folders at or below `path` that hold a COLMAP model, by name."""
+    """Return `path` and folders below it that contain a COLMAP model, sorted by name."""
     sparse = path / "sparse"
     folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
     return [folder for folder in folders if find_file(folder, "cameras") and find_file(folder, "images")]

@@ -132,7 +132,7 @@ class FrameFiles(FileLookup):
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
     def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
-        """Return the views of the frames; `missing` says what to do about missing images.
+        """Return the views of the frames.  missing: what to do about missing images.
 
         Raises DataError for damaged numbers and missing files.
         """

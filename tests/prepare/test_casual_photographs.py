@@ -397,7 +397,7 @@ def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
 
 
 def test_unrelated_photographs_are_not_searched_again(tmp_path, dense, monkeypatch, caplog):
-    monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
+    monkeypatch.setattr(reasons_tool, "MIN_TEXTURED", 100)
     caplog.set_level("INFO")
     matches, cameras = prepared(tmp_path, [unrelated_photograph(number) for number in range(6)])
     with pytest.raises(DataError, match="no two of them show the same features"):
@@ -418,10 +418,10 @@ def test_unrelated_photographs_are_not_searched_again(tmp_path, dense, monkeypat
 def test_unrelated_photographs_are_detected(tmp_path, features, pairs, expected):
     """Ten photographs; however few matches a pair has."""
     found = MatchGraph(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
-    assert found.have_nothing_in_common() == expected
+    assert found.has_unrelated_photographs() == expected
 
 
 @pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
 def test_photographs_are_related_if_two_of_few_match(tmp_path, names, pairs):
     found = MatchGraph(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
-    assert not found.have_nothing_in_common()
+    assert not found.has_unrelated_photographs()
