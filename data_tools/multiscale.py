@@ -1,7 +1,7 @@
 """The multi-scale Blender dataset of mip-NeRF (Barron et al. 2021), made from a single-scale one.
 
-Level j of an image is the mean over boxes of 2^j x 2^j pixels of its RGBA values as they are stored, not premultiplied,
-truncated to 8 bits; its focal length is that of the full image by 2^j.
+Level j of an image is the mean over boxes of 2^j x 2^j pixels of the stored RGBA values, not premultiplied,
+truncated to 8 bits; its focal length is that of the full image divided by 2^j.
 """
 
 import json
@@ -23,7 +23,7 @@ MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scen
 def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
     """Write images_train, images_test, … and metadata.json into `out`; return the number of images.
 
-    Raises DataError when `source` is not a Blender folder or its images cannot be halved so often.
+    Raises DataError if `source` is not a Blender folder or its images cannot be halved `levels - 1` times.
     """
     splits = {path.stem.removeprefix("transforms_"): path for path in sorted(source.glob("transforms_*.json"))}
     if "train" not in splits:
@@ -49,7 +49,7 @@ def pyramid(pixels: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
 
 
 def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> dict[str, Any]:
-    """Write one split's images and return its columns, one value for each image."""
+    """Write one split's images and return its columns, one value per image."""
     folder, rows = transforms.path.parent, []
     views = filter(None, FrameFiles(folder, folder, transforms.frames).views(transforms.path, "refuse"))
     for i, (frame, view) in enumerate(zip(transforms.frames, views, strict=True)):

@@ -1,7 +1,7 @@
-"""Shapes that a ray caster meets, in closed form: balls, boxes, cylinders.
+"""Ray intersections with spheres, boxes and cylinders, in closed form.
 
-Arrays hold planes: points and directions are [3, R] (or [3, 1], which broadcasts), one column per ray; lengths are
-scene units.  Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.
+Arrays hold one row per axis: points and directions are [3, R] (or [3, 1], which broadcasts), one column per ray;
+lengths are scene units.  Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.
 """
 
 from collections.abc import Callable
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
-Paint = Callable[[Array], Array]  # points in the shape's own axes [3, R] -> albedo [3, R]
+Paint = Callable[[Array], Array]  # points in the shape's axes [3, R] -> albedo [3, R]
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Sum of products over the first axis, [R]."""
+    """Return the sum of products over the first axis, [R]."""
     total: Array = a[0] * b[0]
     for i in range(1, len(a)):
         total = total + a[i] * b[i]
@@ -36,7 +36,7 @@ def unit(v: Array) -> Array:
 
 
 def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
-    """Turn (x, y, z) so that z is along the unit columns `axis` (Duff et al. 2017)."""
+    """Rotate (x, y, z) so that z points along the unit columns `axis` (Duff et al. 2017)."""
     sign = np.copysign(1.0, axis[2])
     a = -1 / (sign + axis[2])
     b = axis[0] * axis[1] * a
@@ -46,21 +46,21 @@ def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
 
 
 def disc(count: int) -> Array:
-    """Points spread evenly over the unit disc (Vogel's spiral), [2, count]."""
+    """Return points spread evenly over the unit disc (Vogel's spiral), [2, count]."""
     radius, angle = np.sqrt((np.arange(count) + 0.5) / count), np.arange(count) * GOLDEN_ANGLE
     return np.array([radius * np.cos(angle), radius * np.sin(angle)])
 
 
 def spiral(count: int, low: float, high: float, phase: float = 0.0) -> Array:
-    """Unit vectors spread evenly between two elevations (degrees) on a Fibonacci spiral, [count, 3]."""
+    """Return unit vectors spread evenly between two elevations (degrees) on a Fibonacci spiral, [count, 3]."""
     bottom, top = np.sin(np.radians((low, high)))
     z = bottom + (top - bottom) * (np.arange(count) + 0.5) / count
     angle = np.arange(count) * GOLDEN_ANGLE + phase
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
 
 
-def round_interval(origins: Array, directions: Array, radius: float) -> tuple[Array, Array]:
-    """Where rays are within `radius` of the origin: a ball (3 axes) or an endless cylinder (2).  Miss: enter = inf."""
+def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+    """Return where rays are inside a sphere (3 axes) or an infinite cylinder (2) at the origin.  Miss: enter = inf."""
     a, b = np.maximum(dot(directions, directions), 1e-12), dot(origins, directions)
     square = b * b - a * (dot(origins, origins) - radius * radius)
     root = np.sqrt(np.maximum(square, 0))
@@ -68,21 +68,21 @@ def round_interval(origins: Array, directions: Array, radius: float) -> tuple[Ar
 
 
 def slab_interval(origins: Array, directions: Array, half: float) -> tuple[Array, Array]:
-    """Where rays have one coordinate within `half` of 0."""
+    """Return where one coordinate of rays is within `half` of 0."""
     inverse = 1 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     middle, reach = -origins * inverse, half * np.abs(inverse)
     return middle - reach, middle + reach
 
 
-def common(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Intersect intervals."""
+def intersect_intervals(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the intersection of (enter, leave) intervals; it is empty if enter > leave."""
     enters, leaves = zip(*intervals, strict=True)
     return np.maximum.reduce(enters), np.minimum.reduce(leaves)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A painted convex body with its own axes: turned by `tilt` about x, then by `yaw` about z (degrees)."""
+    """A painted convex body with local axes: rotated by `tilt` about x, then by `yaw` about z (degrees)."""
 
     center: Vector
     paint: Paint
@@ -91,7 +91,7 @@ class Shape:
 
     @property
     def reach(self) -> float:
-        """Radius of the bounding ball."""
+        """Radius of the bounding sphere."""
         raise NotImplementedError
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -110,14 +110,14 @@ class Shape:
         return np.asarray(tilt @ yaw)
 
     def local(self, points: Array) -> Array:
-        """Bring world points into the shape's own axes."""
+        """Transform world points to local coordinates."""
         return rotate(self.axes, points - np.array(self.center)[:, None])
 
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Distance along each ray to the surface ahead, [R]; inf = miss."""
         offset = origins - np.array(self.center)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
-        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # rays through the ball
+        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # through the bounding sphere
         distance = np.full(along.shape, np.inf)
         offset, directions = (np.broadcast_to(v, (3, len(along)))[:, near] for v in (offset, directions))
         enter, leave = self.interval(rotate(self.axes, offset), rotate(self.axes, directions))
@@ -136,7 +136,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Sphere(Shape):
-    """A ball."""
+    """A sphere."""
 
     radius: float
 
@@ -145,7 +145,7 @@ class Sphere(Shape):
         return self.radius
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        return round_interval(origins, directions, self.radius)
+        return sphere_interval(origins, directions, self.radius)
 
     def local_normal(self, points: Array) -> Array:
         return points / self.radius
@@ -153,7 +153,7 @@ class Sphere(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Cuboid(Shape):
-    """A block of half sides `half`."""
+    """A box with half side lengths `half`."""
 
     half: Vector
 
@@ -162,7 +162,7 @@ class Cuboid(Shape):
         return float(np.linalg.norm(self.half))
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        return common(*(slab_interval(origins[i], directions[i], self.half[i]) for i in range(3)))
+        return intersect_intervals(*(slab_interval(origins[i], directions[i], self.half[i]) for i in range(3)))
 
     def local_normal(self, points: Array) -> Array:
         depth = np.abs(points) - np.array(self.half)[:, None]
@@ -171,7 +171,7 @@ class Cuboid(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shape):
-    """A closed cylinder along its own z."""
+    """A closed cylinder along the local z axis."""
 
     radius: float
     half: float
@@ -181,8 +181,8 @@ class Cylinder(Shape):
         return float(np.hypot(self.radius, self.half))
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        side = round_interval(origins[:2], directions[:2], self.radius)
-        return common(side, slab_interval(origins[2], directions[2], self.half))
+        side = sphere_interval(origins[:2], directions[:2], self.radius)
+        return intersect_intervals(side, slab_interval(origins[2], directions[2], self.half))
 
     def local_normal(self, points: Array) -> Array:
         x, y, z = points

@@ -1,4 +1,4 @@
-"""The still life on its table: procedural paints, each in its shape's own axes, and the list of shapes."""
+"""The still life on its table: procedural paints in the local axes of their shapes, and the list of shapes."""
 
 from functools import partial
 
@@ -43,16 +43,16 @@ def mix(a: Vector | Array, b: Vector | Array, t: Array | NDArray[np.bool_]) -> A
 
 
 def grain(p: Array) -> Array:
-    """Wood along x: wavy rings and fine fibres, in [0, 1]."""
+    """Wood along x: wavy rings and fine fibers, in [0, 1]."""
     x, y, z = p
     bend = noise(np.array([1.1 * x, 3 * y, 3 * z]), 2)
-    fibre = noise(np.array([7 * x, 80 * y, 80 * z]), 2)
+    fiber = noise(np.array([7 * x, 80 * y, 80 * z]), 2)
     ring = 0.5 + 0.5 * np.sin(95 * (y + z) + 26 * bend)
-    return np.asarray(0.45 * ring + 0.55 * fibre)
+    return np.asarray(0.45 * ring + 0.55 * fiber)
 
 
 def planks(p: Array) -> Array:
-    """Boards of 0.25, each with its own tone, and dark joints."""
+    """Boards 0.25 wide of different tones, with dark joints."""
     across = p[1] / 0.25 + 0.5
     row = np.floor(across)
     tone = scramble(row.astype(np.int64).astype(np.uint32) * np.uint32(PRIMES[0]))
@@ -72,7 +72,7 @@ def chessboard(p: Array) -> Array:
 
 
 def globe(p: Array) -> Array:
-    """Sea, land, ice and a grid of 15 degrees; radius 0.33."""
+    """Sea, land, ice and a 15-degree grid; radius 0.33."""
     x, y, z = p / 0.33
     height = noise(p * 6 + 5.2, 5)
     sea = mix((0.01, 0.06, 0.22), (0.05, 0.33, 0.5), np.clip(height * 2.6 - 0.4, 0, 1))
@@ -95,8 +95,8 @@ def beach_ball(p: Array) -> Array:
 
 def dotted(p: Array) -> Array:
     """White dots on red, spread evenly over the ball."""
-    way = unit(p)
-    nearest = np.maximum.reduce([dot(d, way) for d in spiral(36, -90, 90)])
+    direction = unit(p)
+    nearest = np.maximum.reduce([dot(d, direction) for d in spiral(36, -90, 90)])
     return mix((0.62, 0.02, 0.03), (0.82, 0.79, 0.74), nearest > np.cos(0.19))
 
 
@@ -131,7 +131,7 @@ def tin(p: Array) -> Array:
     return mix(label, mix((0.28, 0.29, 0.31), (0.62, 0.63, 0.65), rib), np.abs(z) > 0.18)
 
 
-def bound(cover: Vector, half: Vector, p: Array) -> Array:
+def book_cover(cover: Vector, half: Vector, p: Array) -> Array:
     """A book: cloth covers with a gilt frame and title, pages on three sides, the spine at -x."""
     x, y, z = p / np.reshape(half, (3, 1))
     cloth = mix(cover, (0.02, 0.02, 0.02), 0.55 * noise(p * 90, 2))
@@ -172,8 +172,8 @@ def pencil(p: Array) -> Array:
 
 
 def book(center: Vector, half: Vector, yaw: float, cover: Vector) -> Cuboid:
-    """A bound box: its paint needs its size."""
-    return Cuboid(center=center, half=half, yaw=yaw, paint=partial(bound, cover, half))
+    """Return a box painted as a book."""
+    return Cuboid(center=center, half=half, yaw=yaw, paint=partial(book_cover, cover, half))
 
 
 SCENE: tuple[Shape, ...] = (

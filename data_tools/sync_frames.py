@@ -1,4 +1,4 @@
-"""Frames of the videos of several cameras, at the same moments of each."""
+"""Extract synchronized frames from the videos of several cameras."""
 
 import logging
 from pathlib import Path
@@ -17,12 +17,12 @@ from .video import decoded, limited
 LOG = logging.getLogger("clsplat")
 
 
-def write_sync_frames(scene: Path, moments: int, long_side: int | None = None) -> int:
+def write_sync_frames(scene: Path, frames: int, long_side: int | None = None) -> int:
     """Write frames of `scene/videos/NAME.mp4` into `scene/videos/NAME/`, evenly spaced; return the number of cameras.
 
-    The moments are the same of all cameras: the videos start together and have one rate.  Of a video with more frames
-    than another the end is left out, with a warning.  Folders with that number of frames stay as they are.
-    Raises DataError where there is no video, one cannot be decoded, or a folder holds another number of frames.
+    All cameras use the same frame numbers, so the videos must start together and have the same frame rate.  Frames
+    past the end of the shortest video are ignored, with a warning.  Folders that already hold `frames` frames are kept.
+    Raises DataError if there are no videos, a video cannot be decoded, or a folder holds another number of frames.
     """
     folder = scene / VIDEOS
     files = sorted(folder.iterdir()) if folder.is_dir() else []
@@ -30,26 +30,26 @@ def write_sync_frames(scene: Path, moments: int, long_side: int | None = None) -
     if not videos:
         raise DataError(f"{folder}: holds no videos; expected {VIDEOS}/NAME.mp4 of each camera")
     lengths = {video: _length(video) for video in videos}
-    least = min(lengths.values())
-    if longer := [video.name for video, length in lengths.items() if length > least]:
-        LOG.warning("%s: the end of %s is left out: another video has only %d frames", folder, first_few(longer), least)
-    if not 2 <= moments <= least:
-        raise DataError(f"{folder}: {moments} moments of videos with {least} frames; expected 2 to {least}")
-    places = np.linspace(0, least - 1, moments).round().astype(int).tolist()
-    count = Count("frames written", moments * len(videos))
+    shortest = min(lengths.values())
+    if longer := [video.name for video, length in lengths.items() if length > shortest]:
+        LOG.warning("%s: the end of %s is ignored: another video has %d frames", folder, first_few(longer), shortest)
+    if not 2 <= frames <= shortest:
+        raise DataError(f"{folder}: cannot extract {frames} frames from videos of {shortest}; use 2 to {shortest}")
+    frame_indices = np.linspace(0, shortest - 1, frames).round().astype(int).tolist()
+    count = Count("frames written", frames * len(videos))
     for video in videos:
         out = video.with_suffix("")
-        there = [file for file in out.iterdir() if is_image(file)] if out.is_dir() else []
-        if there and len(there) != moments:
-            raise DataError(f"{out}: holds {len(there)} frames; expected none, or {moments}: remove that folder")
-        if not there:
-            _write(video, out, places, long_side)
-        count.reach(count.done + moments)
+        existing = [file for file in out.iterdir() if is_image(file)] if out.is_dir() else []
+        if existing and len(existing) != frames:
+            raise DataError(f"{out}: holds {len(existing)} frames, expected {frames}; remove that folder")
+        if not existing:
+            _write(video, out, frame_indices, long_side)
+        count.reach(count.done + frames)
     return len(videos)
 
 
 def _length(video: Path) -> int:
-    """The number of frames, which headers do not always tell."""
+    """Return the number of frames, counted since headers are not always right."""
     reader = cv2.VideoCapture(str(video))
     try:
         count = 0
@@ -62,9 +62,9 @@ def _length(video: Path) -> int:
     return count
 
 
-def _write(video: Path, out: Path, places: list[int], long_side: int | None) -> None:
-    """Write the frames at these places, all or none."""
-    with new_folder(out) as half:
-        for place, image in enumerate(decoded(video)):
-            for number in (i for i, wanted in enumerate(places) if wanted == place):
-                write_image(half / f"{number:04}.png", np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
+def _write(video: Path, out: Path, indices: list[int], long_side: int | None) -> None:
+    """Write the frames with these indices as 0000.png, 0001.png, …, all or none."""
+    with new_folder(out) as folder:
+        for index, image in enumerate(decoded(video)):
+            for number in (i for i, wanted in enumerate(indices) if wanted == index):
+                write_image(folder / f"{number:04}.png", np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))

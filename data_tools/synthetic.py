@@ -27,7 +27,7 @@ from .shapes import Array, spiral
 from .still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
 
 View = TypeVar("View")
-LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the center of every image
+LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point at the center of every image
 CAMERA_DISTANCE = 3.75
 POINT_COUNT = 8000
 POINT_NOISE = 0.002 * SCENE_RADIUS
@@ -77,13 +77,13 @@ class SyntheticOptions:
 def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = None) -> str:
     """Write the folder `out`, all of it or nothing, and return a summary.
 
-    `workers` processes share the views (default: one per core; 1: this process).  Raises DataError when `out` exists
-    and is another dataset, OutputError when it cannot be written.
+    `workers` processes share the views (default: one per core; 1: this process).  Raises DataError if `out` is
+    another dataset, OutputError if it cannot be written.
     """
     if path_exists(out):
         if is_complete(out, options):
             return f"{out} is already complete"
-        raise DataError(f"{out}: exists and is another dataset; remove it or choose another folder")
+        raise DataError(f"{out}: already holds another dataset; remove it or choose another folder")
     with new_folder(out) as partial_out, raising_output_error(out):
         text = options.fill(partial_out, workers or os.cpu_count() or 1)
         (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")
@@ -152,7 +152,7 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noisy surface points of a view, like those of structure from motion: positions and colors, [M, 3]."""
+    """Return noisy surface points of a view, like those from structure from motion: positions and colors, [M, 3]."""
     rows, columns = np.nonzero(image[..., 3] == 255)
     chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
     x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))

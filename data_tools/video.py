@@ -1,4 +1,4 @@
-"""Sharp frames of a video, with the same motion between them."""
+"""Extract sharp frames from a video, with equal camera motion between them."""
 
 import json
 import logging
@@ -21,54 +21,56 @@ from clsplat.scene.quality import SIDE, sharpness
 from clsplat.scene.times_file import write_times
 
 LOG = logging.getLogger("clsplat")
-RECORD = ".frames.json"  # next to the frames: what they were made from
+RECORD = ".frames.json"  # next to the frames: the video and settings they were extracted with
 FLOW_SIDE = 120  # px: motion is measured at this size
-CELLS = 4, 3  # in each of which the motion of all pixels is averaged, so that noise has little
-STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
+CELLS = 4, 3  # motion is averaged over each cell to suppress noise
+STILL = 0.1  # px per frame: less is noise and compression artifacts
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
-    """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
+    """Split a video into `frames` parts of equal motion and write the sharpest frame of each; return their number.
 
-    The format is PNG because a second lossy coding changes features and colors.  An interrupted call continues: frames
-    of the same video and settings stay unchanged.  times: also write times.json, of a dynamic scene: the number of
+    The format is PNG because a second lossy compression changes features and colors.  An interrupted call continues:
+    frames of the same video and settings are kept.  times: also write times.json for a dynamic scene, the index of
     each frame in the video.
-    Raises DataError when the video cannot be decoded, or has one frame, as a picture has, and when `out` holds other
-    images, which would mix with frames.
+    Raises DataError if the video cannot be decoded or has only one frame, or if `out` holds other images.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     remove_partial_files(out, border=PIPELINE)
-    chosen = _begun(out, settings)
+    chosen = _read_chosen_frames(out, settings)
     if chosen is None:
         LOG.info("%s: looking for sharp frames", video)
-        sharp, moved = _measured(video)
-        if len(sharp) == 1:
+        sharpnesses, motions = _measure_frames(video)
+        if len(sharpnesses) == 1:
             raise DataError(f"{video}: has only one frame; a photograph can be used without `clsplat data video`")
-        chosen = sharpest(sharp, moved, frames)
-        LOG.info("%d frames, of which %d are written", len(sharp), len(chosen))
+        chosen = sharpest(sharpnesses, motions, frames)
+        LOG.info("%d frames, of which %d are written", len(sharpnesses), len(chosen))
         write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")
-    files = {place: _file(out, i) for i, place in enumerate(chosen, 1)}
+    files = {index: _file(out, i) for i, index in enumerate(chosen, 1)}
     count = Count("frames written", len(files))
-    missing = {place for place, path in files.items() if not _is_whole(path)}
-    for place, image in enumerate(decoded(video) if missing else ()):
-        if place in missing:
-            write_image(files[place], np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
-            missing.remove(place)
+    missing = {index for index, path in files.items() if not _is_readable(path)}
+    for index, image in enumerate(decoded(video) if missing else ()):
+        if index in missing:
+            write_image(files[index], np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
+            missing.remove(index)
             count.reach(count.done + 1)
     if missing:
         raise DataError(f"{out / RECORD}: names frame {min(missing)}, which the video does not have; remove {out}")
     if times:
-        write_times(out, {path.name: place for place, path in files.items()})
+        write_times(out, {path.name: index for index, path in files.items()})
     return len(files)
 
 
-def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
-    """The frames that a call with the same settings has chosen, or None.  Raises DataError for a folder of others."""
+def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None:
+    """Return the frame indices that an earlier call with the same settings chose, or None.
+
+    Raises DataError if the folder holds frames of another video or other settings, or other images.
+    """
     record: dict[str, Any] = {}
     with suppress(DataError, ValueError, TypeError):
         record = dict(read_json(out / RECORD))
     chosen: list[int] | None = record.pop("chosen", None)
-    if not _are_places(chosen):  # damaged: the frames are chosen again
+    if not _are_frame_indices(chosen):  # damaged: choose the frames again
         chosen = None
     if record and record != settings:
         changed = [name for name, value in settings.items() if record.get(name) != value]
@@ -77,12 +79,11 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
             "folder, or remove it"
         )
     count = len(chosen) if chosen else settings["frames"] if record else 0
-    own = {_file(out, i) for i in range(1, count + 1)}
-    others = sorted(path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in own)
+    expected = {_file(out, i) for i in range(1, count + 1)}
+    others = sorted(path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected)
     if others:
         raise DataError(
-            f"{out}: holds {len(others)} images already, such as {others[0].name}, with which the frames would mix; "
-            "use another folder"
+            f"{out}: already holds {len(others)} other images, such as {others[0].name}; use another folder"
         )
     return chosen
 
@@ -91,15 +92,15 @@ def _file(out: Path, number: int) -> Path:
     return out / f"frame_{number:05d}.png"
 
 
-def _are_places(chosen: Any) -> bool:
-    """Return whether these are frames of a video, in its order."""
-    if not isinstance(chosen, list) or not all(type(place) is int and place >= 0 for place in chosen):
+def _are_frame_indices(chosen: Any) -> bool:
+    """Return whether `chosen` is a non-empty list of increasing frame indices."""
+    if not isinstance(chosen, list) or not all(type(index) is int and index >= 0 for index in chosen):
         return False
     return bool(chosen) and sorted(set(chosen)) == chosen
 
 
-def _is_whole(path: Path) -> bool:
-    """Return whether a frame was written and can be read."""
+def _is_readable(path: Path) -> bool:
+    """Return whether the file exists and is a readable image."""
     try:
         return bool(image_size(path))
     except DataError:
@@ -110,47 +111,47 @@ def sharpest(sharpness: Sequence[float], motion: Sequence[float], parts: int) ->
     """Return the index of the sharpest frame in each of at most `parts` parts with the same motion, the first of
     equal ones.
 
-    motion: of each frame from the one before, px.  A camera that rests gives one frame, however long it does; where it
-    always rests, parts are equally long.
+    motion: of each frame relative to the previous one, px.  While the camera rests, only one frame is chosen; if it
+    always rests, all parts have the same number of frames.
     """
-    way = np.cumsum(np.maximum(np.asarray(motion, float) - STILL, 0))
-    if not way[-1] > 0:
-        way = np.arange(1.0, len(sharpness) + 1)
-    edges = np.searchsorted(way, np.linspace(0, way[-1], min(parts, len(sharpness)) + 1)[1:-1], side="right")
+    path = np.cumsum(np.maximum(np.asarray(motion, float) - STILL, 0))
+    if not path[-1] > 0:
+        path = np.arange(1.0, len(sharpness) + 1)
+    edges = np.searchsorted(path, np.linspace(0, path[-1], min(parts, len(sharpness)) + 1)[1:-1], side="right")
     return [int(a + np.argmax(sharpness[a:b])) for a, b in pairwise([0, *edges.tolist(), len(sharpness)]) if b > a]
 
 
-def _measured(video: Path) -> tuple[list[float], list[float]]:
-    """Sharpness of each frame, and the middle length of its motion from the frame before, px."""
-    sharp: list[float] = []
-    moved: list[float] = []
+def _measure_frames(video: Path) -> tuple[list[float], list[float]]:
+    """Return the sharpness of each frame, and its median motion relative to the previous frame, px."""
+    sharpnesses: list[float] = []
+    motions: list[float] = []
     empty = np.empty(0, np.float32)
-    flow, before = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
+    flow, previous = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
     for image in decoded(video):
         gray = np.asarray(cv2.cvtColor(limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
-        sharp.append(sharpness(gray))
+        sharpnesses.append(sharpness(gray))
         small = limited(gray, FLOW_SIDE)
-        way = np.zeros((*small.shape, 2), np.float32) if before is None else flow.calc(before, small, empty)
-        way = cv2.resize(way, CELLS, interpolation=cv2.INTER_AREA)
-        moved.append(float(np.median(np.linalg.norm(way, axis=2))))
-        before = small
-    return sharp, moved
+        motion = np.zeros((*small.shape, 2), np.float32) if previous is None else flow.calc(previous, small, empty)
+        motion = cv2.resize(motion, CELLS, interpolation=cv2.INTER_AREA)
+        motions.append(float(np.median(np.linalg.norm(motion, axis=2))))
+        previous = small
+    return sharpnesses, motions
 
 
 def decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError when there is none."""
+    """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError if there are none."""
     reader = cv2.VideoCapture(str(video))
     try:
-        found = False
+        has_frames = False
         while True:
-            good, image = reader.read()
-            if not good:
+            success, image = reader.read()
+            if not success:
                 break
-            found = True
+            has_frames = True
             yield np.asarray(image, np.uint8)
     finally:
         reader.release()
-    if not found:
+    if not has_frames:
         raise DataError(f"{video}: not a video that OpenCV decodes; convert it to MP4 (H.264)")
 
 

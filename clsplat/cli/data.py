@@ -50,11 +50,11 @@ def synthetic(
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
     from clsplat.data_tools.moving import Moving
 
-    given = {"size": size, "train": train, "test": test, "times": times}
-    found = {name: value for name, value in given.items() if value is not None}
+    values = {"size": size, "train": train, "test": test, "times": times}
+    options = {name: value for name, value in values.items() if value is not None}
     if times is not None and not moving:
         raise ConfigError("--times needs a dynamic scene; add --moving")
-    print(write_dataset(out, Moving(seed=seed, **found) if moving else SyntheticOptions(seed=seed, **found)))
+    print(write_dataset(out, Moving(seed=seed, **options) if moving else SyntheticOptions(seed=seed, **options)))
 
 
 @app.command()
@@ -150,13 +150,13 @@ def cameras(
 def fetch(
     name: Annotated[str, typer.Argument(help="mipnerf360, tandt_db, or the address of a ZIP or TAR archive.")],
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    sha256: Annotated[str, typer.Option(help="Checksum of an archive that is given by its address.")] = "",
+    sha256: Annotated[str, typer.Option(help="Expected checksum of an archive downloaded by address.")] = "",
 ) -> None:
     """Download a public data set, or continue an interrupted download."""
-    from clsplat.data_tools.fetch import WebArchive, named
+    from clsplat.data_tools.fetch import WebArchive, find_source
     from clsplat.data_tools.fetch import fetch as download
 
-    download(WebArchive(name, "", sha256 or None) if "://" in name else named(name), out)
+    download(WebArchive(name, "", sha256 or None) if "://" in name else find_source(name), out)
 
 
 @app.command()

@@ -121,7 +121,7 @@ def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     kept = image.read_bytes()
     message = refusal(write_frames, video, tmp_path / "frames", 4)
-    assert "holds 1 images already, such as frame_00001.png, with which the frames would mix" in message
+    assert "already holds 1 other images, such as frame_00001.png" in message
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["below", "notes.txt"]
     assert image.read_bytes() == kept
 
@@ -129,7 +129,7 @@ def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
 def test_extraction_resumes_after_a_kill(video, tmp_path, monkeypatch):
     write_frames(video, tmp_path / "whole", frames=6)
     written: list[str] = []
-    write, looked = video_tool.write_image, video_tool._measured
+    write, looked = video_tool.write_image, video_tool._measure_frames
 
     def killed(path: Path, pixels: np.ndarray) -> None:
         if len(written) == 2:
@@ -143,7 +143,9 @@ def test_extraction_resumes_after_a_kill(video, tmp_path, monkeypatch):
     monkeypatch.setattr(
         video_tool, "write_image", lambda path, pixels: (written.append(path.name), write(path, pixels))
     )
-    monkeypatch.setattr(video_tool, "_measured", lambda image: pytest.fail("was measured before") or looked(image))
+    monkeypatch.setattr(
+        video_tool, "_measure_frames", lambda image: pytest.fail("was measured before") or looked(image)
+    )
     assert write_frames(video, tmp_path / "frames", frames=6) == 6
     assert written == [f"frame_{i:05d}.png" for i in range(1, 7)]
     assert contents(tmp_path / "frames") == contents(tmp_path / "whole")

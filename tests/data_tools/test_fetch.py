@@ -126,7 +126,7 @@ def test_wrong_checksum(web, tmp_path):
 def test_archive_members_outside_the_folder_are_refused(web, tmp_path, name):
     folder, address, _ = web
     archive(folder / "d.zip", ("scene/a.txt", name))
-    assert "outside of its folder" in refusal(quietly, WebArchive(f"{address}/d.zip", ""), tmp_path / "d")
+    assert "outside its folder" in refusal(quietly, WebArchive(f"{address}/d.zip", ""), tmp_path / "d")
     assert not (tmp_path / "d").exists()
     assert not list(tmp_path.rglob("evil.txt"))
 
