@@ -1,7 +1,7 @@
 /* Rays of pixels, each the axis of a cone, and the edges of their samples (Barron et al. 2021, "Mip-NeRF").
  *
- *   ray     o the camera's position, d toward the pixel's center with depth 1 in the camera; at a distance t of 1 the
- *           cone has the radius 2 / sqrt(12) of a pixel's width (section 3.1)
+ *   ray     o the camera's position in units of the field, d toward the pixel's center with depth 1 in the camera; at a
+ *           distance t of 1 the cone has the radius 2 / sqrt(12) of a pixel's width (section 3.1)
  *   coarse  edges evenly from near to far; in training each is drawn up to 1/2 interval before or after
  *   fine    edges at even values of the distribution of the blurred coarse weights (equation 18, alpha 0.01),
  *           w'_k = (max(w_k-1, w_k) + max(w_k, w_k+1)) / 2 + alpha
@@ -40,6 +40,7 @@ void cast_rays(
     __global const uint *restrict pixels,  // [rays] row * width + column
     __constant camera_t *restrict camera,  // [1]
     __global float *restrict cones,        // [count,RAY_VALUES]
+    const float scale,                     // units of the field per scene unit
     const uint rays,
     const uint count)                      // rays, including padding to whole tiles
 {
@@ -54,7 +55,7 @@ void cast_rays(
     float length2 = 0.0f;
     for (uint k = 0; k < 3; k++) {
         const float d = m[k] * x + m[4 + k] * y + m[8 + k];
-        cone[k] = camera->position[k];
+        cone[k] = camera->position[k] * scale;
         cone[3 + k] = d;
         length2 += d * d;
     }

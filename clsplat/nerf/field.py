@@ -51,7 +51,7 @@ class SampleLevel:
 
     rays: Rays
     samples: int
-    edges: Array  # [count, samples + 1]
+    edges: Array  # [count, samples + 1] distances, in units of the field
     raw_colors: Array  # [tiles, COLOR_ROWS, SAMPLES]
     raw_densities: Array  # [tiles, COLOR_ROWS, SAMPLES]
     weights: Array  # [count, samples]
@@ -99,7 +99,13 @@ class Levels:
         count = -(-pixels.shape[0] // RAYS) * RAYS
         cones = self.workspace.array("field cones", (count, RAY_VALUES))
         self._rays.cast_rays(
-            items=count, pixels=pixels, camera=camera.array, cones=cones, rays=pixels.shape[0], count=count
+            items=count,
+            pixels=pixels,
+            camera=camera.array,
+            cones=cones,
+            scale=1 / self.shape.scene_units,
+            rays=pixels.shape[0],
+            count=count,
         )
         return Rays(camera, pixels, cones, count, draw)
 
@@ -245,7 +251,7 @@ class Field:
     def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
         """Return the image of the fine level on the host, its alpha, and the mean depth.
 
-        The direction of a ray has depth 1, so that distances along it are depths, in scene units.
+        The direction of a ray has depth 1, so that distances along it are depths.  Depths are in scene units.
         """
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
@@ -254,7 +260,8 @@ class Field:
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
             opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
             alpha[pixels] = np.minimum(opacity, 1)  # rounding may exceed 1
-            depths[pixels] = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
+            mean = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
+            depths[pixels] = self.shape.scene_units * mean
         rgb = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
         return Layers(rgb, alpha.reshape(size), depths.reshape(size) if depth else None)
 

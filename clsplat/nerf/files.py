@@ -47,7 +47,7 @@ class Notes(BaseModel):
 class FieldModel:
     """A field on the host, as `train_field` trains it.
 
-    Raises ValueError if the parameters do not fit the shape, or the origin is not 3 numbers.
+    Raises ValueError if the parameters do not fit the shape, its unit is not a number, or the origin is not 3 numbers.
     """
 
     shape: FieldShape
@@ -58,6 +58,7 @@ class FieldModel:
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.parameters,):
             raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
+        _ = self.shape.scene_units
         if self.origin.shape != (3,):
             raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
 

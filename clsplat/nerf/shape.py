@@ -1,19 +1,23 @@
 """Describe the shape of a field: its network, encodings, samples and grid, and the layout of its parameters."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from clsplat.core.settings import Settings
+from clsplat.core.settings import Settings, in_one_sentence
 from clsplat.opencl.device import constants
+from clsplat.scene.scene import Scene
+from clsplat.scene.viewpoint import BLENDER_DISTANCE, camera_distance
 
 GRID = constants("grid.cl")
 FEATURES = int(GRID["GRID_FEATURES"])
-FARTHEST = 1e6  # scene units: the squared ratio of two depths stays within float32
+FARTHEST = 1e6  # units of the field: the squared ratio of two depths stays within float32
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+UNIT_MAX = 1e15  # scene units, as numbers in a dataset; its inverse is the least
+UnitLength = Annotated[float, Field(ge=1 / UNIT_MAX, le=UNIT_MAX)]
 MAX_INITIAL = 1e-4  # largest initial value of an entry (Müller et al. 2022, section 4)
 
 
@@ -33,9 +37,9 @@ class GridShape(Settings):
     entries: Annotated[int, Field(ge=16, le=1 << 22)] = 1 << 17
     """Largest number of entries of a level, a power of 2; levels with more corners share entries by a hash."""
     corner: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
-    """Corner of the cube with the smallest coordinates, scene units."""
+    """Corner of the cube with the smallest coordinates, in units of `unit`."""
     side: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 3.0
-    """Side of the cube, scene units."""
+    """Side of the cube, in units of `unit`."""
 
     @model_validator(mode="after")
     def _in_order(self) -> "GridShape":
@@ -112,10 +116,20 @@ class DenseLayer:
 class FieldShape(Settings):
     """The field of Mip-NeRF (Barron et al. 2021): both levels share one network of positions and directions."""
 
+    output_keys: ClassVar[frozenset[str]] = frozenset({"unit_auto"})
+
+    unit: Annotated[
+        Literal["auto"] | UnitLength,
+        in_one_sentence(f"expected 'auto' or a length from {1 / UNIT_MAX:g} to {UNIT_MAX:g}"),
+    ] = "auto"
+    """The unit of all lengths in the field, in scene units; `auto`: the median distance of the training cameras from
+    the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes the number."""
+    unit_auto: UnitLength | None = None
+    """Written by a run: the number that `auto` chose.  Other photos choose again while `unit` is that number."""
     near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
-    """Depth at which the samples of a ray start, scene units; 2 for the Blender scenes."""
+    """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
     far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0
-    """Depth at which the samples of a ray end, scene units; 6 for the Blender scenes."""
+    """Depth at which the samples of a ray end, in units of `unit`; 6 for the Blender scenes."""
     coarse_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
     """Samples per ray in the coarse level."""
     fine_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
@@ -144,6 +158,20 @@ class FieldShape(Settings):
         if not self.degrees and self.grid is None:
             raise ValueError("'degrees' must be larger than 0 without a 'grid': the network would read no position")
         return self
+
+    def with_unit(self, scene: Scene) -> "FieldShape":
+        """Return the shape with the unit that `auto` chooses by a scene, with three digits: the same everywhere."""
+        if self.unit != "auto":
+            return self
+        unit = float(f"{camera_distance(scene) / BLENDER_DISTANCE:.3g}")
+        return self.model_copy(update={"unit": unit, "unit_auto": unit})
+
+    @property
+    def scene_units(self) -> float:
+        """The unit as a number.  Raises ValueError if no scene has chosen it yet."""
+        if self.unit == "auto":
+            raise ValueError("the unit of the field is 'auto'; use FieldShape.with_unit to choose it by a scene")
+        return self.unit
 
     @property
     def position_parts(self) -> list[int]:
@@ -227,15 +255,18 @@ class FieldShape(Settings):
 
 
 def _with_all_keys(value: Any) -> Any:
-    """Return a shape from a file.  Raises ValueError if a key is missing, since defaults may have changed."""
-    written = value if isinstance(value, dict) else {}
+    """Return a shape from a file, in scene units if it has no unit.  Raises ValueError if another key is missing, since
+    defaults may have changed, or if the unit is not a number."""
+    written = {"unit": 1.0, "unit_auto": None, **value} if isinstance(value, dict) and value else {}
     grid = written.get("grid")
     missing = [name for name in FieldShape.model_fields if written and name not in written]
     if isinstance(grid, dict):
         missing += [f"grid.{name}" for name in GridShape.model_fields if name not in grid]
     if missing:
         raise ValueError(f"the shape lacks {', '.join(missing)}")
-    return value
+    if written.get("unit") == "auto":
+        raise ValueError("the shape has the unit 'auto' instead of a number")
+    return written or value
 
 
 WrittenShape = Annotated[FieldShape, BeforeValidator(_with_all_keys)]  # the shape in a file

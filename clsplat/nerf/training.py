@@ -244,7 +244,7 @@ def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
 # Check that photographs show the cube of a field's grid, since nothing is trained outside it.
 
 Floats = NDArray[np.float64]
-UNIT = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
+CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
 
 
 def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
@@ -253,17 +253,19 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
     cube, views, points = shape.grid, scene.split("train"), scene.points
     if cube is None or not views:
         return
+    unit = shape.with_unit(scene).scene_units
     corner, side = np.array(cube.corner), cube.side
-    if not any(_intersect(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
+    if not any(_intersect(corner + side * CORNERS, _corners(view, shape.near, shape.far, unit)) for view in views):
         fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
-    elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64)).any():
+    elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64) / unit).any():
         fault = f"none of the scene's {len(points):,} points is in it"
     else:
         return
-    low, high, center = (_point_text(point) for point in (corner, corner + side, scene_center(views)))
+    low, high, center = (_point_text(point) for point in (corner, corner + side, scene_center(views) / unit))
     raise ConfigError(
-        f"train_field.field.grid: its cube is from {low} to {high}, scene units, and {fault} ({scene.path}); the "
-        f"cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and `far`"
+        f"train_field.field.grid: its cube is from {low} to {high}, units of {unit:g} scene units, and {fault} "
+        f"({scene.path}); the cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and "
+        "`far`"
     )
 
 
@@ -272,18 +274,19 @@ def _inside(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 
 
-def _corners(view: View, near: float, far: float) -> Floats:
-    """Return the corners of a view's frustum between two depths, [8, 3], ordered as UNIT: columns, rows, depth."""
+def _corners(view: View, near: float, far: float, unit: float) -> Floats:
+    """Return the corners of a view's frustum between two depths, [8, 3], ordered as CORNERS: columns, rows, depth; in
+    units of `unit`."""
     camera = view.camera
-    directions = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    positions = np.column_stack([directions, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
-    rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
+    directions = (CORNERS[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    positions = np.column_stack([directions, np.ones(8)]) * (near + CORNERS[:, 2:] * (far - near))
+    rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3] / unit
     return np.asarray((positions - translation) @ rotation)
 
 
 def _intersect(cube: Floats, frustum: Floats) -> bool:
-    """Return whether two bodies, given by corners ordered as UNIT, intersect: no axis separates them (Gottschalk, Lin
-    and Manocha 1996)."""
+    """Return whether two bodies, given by corners ordered as CORNERS, intersect: no axis separates them (Gottschalk,
+    Lin and Manocha 1996)."""
     axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
     faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])
     candidates = np.vstack([axes, faces, np.cross(axes[:, None], edges[None]).reshape(-1, 3)])

@@ -169,6 +169,7 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
 # Settings that follow from the photos: decided once, as if by `--set`, and decided again for other photos.
 
 AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
+LENGTHS = ("near", "unit")  # keys that a run replaces by numbers if they are `auto`
 
 
 def apply_adaptation(pipeline: Pipeline, measures: Measures) -> Pipeline:
@@ -227,8 +228,9 @@ def without_auto(data: Any) -> Any:
         return [without_auto(item) for item in data]
     if not isinstance(data, dict):
         return data
-    if (near := data.get("near_auto")) is not None:
-        data = {**data, "near": "auto" if data["near"] == near else data["near"], "near_auto": None}
+    for key in LENGTHS:
+        if (length := data.get(f"{key}_auto")) is not None:
+            data = {**data, key: "auto" if data[key] == length else data[key], f"{key}_auto": None}
     is_auto = all(key in data for key in AUTO)
     return {key: without_auto(value) for key, value in data.items() if not (is_auto and key in AUTO)}
 

@@ -31,6 +31,7 @@ from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import MissingViewError
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.train_field import TrainField
 from clsplat.training.modules.sky_choice import choose_sky, sky_fraction
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
@@ -218,7 +219,7 @@ def undistorted_folder(out: Path) -> Path:
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
     """Return the run of a pipeline on a scene, in the state before its first stage."""
-    pipeline = with_near(pipeline, scene.scene)
+    pipeline = with_lengths(pipeline, scene.scene)
     settings = pipeline.settings
     budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
     return Run(
@@ -253,7 +254,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
             pipeline = apply_adaptation(pipeline, measure_scene(run.scene, lambda: sky_fraction(run)))
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
-        pipeline = _with_modules(pipeline, run)
+        pipeline = _with_modules(with_lengths(pipeline, run.scene), run)
         run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
         run.harmonics = pipeline.settings.harmonics
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
@@ -261,13 +262,17 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
         return pipeline
 
 
-def with_near(pipeline: Pipeline, scene: Scene) -> Pipeline:
-    """Return the pipeline with the near plane that `auto` chooses by the scene."""
-    model = pipeline.settings.model
-    if model.near != "auto":
-        return pipeline
-    changed = model.model_copy(update=dict.fromkeys(("near", "near_auto"), near_plane(scene)))
-    return replace(pipeline, settings=pipeline.settings.model_copy(update={"model": changed}))
+def with_lengths(pipeline: Pipeline, scene: Scene) -> Pipeline:
+    """Return the pipeline with the near plane and the units of fields that `auto` chooses by the scene."""
+
+    def with_unit(training: TrainField) -> TrainField:
+        return training.model_copy(update={"field": training.field.with_unit(scene)})
+
+    settings = map_trainings(pipeline.settings, TrainField, with_unit)
+    if settings.model.near == "auto":
+        changed = settings.model.model_copy(update=dict.fromkeys(("near", "near_auto"), near_plane(scene)))
+        settings = settings.model_copy(update={"model": changed})
+    return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)
 
 
 def _warn_of_near(near: float | str, nearest: float | None) -> None:
@@ -289,6 +294,5 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
 
     settings = map_trainings(pipeline.settings, Optimize, with_choices)
     modules = [module for stage in settings.stages if isinstance(stage, Optimize) for module in stage.modules]
-    near = {key: getattr(run.model_settings, key) for key in ("near", "near_auto")}
-    settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules).model_copy(update=near)})
+    settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules)})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

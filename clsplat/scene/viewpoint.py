@@ -86,7 +86,9 @@ def nearest_to_axes(
     return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", planes, centers) + weight * prior))
 
 
-RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: 3DGS on the Blender scenes (Kerbl et al. 2023)
+BLENDER_DISTANCE = 4.03  # of the cameras from the center, in the Blender scenes
+RANDOM_BOX = 1.3 / BLENDER_DISTANCE  # half side of the box by camera distance (3DGS, Kerbl et al. 2023)
+MIN_DISTANCE = 1e-3  # extents: cameras that are nearer to the center only turn
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
@@ -99,9 +101,18 @@ def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
 
 def scene_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
     """Return the center, [3], and half the side of a box around the point that the training cameras look at."""
+    return scene_center(scene.split("train")), RANDOM_BOX * camera_distance(scene)
+
+
+def camera_distance(scene: Scene) -> float:
+    """Return the median distance of the training cameras from the point that they look at, scene units.
+
+    For cameras that only turn, it is the extent.
+    """
     views = scene.split("train")
     positions, center = np.stack([view.position for view in views]), scene_center(views)
-    return center, RANDOM_BOX * float(np.median(np.linalg.norm(positions - center, axis=1)))
+    distance = float(np.median(np.linalg.norm(positions - center, axis=1)))
+    return distance if distance > MIN_DISTANCE * scene.extent else scene.extent
 
 
 def scene_center(views: Sequence[View]) -> NDArray[np.floating]:

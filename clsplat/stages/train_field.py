@@ -108,9 +108,12 @@ class TrainField(Training):
 
     def _field(self, run: Run) -> LearnedField:
         """Return the field of a resumed run, or a new one."""
-        if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == self.field:
+        shape = self.field.with_unit(run.scene).model_copy(update={"unit_auto": None})
+        if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == shape:
             return run.learned_field
-        field = LearnedField.initial(self.field, run.seed, run.photographs.background)
+        if run.stage_step:
+            raise DataError("train_field.field: the checkpoint has a field of another shape or unit; train it again")
+        field = LearnedField.initial(shape, run.seed, run.photographs.background)
         LOG.info("training a field with %s parameters", f"{self.field.learned:,}")
         return field
 

@@ -42,7 +42,7 @@ from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.runs.estimate import MAX_PER_PIXEL, max_gaussians, minutes_text, step_seconds
 from clsplat.runs.failures import Failures
 from clsplat.runs.model_file import path_setting, photo_folder, require_model
-from clsplat.runs.opening import read_run_scene, with_near
+from clsplat.runs.opening import read_run_scene, with_lengths
 from clsplat.runs.status import status_text
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
@@ -143,7 +143,8 @@ class Blocks:
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
         self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
-        self.pipeline = with_near(self.pipeline, self.scene.scene)  # a block has other photos, and would choose another
+        # a block has other photos, and would choose another near plane
+        self.pipeline = with_lengths(self.pipeline, self.scene.scene)
         if len(self.scene.original.downscales) > 1:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
@@ -347,7 +348,7 @@ def plan_blocks(
         raise DataError(f"{scene}: has no points to partition; `clsplat blocks --plan` trains a coarse model first")
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "points.ply")
-        tables = from_points(points, Init().opacity, settings.model.sh_degree)
+        tables = from_points(points, Init().opacity, settings.model.sh_degree, extent=original.extent)
         Model(**tables, rendering=NUMBERS, sky=None, origin=original.origin).save(model)
         blocks_run = Blocks(scene, Path(folder), BlocksPlan(pipeline, str(model), blocks), device)
         try:

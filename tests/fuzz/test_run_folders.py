@@ -60,7 +60,7 @@ def test_damaged_archive_is_equal_or_refused(folder: Path):
 
 
 def test_damaged_field_is_equal_or_refused(folder: Path):
-    shape = FieldShape(depth=1, skip=None, width=4, color_width=4, degrees=1)
+    shape = FieldShape(unit=1.0, depth=1, skip=None, width=4, color_width=4, degrees=1)
     field = FieldModel(shape, shape.initial_parameters(0), Rendering(background="white"))
     field.save(folder / "whole.npz")
     path = folder / "field.npz"

@@ -21,7 +21,7 @@ def scene_of(tmp_path, *views: View, points: PointCloud | None = None) -> Scene:
 
 
 def is_seen(scene: Scene, corner, side: float) -> bool:
-    shape = FieldShape(near=NEAR, far=FAR, grid=GridShape(corner=[float(v) for v in corner], side=side))
+    shape = FieldShape(unit=1.0, near=NEAR, far=FAR, grid=GridShape(corner=[float(v) for v in corner], side=side))
     try:
         require_visible_grid(shape, scene)
     except ConfigError:
@@ -63,7 +63,7 @@ def test_message_reports_the_scene_position(tmp_path):
         View.looking_at([x, y, -2.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0], CAMERA, f"{x}") for x, y in ((0, 0), (3, 1))
     ]
     scene = scene_of(tmp_path, *views)
-    shape = FieldShape(near=NEAR, far=FAR, grid=GridShape(corner=[20.0, 0.0, 0.0], side=1.0))
+    shape = FieldShape(unit=1.0, near=NEAR, far=FAR, grid=GridShape(corner=[20.0, 0.0, 0.0], side=1.0))
     with pytest.raises(
         ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3 .* the cameras look at \(1, 2, 3\)"
     ):

@@ -293,7 +293,9 @@ def paint(field: Field, view: View) -> np.ndarray:
 @pytest.fixture(scope="module")
 def small_field() -> Field:
     device = open_device()
-    shape = FieldShape(coarse_samples=16, fine_samples=16, depth=1, skip=None, width=4, color_width=4, degrees=2)
+    shape = FieldShape(
+        unit=1.0, coarse_samples=16, fine_samples=16, depth=1, skip=None, width=4, color_width=4, degrees=2
+    )
     return Field.initial(shape, 1, device.upload(np.array([1.0, 0.5, 0.0], np.float32)))
 
 

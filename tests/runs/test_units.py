@@ -6,15 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from clsplat import FieldModel, FieldRenderer, load_field
+from clsplat import run as run_pipeline
+from clsplat.core.errors import DataError
 from clsplat.formats.splats import SplatFile, Writing
 from clsplat.formats.table import write
 from clsplat.gaussians.model import Model, Rendering, load
+from clsplat.nerf.shape import FieldShape
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
 from clsplat.scene.quality import near_plane
 from clsplat.scene.scene import PointCloud, Scene, camera_extent
+from clsplat.training import archive
 from tests.support.commands import clsplat
 from tests.support.models import splats
 from tests.support.transforms_scene import scaled
@@ -102,6 +108,66 @@ def test_cameras_with_one_center_have_an_extent(tiny_scene, factor):
     assert extent(scene, 2, with_points=True) == extent(scene, 1, with_points=True)
     assert extent(scene, 1, with_points=True) / factor == pytest.approx(3.8, rel=0.1), "the distance of the points"
     assert extent(scene, 1, with_points=False) / factor == pytest.approx(3.8, rel=0.1), "the depth of zero"
+
+
+FIELD = {"steps": 8, "rays": 128, "photographs": 4, "warm_up": 0, "rate": 0.01, "epsilon": 1e-15}
+SHAPE = {"near": 0.5, "far": 9, "coarse_samples": 16, "fine_samples": 16, "depth": 1, "width": 32, "skip": None}
+GRID = {"levels": 3, "coarsest": 4, "finest": 24, "entries": 1024, "corner": [-2, -2, -2], "side": 4}
+FIELD_STAGES = [
+    {"train_field": {**FIELD, "field": {**SHAPE, "grid": GRID}}},
+    "export_field",
+    {"evaluate": {"split": "test"}},
+]
+
+
+def unit_of(scene: Scene) -> float | str:
+    return FieldShape().with_unit(scene).unit
+
+
+@pytest.mark.slow
+def test_field_trains_alike_in_any_unit_of_length(tiny_scene, tmp_path):
+    fields, pictures, pipeline = {}, {}, tmp_path / "field.yaml"
+    pipeline.write_text(json.dumps({"name": "field", "stages": FIELD_STAGES}))
+    for factor in (1.0, *FACTORS):
+        folder, run = scaled(tiny_scene, tmp_path / f"scene_{factor:g}", factor), tmp_path / f"run_{factor:g}"
+        run_pipeline(pipeline, folder, run)
+        scene, fields[factor] = read_scene(folder), load_field(run)
+        written = load_pipeline(str(run / "pipeline.yaml")).stages[0].field
+        assert fields[factor].shape.unit == written.unit == written.unit_auto == unit_of(scene)
+        pictures[factor] = FieldRenderer(fields[factor]).render(scene.split("test")[0], depth=True)
+    for factor in FACTORS:
+        assert fields[factor].shape.unit == pytest.approx(factor * fields[1].shape.unit, rel=0.01)
+        assert trained_psnr(tmp_path / f"run_{factor:g}") == pytest.approx(trained_psnr(tmp_path / "run_1"), abs=0.1)
+        np.testing.assert_allclose(pictures[factor].depth / factor, pictures[1].depth, rtol=0.02)
+
+
+def test_field_has_the_unit_of_its_scene(tiny_scene):
+    scene = read_scene(tiny_scene)
+    assert FieldShape(unit=3.0).with_unit(scene).unit == 3
+    turning = [replace(view, world_to_camera=view.world_to_camera * [1, 1, 1, 0]) for view in scene.views]
+    assert unit_of(replace(scene, views=tuple(turning), extent=8.06)) == 2, "cameras that only turn"
+
+
+@pytest.mark.parametrize("unit", [0, -1.0, float("nan"), float("inf"), 1e-20, "meters", None])
+def test_invalid_unit_of_a_field_is_refused(unit):
+    with pytest.raises(ValidationError, match="expected 'auto' or a length from 1e-15 to 1e"):
+        FieldShape(unit=unit)
+
+
+def test_field_file_without_a_unit_is_in_scene_units(tmp_path):
+    shape = FieldShape(unit=2.0, depth=1, skip=None, width=4, color_width=4, degrees=1)
+    FieldModel(shape, np.zeros(shape.parameters, np.float32), Rendering()).save(tmp_path / "new.npz")
+    assert load_field(tmp_path / "new.npz").shape == shape
+    notes, arrays = archive.read(tmp_path / "new.npz")
+    old = {key: value for key, value in notes["shape"].items() if not key.startswith("unit")}
+    for name, written in (("old", old), ("auto", {**old, "unit": "auto"})):
+        with (tmp_path / f"{name}.npz").open("wb") as file:
+            archive.write(file, {**notes, "shape": written}, arrays.items())
+    assert load_field(tmp_path / "old.npz").shape.unit == 1
+    with pytest.raises(DataError, match="unit 'auto' instead of a number"):
+        load_field(tmp_path / "auto.npz")
+    with pytest.raises(ValueError, match=r"'auto'; use FieldShape\.with_unit"):
+        FieldModel(FieldShape(), np.zeros(FieldShape().parameters, np.float32), Rendering())
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog", "a.glb", "a.splat"])

@@ -20,6 +20,7 @@ from clsplat.opencl.device import Array, Device
 CHECKS = Checks()
 RAYS = (1, 63, 64, 65)  # around the size of a tile of samples and a chunk of tiles
 SHAPE = FieldShape(
+    unit=0.8,
     near=0.2,
     depth=3,
     width=16,
@@ -78,7 +79,9 @@ class FieldCase:
         pixels = ref.draw_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
         filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
         planes = to_planes(device, camera, photograph)
-        return cls(shape, levels, parameters, photograph, planes, cast, ref.cones(scene.camera(), filled))
+        return cls(
+            shape, levels, parameters, photograph, planes, cast, ref.cones(scene.camera(), filled, shape.scene_units)
+        )
 
     @property
     def on_device(self) -> Array:

@@ -111,13 +111,14 @@ def draw_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDAr
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 
-def cones(camera: PinholeCamera, pixels: NDArray[np.int64]) -> Floats:
-    """Return origin, direction with depth 1, radius at distance 1, and length of the direction, [R, 8]."""
+def cones(camera: PinholeCamera, pixels: NDArray[np.int64], unit: float = 1.0) -> Floats:
+    """Return origin in units of the field, direction with depth 1, radius at distance 1, and length of the direction,
+    [R, 8]."""
     x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
     y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
     rotation, translation = camera.world_to_camera[:, :3], camera.world_to_camera[:, 3]
     directions = np.stack([x, y, np.ones_like(x)], axis=1) @ rotation
-    origins = np.broadcast_to(-rotation.T @ translation, directions.shape)
+    origins = np.broadcast_to(-rotation.T @ translation / unit, directions.shape)
     radii = np.full((len(pixels), 1), 2 / np.sqrt(12) / camera.fx)  # section 3.1
     return np.concatenate([origins, directions, radii, np.linalg.norm(directions, axis=1, keepdims=True)], axis=1)
 
