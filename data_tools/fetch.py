@@ -72,9 +72,6 @@ def find_source(name: str) -> WebArchive:
     return SOURCES[name]
 
 
-named = find_source
-
-
 def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
 

@@ -67,7 +67,6 @@ STATIC_SHAPES: tuple[Shape, ...] = (
     Sphere(center=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
     Cylinder(center=(0.30, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
 )
-STANDING = STATIC_SHAPES
 
 
 def shapes_at(time: float) -> tuple[Shape, ...]:

@@ -15,7 +15,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.data_tools import fetch as fetching
-from clsplat.data_tools.fetch import WebArchive, fetch, named
+from clsplat.data_tools.fetch import WebArchive, fetch, find_source
 from tests.support.refusals import refusal
 
 
@@ -150,5 +150,5 @@ def test_unfetchable_data_is_refused(web, tmp_path):
     assert "the server sent 404" in refusal(quietly, WebArchive(f"{address}/none.zip", ""), tmp_path / "d")
     assert "expected a ZIP or TAR archive" in refusal(quietly, WebArchive(f"{address}/page.html", ""), tmp_path / "d")
     with pytest.raises(ConfigError, match="no data set is called 'garden'; use one of mipnerf360"):
-        named("garden")
+        find_source("garden")
     assert not (tmp_path / "d").exists()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.data_tools.moving import STANDING, Moving, shapes_at
+from clsplat.data_tools.moving import STATIC_SHAPES, Moving, shapes_at
 from clsplat.data_tools.sync_frames import write_sync_frames
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.prepare.inspect.findings import Inspection, summarize
@@ -71,7 +71,7 @@ def test_photographs_are_equal_in_static_pixels_only(folder, scene):
 
 def test_static_parts_never_change_and_three_things_do():
     first, last = shapes_at(0.0), shapes_at(0.8)
-    assert first[: len(STANDING)] == last[: len(STANDING)] == STANDING
+    assert first[: len(STATIC_SHAPES)] == last[: len(STATIC_SHAPES)] == STATIC_SHAPES
     ball, book, lamp = (first[-3:][i] for i in range(3))
     assert ball.center != last[-3].center
     assert book.yaw != last[-2].yaw
