@@ -3,7 +3,8 @@
     import clsplat.torch
     image, alpha = clsplat.torch.render(renderer, view, parameters)
 
-Tensors should be on the CPU, where NumPy shares their memory; those of other devices are copied there and back.
+Images and gradients are computed in float32, whatever the type of the tensors.  Tensors should be on the CPU, where
+NumPy shares their memory; those of other devices are copied there and back.
 """
 
 from collections.abc import Mapping
@@ -46,7 +47,7 @@ class _Render(torch.autograd.Function):
         grad_image, grad_alpha = (gradient.detach().cpu().numpy() for gradient in gradients)
         computed = ctx.result.backward(image=grad_image, alpha=grad_alpha if grad_alpha.any() else None)
         arrays = [torch.from_numpy(getattr(computed, name)) for name in PARAMETERS]
-        return None, None, None, *(a.to(t.device) for a, t in zip(arrays, ctx.saved_tensors, strict=True))
+        return None, None, None, *(a.to(t) for a, t in zip(arrays, ctx.saved_tensors, strict=True))
 
 
 def render(

@@ -24,6 +24,7 @@ from clsplat.render.painter import Layers, layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, to_color
+from clsplat.training.modules.camera_optimizer import pose_gradient
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
@@ -62,6 +63,9 @@ class Gradients:
     sh_base: Floats
     sh_rest: Floats
     mean2d: Floats  # [N, 2] px⁻¹, with respect to the projected mean
+    rotation: NDArray[np.float64]  # [3] rad⁻¹, of the camera: its axes p become exp([rotation]x) p + translation
+    translation: NDArray[np.float64]  # [3] 1 / scene units, in the axes of the camera
+    log_focal: float  # with respect to the logarithm of a factor on both focal lengths
     motion: Floats | None = None  # [N, 5 or more] if the Gaussians move
 
     def __repr__(self) -> str:
@@ -80,13 +84,17 @@ class RenderResult:
     model: DeviceModel  # the rendered version, which this reference keeps on the device
     renderer: "Renderer"
 
-    def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
-        """Return the gradients of a loss with respect to all parameters.
+    def backward(
+        self, image: Floats | None = None, alpha: Floats | None = None, depth: Floats | None = None
+    ) -> Gradients:
+        """Return the gradients of a loss with respect to all parameters, and to the camera's pose and focal length.
 
-        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  May be called repeatedly, also after
-        an update of the renderer: the gradients are those of the rendered model.  Raises ValueError for other shapes.
+        image: [height, width, 3] dL/d image; alpha, depth: [height, width] dL/d alpha, and dL/d depth in
+        1 / scene units, which does not count where alpha is 0.  May be called repeatedly, also after an update of the
+        renderer: the gradients are those of the rendered model.  Raises ValueError for other shapes, and for the depth
+        of a moving model; render `model.at(time)` then.
         """
-        return self.renderer.backward(self, image, alpha)
+        return self.renderer.backward(self, image, alpha, depth)
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
@@ -149,29 +157,46 @@ class Renderer:
             require_finite(values, view)
         return RenderResult(rendered.image, rendered.alpha, rendered.depth, view, color, model, self)
 
+    def render_batch(
+        self, views: Sequence[View], background: Color | None = None, depth: bool = False
+    ) -> list[RenderResult]:
+        """Render views of any sizes, one after another; see `render`."""
+        return [self.render(view, background, depth) for view in views]
+
     @serialized
-    def backward(self, result: RenderResult, image: Floats | None, alpha: Floats | None) -> Gradients:
+    def backward(
+        self, result: RenderResult, image: Floats | None, alpha: Floats | None, depth: Floats | None = None
+    ) -> Gradients:
         """Return the gradients of a loss; see `RenderResult.backward`."""
-        camera = upload_camera(self.device, result.view)
-        model = result.model
-        size = camera.height, camera.width
-        sums = np.zeros((0, 0), np.float32)
-        if alpha is not None:  # alpha is the second channel of a render of (depth, 1, 0) on black
-            planes = np.zeros((*size, 3), np.float32)
-            planes[:, :, 1] = _check_shape("alpha", alpha, size)
+        camera, pose = upload_camera(self.device, result.view), result.view.world_to_camera
+        model, size = result.model, (camera.height, camera.width)
+        count = model.gaussians.count
+        if depth is not None and model.gaussians.is_moving:
+            raise ValueError("gradient of depth: expected a model that does not move; use `model.at(time)`")
+        geometry, by_depth = None, np.zeros(count)  # by_depth: dL/d(depth of each mean), float64
+        if alpha is not None or depth is not None:
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
-            sums = self._pixel_sums(model, frame, planes).get()[:GEOMETRY]
+            geometry = self._pixel_sums(model, frame, _depth_planes(frame, alpha, depth)).get()
+            by_depth += geometry[GEOMETRY, :count]  # the first color of that frame is the depth
         frame = self._forward(model, camera, result.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _check_shape("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)
-        if alpha is not None:
+        if geometry is not None:
             both = pixel_sums.get()
-            both[:GEOMETRY] += sums
+            both[:GEOMETRY] += geometry[:GEOMETRY]
             pixel_sums.set(both)
+        pose_sums = pose_gradient(self.rasterizer.workspace, model, frame, pixel_sums)
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)
         arrays = {**{name: gradients[name] for name in model.gaussians.trained}, "mean2d": gradients.mean2d}
-        count = model.gaussians.count
-        return Gradients(**{name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()})
+        tables = {name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()}
+        by_mean = by_depth[:, None] * pose[2, :3]
+        tables["means"] += by_mean.astype(np.float32)
+        shift, turn, focal = np.split(pose_sums() if count else np.zeros(7), [3, 6])  # of the Gaussians, in world axes
+        if depth is not None:
+            shift += by_mean.sum(axis=0)
+            turn += np.cross(model.gaussians.get("means") - result.view.position, by_mean).sum(axis=0)
+        rotation = pose[:, :3]
+        return Gradients(**tables, rotation=rotation @ turn, translation=rotation @ shift, log_focal=float(focal[0]))
 
     def _forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Floats, content: Content = "color"
@@ -188,6 +213,23 @@ class Renderer:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
         return np.ascontiguousarray(to_color(background), np.float32)
+
+
+def _depth_planes(frame: Frame, alpha: Floats | None, depth: Floats | None) -> Floats:
+    """Return the gradient of a render of (depth, 1, 0) on black, [height, width, 3].
+
+    Its first channel divided by its second, which is alpha, is the mean depth.
+    """
+    size = frame.camera.height, frame.camera.width
+    planes = np.zeros((*size, 3), np.float32)
+    if alpha is not None:
+        planes[:, :, 1] = _check_shape("alpha", alpha, size)
+    if depth is not None:
+        weighted, weight = frame.image.get()[:2, : size[0], : size[1]]
+        shown = weight > 0
+        planes[shown, 0] = _check_shape("depth", depth, size)[shown] / weight[shown]
+        planes[shown, 1] -= planes[shown, 0] * weighted[shown] / weight[shown]
+    return planes
 
 
 def _check_shape(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:

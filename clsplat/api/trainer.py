@@ -32,7 +32,6 @@ from clsplat.runs.state import RunState
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import NO_FILE
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.checkpoint import save_on_failure
@@ -95,7 +94,7 @@ class Trainer:
         self.pipeline = load(str(pipeline), [*scene_path, *overrides(set or {})])
         _check_pipeline(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
-        if missing := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
+        if missing := [view.name for view in self.scene.split("train") if not view.has_photograph]:
             raise DataError(f"{self.scene.path}: the view '{missing[0]}' has no image, which training needs")
         if start != "new" and out is None:
             raise ConfigError(f"start='{start}': expected a run folder as `out`")

@@ -16,10 +16,10 @@ from clsplat.render.camera import DeviceCamera, update_camera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background
-from clsplat.scene.view import View, load_transparency
+from clsplat.scene.view import BLACK, WHITE, View, load_transparency
 
 Mask = NDArray[np.bool_]
-BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": BLACK, "white": WHITE}
 BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
 
 

@@ -248,11 +248,17 @@ def _row(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, view.downscale]
     distortion = [lens.model, lens.width, lens.height, lens.whole, *map(float, lens.params)] if lens else []
     return {
-        "photograph": files[view.image_path].digest if view.image_path in files else "",
+        "photograph": _photograph_digest(view, files),
         "mask": files[view.mask_path].digest if view.mask_path else "",
         "camera": _hash(numbers, view.world_to_camera, *([origin] if origin.any() else []), text=repr(distortion)),
         **({} if view.time is None else {"time": repr(view.time)}),
     }
+
+
+def _photograph_digest(view: View, files: Mapping[Path, ImageFile]) -> str:
+    if view.image is not None:
+        return _hash(view.image, text=str(view.image.dtype))
+    return files[view.image_path].digest if view.image_path in files else ""
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:

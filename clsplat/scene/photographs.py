@@ -25,7 +25,7 @@ def load_photograph(
 
     undistorted: a folder that caches undistorted photographs.  Raises DataError like load_image.
     """
-    if view.lens is None or undistorted is None:
+    if view.lens is None or undistorted is None or view.image is not None:
         return _load(view, background)
     file = undistorted / f"{view.name}.{_key(view, background)}.png"
     try:

@@ -11,7 +11,7 @@ Conventions of the whole project
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
-from clsplat.scene.view import Alpha, Floats, View, load_image, photograph_name
+from clsplat.scene.view import BLACK, WHITE, Alpha, Floats, View, load_image, photograph_name
 
 LOG = logging.getLogger("clsplat")
 
@@ -66,6 +66,7 @@ MAX_OFFSET = 100  # x the median distance of the points; float32 then places the
 MAX_OUTLIERS = 0.2  # fraction of the cameras
 ROUNDING = 1e-6  # of the largest coordinate: closer cameras have the same center
 MAX_THUMBNAILS = 4
+IN_MEMORY = Path("<memory>")  # of a scene without a dataset
 SPLITS = ("train", "test", "validation")
 
 
@@ -102,6 +103,20 @@ class Scene:
     tracks: Tracks | None = None  # which photographs show which points, if the dataset has this
     origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of this scene's zero
     skipped: tuple[str, ...] = ()  # names of views whose photographs are missing
+
+    @classmethod
+    def from_views(
+        cls,
+        views: Sequence[View],
+        points: PointCloud | None = None,
+        test: Collection[str] = (),
+        background: Background = "black",
+    ) -> "Scene":
+        """Return a scene of views in memory, with the names of its test views.  Raises DataError as for a dataset."""
+        if unknown := set(test) - {view.name for view in views}:
+            raise DataError(f"test: no view is called {quote(min(unknown))}; expected names of views")
+        held_out = {i for i, view in enumerate(views) if view.name in test}
+        return make_scene(IN_MEMORY, list(views), held_out, points, background)
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""
@@ -229,7 +244,8 @@ def make_scene(
         LOG.info("%s: coordinates are far from zero; those of the run are relative to %s", path, position_text(origin))
         views = [view.shifted(origin) for view in views]
         points = points and replace(points, positions=points.positions - origin)
-    views = [replace(view, camera_to_world=None) if view.camera_to_world is not None else view for view in views]
+    color = WHITE if background == "white" else BLACK
+    views = [replace(view, camera_to_world=None, background=color) for view in views]
     points = points and replace(points, positions=np.asarray(points.positions, np.float32))
     extent = camera_extent([views[i] for i in train], None if points is None else points.positions)
     return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background, origin=origin)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
@@ -51,7 +51,7 @@ def validate_time(name: str, time: float | None) -> float | None:
 
 Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
-BLACK = (0.0, 0.0, 0.0)
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 NO_FILE = Path()  # of a view without a photograph
 MAX_ROUNDING = 1.5  # px; a reduced image has whole pixels
 MIN_WHITE = 0.99  # fraction of the largest value: JPEG does not store white exactly
@@ -77,8 +77,12 @@ class View:
     static_path: Path | None = None  # an image of the photograph's size, white in pixels that show only static things
     camera_to_world: Floats | None = None  # [4, 4] float64, as a file has it, until make_scene
     response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes with the camera's response
+    image: NDArray[Any] | None = None  # [height, width, 3 or 4], integers or [0, 1]: the photograph instead of a file
+    background: tuple[float, float, float] = BLACK  # of the scene, behind transparent pixels
 
     def __post_init__(self) -> None:
+        if self.image is not None:
+            object.__setattr__(self, "image", _checked_pixels(self.name, self.image))
         object.__setattr__(self, "world_to_camera", validate_pose(self.name, self.world_to_camera))
         object.__setattr__(self, "time", validate_time(self.name, self.time))
 
@@ -162,15 +166,35 @@ class View:
             return self
         return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
-    def photograph(self, background: ArrayLike = 0.0) -> NDArray[np.float32]:
+    @property
+    def has_photograph(self) -> bool:
+        """Whether the view has an image, or a file for it."""
+        return self.image is not None or self.image_path != NO_FILE
+
+    def photograph(self, background: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
-        background: behind transparent pixels, one number or three in [0, 1]; that of a render is
+        background: behind transparent pixels, one number or three in [0, 1]; default: the scene's.  That of a render is
         `picture.background`.  Raises DataError when the file cannot be read or does not fit the camera, ValueError for
         an invalid background.
         """
-        red, green, blue = to_color(background).tolist()
+        red, green, blue = to_color(self.background if background is None else background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
+
+
+def _checked_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
+    """Return an image as uint8 or uint16, [height, width, 3 or 4].  Raises DataError for another shape or range."""
+    pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or not pixels.size:
+        raise DataError(f"the image of {quote(name)} has shape {pixels.shape}; expected (height, width, 3 or 4)")
+    if pixels.dtype in (np.uint8, np.uint16):
+        return pixels
+    if not np.issubdtype(pixels.dtype, np.floating) or not ((pixels >= 0) & (pixels <= 1)).all():
+        raise DataError(
+            f"the image of {quote(name)} has values of type {pixels.dtype}, or outside of [0, 1]; expected uint8, "
+            "uint16, or floats from 0 to 1"
+        )
+    return np.asarray(np.rint(pixels.astype(np.float64) * 65535), np.uint16)  # uint8 / 255 is exact
 
 
 CUBE = "cube_"  # before the name of a face
@@ -271,16 +295,17 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
 
     Raises DataError as needs_rotation does.
     """
-    if path == NO_FILE:
-        raise DataError(f"the view {quote(view.name)} has no photograph; expected one with an image_path")
+    is_file = path != NO_FILE
+    if not is_file and view.image is None:
+        raise DataError(f"the view {quote(view.name)} has no photograph; expected one with an image or an image_path")
     decoded: dict[bool, NDArray[Any]] = {}
 
     def size(upright: bool) -> Size:
-        decoded[upright] = read_image(path, upright)
+        decoded[upright] = read_image(path, upright) if is_file else cast(NDArray[Any], view.image)
         height, width = decoded[upright].shape[:2]
         return width, height
 
-    pixels = decoded[needs_rotation(view, path, size)][:, :, channels]
+    pixels = decoded[needs_rotation(view, path if is_file else Path(view.name), size)][:, :, channels]
     return view.lens.undistort_image(np.ascontiguousarray(pixels)) if view.lens and pixels.size else pixels
 
 

@@ -116,6 +116,15 @@ def test_gradients_by_image_and_by_alpha_add_up(device, rng):
 
 
 @on_one_setting
+def test_batch_has_the_renders_of_its_views(device, rng):
+    case = random_case(rng, 20, *SIZE)
+    views = [case.view, replace(case.view, camera=case.view.camera.zoomed(2.0))]
+    renderer = Renderer(model_of(case), device)
+    for result, view in zip(renderer.render_batch(views, 0.3), views, strict=True):
+        np.testing.assert_array_equal(result.image, renderer.render(view, 0.3).image)
+
+
+@on_one_setting
 def test_empty_model_renders_the_background(device, rng):
     case = random_case(rng, 3, *SIZE)
     picture = Renderer(model_of(case)[:0], device).render(case.view, 0.25, depth=True)

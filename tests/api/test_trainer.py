@@ -22,6 +22,7 @@ from clsplat.losses.image import L1, Dssim
 from clsplat.photos.photographs import Photographs
 from clsplat.render.camera import upload_camera
 from clsplat.render.workspace import Workspace
+from clsplat.scene.images import read_image
 from clsplat.training import trainer as steps
 from tests.support.models import equal
 
@@ -48,6 +49,61 @@ def test_trainer_gives_the_bits_of_the_command(name, tiny_scene, tmp_path):
     assert (last.step, last.gaussians) == (metrics["steps"], metrics["gaussians"])
     assert repr(last) == f"Report(step {last.step}, {last.gaussians:,} Gaussians)"
     assert repr(trainer) == f"Trainer({name} on tiny, step {last.step})"
+
+
+def in_memory(scene: clsplat.Scene) -> clsplat.Scene:
+    """The scene from arrays, without its files."""
+    views = [
+        clsplat.View(view.name, view.camera, view.world_to_camera, image=read_image(view.image_path))
+        for view in scene.views
+    ]
+    test = [view.name for view in scene.split("test")]
+    return clsplat.Scene.from_views(views, scene.points, test, scene.background)
+
+
+def test_scene_from_arrays_trains_to_the_bits_of_its_files(tiny_scene, tmp_path):
+    scene = clsplat.read_scene(tiny_scene)
+    arrays = in_memory(scene)
+    np.testing.assert_array_equal(arrays.views[0].photograph(), scene.views[0].photograph())
+    expected = clsplat.Trainer(scene, "smoke")
+    expected.run()
+    first = clsplat.Trainer(arrays, "smoke", out=tmp_path / "run")
+    first.run(7)
+    first.checkpoint()
+    first.close()
+    second = clsplat.Trainer(in_memory(scene), "smoke", out=tmp_path / "run", start="resume")
+    second.run()
+    assert equal(second.model, expected.model)
+    other = replace(arrays.views[0], image=255 - arrays.views[0].image)
+    changed = replace(arrays, views=(other, *arrays.views[1:]))
+    with pytest.raises(ConfigError, match="the photograph of 1 view"):
+        clsplat.Trainer(changed, "smoke", out=tmp_path / "run", start="resume")
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 5)), "shape"),
+        (np.full((4, 5, 3), 1.5), "values"),
+        (np.full((4, 5, 3), np.nan), "values"),
+        (np.zeros((4, 5, 3), int), "values"),
+    ],
+)
+def test_array_that_is_not_an_image_is_refused(image, message):
+    with pytest.raises(DataError, match=rf"^the image of 'a' has {message}"):
+        clsplat.View("a", clsplat.Camera(5, 4, 5, 5, 2.5, 2), np.eye(4)[:3], image=image)
+
+
+def test_float_image_keeps_the_levels_of_8_bits():
+    levels = np.arange(240, dtype=np.uint8).reshape(8, 10, 3)
+    view = clsplat.View("a", clsplat.Camera(10, 8, 5, 5, 5, 4), np.eye(4)[:3], image=levels / np.float32(255))
+    np.testing.assert_array_equal(view.photograph(), levels / np.float32(255))
+
+
+def test_unknown_test_view_is_refused():
+    view = clsplat.View("a", clsplat.Camera(5, 4, 5, 5, 2.5, 2), np.eye(4)[:3])
+    with pytest.raises(DataError, match="no view is called 'b'"):
+        clsplat.Scene.from_views([view], test=["b"])
 
 
 def test_threads_may_share_a_trainer(tiny_scene, tmp_path):

@@ -286,7 +286,7 @@ def test_blender_scene_converts_to_colmap(tiny_scene, tmp_path):
     assert found.keys() == {f"{view.name}.png" for view in old.views}
     for view in old.views:
         np.testing.assert_allclose(found[f"{view.name}.png"].world_to_camera, view.world_to_camera, atol=1e-14)
-        np.testing.assert_array_equal(found[f"{view.name}.png"].photograph(), view.photograph())
+        np.testing.assert_array_equal(found[f"{view.name}.png"].photograph(0.0), view.photograph(0.0))
 
 
 @pytest.mark.slow
