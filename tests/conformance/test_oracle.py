@@ -27,7 +27,7 @@ STEP = 1e-6  # of central differences of the oracle in float64; too short for a 
 
 
 @pytest.mark.parametrize("kind", ["compact", "off-center", "wide"])
-def test_gradients_of_camera_and_depth_are_derivatives_of_the_oracle(device, kind):
+def test_gradients_by_camera_and_depth_agree_with_the_oracle(device, kind):
     tables, camera = make_scene(KINDS[kind], "ewa", seed=3)
     rng = np.random.default_rng(3)
     weights = rng.normal(size=(5, camera.height, camera.width))  # of the image's channels, alpha, and depth
