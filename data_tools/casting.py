@@ -75,16 +75,16 @@ class World:
         pose: camera-to-world [4, 4] in OpenGL axes.
         """
         focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
-        through = np.array([(x - 0.5 * size) / focal, (0.5 * size - y) / focal, np.full(x.shape, -1.0)])
-        return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
+        directions = np.array([(x - 0.5 * size) / focal, (0.5 * size - y) / focal, np.full(x.shape, -1.0)])
+        return pose[:3, 3:], unit(rotate(pose[:3, :3], directions))
 
     def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
         """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB), alpha = covered fraction."""
         rows = max(1, BLOCK // size)
-        parts = [self.expose(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
+        parts = [self.render_rows(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
         return np.concatenate(parts)
 
-    def expose(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
+    def render_rows(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
         """Render some rows of a view, [rows, size, 4] RGBA."""
         y, x = (v.ravel() for v in np.meshgrid(np.array(rows, float), np.arange(float(size)), indexing="ij"))
         color, cover = np.zeros((3, len(x))), np.zeros(len(x))

@@ -243,10 +243,10 @@ def skip_fsync() -> Iterator[None]:
 @pytest.fixture
 def without_plugins() -> Iterator[None]:
     """Forget the plug-ins that a test has loaded."""
-    defined, readers = list(Settings.defined), list(Reader.defined)
+    defined, readers = list(Settings.subclasses), list(Reader.subclasses)
     yield
-    is_clean = not plugins._loaded and (Settings.defined, Reader.defined) == (defined, readers)
-    Settings.defined[:], Reader.defined[:] = defined, readers
+    is_clean = not plugins._loaded and (Settings.subclasses, Reader.subclasses) == (defined, readers)
+    Settings.subclasses[:], Reader.subclasses[:] = defined, readers
     plugins._loaded.clear()
     for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
         del sys.modules[name]

@@ -113,13 +113,13 @@ class Check:
 class Checks:
     """A list of checks; `add` is the decorator that adds a function to it."""
 
-    listed: list[Check] = field(default_factory=list)
+    checks: list[Check] = field(default_factory=list)
 
     def add(self, *kernels: str) -> Callable[[Run], Run]:
         """Add a function as a check of these kernels; the check's name is the function's, with spaces."""
 
         def register(run: Run) -> Run:
-            self.listed.append(Check(getattr(run, "__name__", "check").replace("_", " "), kernels, run))
+            self.checks.append(Check(getattr(run, "__name__", "check").replace("_", " "), kernels, run))
             return run
 
         return register

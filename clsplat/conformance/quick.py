@@ -46,7 +46,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     info, schedule = device.info, device.schedule
     bitonic = resolve_sort(device, sort) != "radix"
     sorts = SORTS if bitonic else SORTS[:1]
-    if all(_record(info, schedule, name).exists() for name in sorts):
+    if all(_record_file(info, schedule, name).exists() for name in sorts):
         return
     from clsplat.conformance.checks import BITONIC, ESSENTIAL  # slow to import, and not needed for a verified device
 
@@ -66,18 +66,18 @@ def remember(info: DeviceInfo, schedule: Resolved, sorts: Sequence[str] = SORTS)
     """Record that a device computes correctly; if the cache cannot be written, the next run checks it again."""
     with suppress(OutputError):
         for sort in sorts:
-            write_text(_record(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
+            write_text(_record_file(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
 
 
 def forget(info: DeviceInfo, schedule: Resolved) -> None:
     """Remove the records of a device that computes wrongly: the next run checks it again."""
     for sort in SORTS:
         with suppress(OSError):
-            _record(info, schedule, sort).unlink(missing_ok=True)
+            _record_file(info, schedule, sort).unlink(missing_ok=True)
 
 
-def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
-    """Return a file whose name depends on all that affects the result: checks, driver, kernels, build options."""
+def _record_file(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
+    """Return the file of a result, named by all that affects it: checks, device, driver, kernels, build options."""
     checks = (__version__, _hash_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_macros(info, schedule).items()), _hash_kernels())

@@ -67,7 +67,7 @@ class _Curves:
     """Marks a field that accepts any curve, recognized by its keys."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        kinds = [kind for kind in Settings.defined if issubclass(kind, Curve) and not inspect.isabstract(kind)]
+        kinds = [kind for kind in Settings.subclasses if issubclass(kind, Curve) and not inspect.isabstract(kind)]
         return core_schema.union_schema([handler.generate_schema(kind) for kind in kinds])
 
 

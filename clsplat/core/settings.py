@@ -37,7 +37,7 @@ class Settings(BaseModel):
     """Base of all settings in pipeline files: unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
-    defined: ClassVar[list[type["Settings"]]] = []  # all subclasses in order of definition
+    subclasses: ClassVar[list[type["Settings"]]] = []  # all subclasses in order of definition
     output_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume: the model does not depend on them
     training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the bits then change too
     step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
@@ -52,7 +52,7 @@ class Settings(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        Settings.defined.append(cls)
+        Settings.subclasses.append(cls)
 
     def conflict_names(self) -> set[str]:
         """Return the names by which `conflicts` of other settings may refer to this one."""
@@ -137,13 +137,13 @@ def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:
     """Return the variants of `base` by name.  Raises ConfigError when two have the same name."""
-    return dict(_variants_by_name(base, tuple(Settings.defined)))
+    return dict(_variants_by_name(base, tuple(Settings.subclasses)))
 
 
 @functools.lru_cache(maxsize=256)
-def _variants_by_name(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
+def _variants_by_name(base: type[Base], subclasses: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
     named: dict[str, type[Base]] = {}
-    for kind in defined:
+    for kind in subclasses:
         if not issubclass(kind, base) or (tag := variant_tag(kind)) is None:
             continue
         if tag[1] in named:
@@ -261,7 +261,7 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild_models() -> None:
     """Rebuild all models, so that their fields accept variants defined later, such as those of a plug-in."""
-    complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built on first use
+    complete = [kind for kind in Settings.subclasses if kind.__pydantic_complete__]  # others are built on first use
     for kind in complete:  # schemas contain those of nested variants
         if "__pydantic_core_schema__" in vars(kind):
             del kind.__pydantic_core_schema__

@@ -156,7 +156,7 @@ class Stream:
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream; never raises either."""
+        """Flush the stream; like `write`, never raises."""
         self._call("flush")
 
     def _call(self, action: str, *arguments: str) -> None:

@@ -46,9 +46,9 @@ def weights(
 def heaviest(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
     """Return the mask, [N], of the smallest set of Gaussians with this fraction of the weight; none have weight 0."""
     order = np.argsort(-weight, kind="stable")
-    before = np.cumsum(weight[order]) - weight[order]
+    heavier = np.cumsum(weight[order]) - weight[order]  # the sum of the weights before each
     chosen = np.zeros(len(weight), bool)
-    chosen[order] = (before < fraction * weight.sum()) & (weight[order] > 0)
+    chosen[order] = (heavier < fraction * weight.sum()) & (weight[order] > 0)
     return chosen
 
 

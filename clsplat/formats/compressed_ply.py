@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError
 from clsplat.core.reading import open_file
 from clsplat.formats.packing import from_smallest_three
-from clsplat.formats.ply import MAX_HEADER, PlyHeader, parse_ply_header, render_mode, rendering_of
+from clsplat.formats.ply import MAX_HEADER, PlyHeader, parse_ply_header, read_rendering_comment, render_mode
 from clsplat.formats.splats import (
     MAX_DEGREE,
     SH_C0,
@@ -66,7 +66,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
         "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": _harmonics(path, tables.get("sh"), len(vertices)),
     }
-    return SplatFile(parameters, rendering_of(path, header), render_mode(header))
+    return SplatFile(parameters, read_rendering_comment(path, header), render_mode(header))
 
 
 def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:

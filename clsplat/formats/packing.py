@@ -67,7 +67,7 @@ def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def warn_clipped(path: Path, name: str, ranges: str, is_clipped: NDArray[np.bool_]) -> None:
-    """Warn how many Gaussians, rows of `beyond`, have values outside of a format's range."""
+    """Warn how many Gaussians have values outside of a format's range.  is_clipped: [N, K], one row per Gaussian."""
     if count := int(is_clipped.any(axis=1).sum()):
         LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
@@ -154,7 +154,7 @@ class Output:
 
     @property
     def sha256(self) -> str:
-        """The SHA-256 of what was written so far, as `sha256sum` prints it."""
+        """The SHA-256 of the bytes written so far, as `sha256sum` prints it."""
         return self._sum.hexdigest()
 
 
@@ -167,6 +167,6 @@ def write_bytes(path: Path, data: bytes) -> str:
 
 @contextmanager
 def open_hashed(path: Path) -> Iterator[Output]:
-    """Open a file as `open_atomic` does.  Raises OutputError."""
+    """Open a file for atomic writing, like `open_atomic`, and hash what is written.  Raises OutputError."""
     with open_atomic(path) as file:
         yield Output(file)

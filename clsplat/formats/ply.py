@@ -72,7 +72,7 @@ class Section:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The vertices of a PLY file."""
+    """The parsed header of a PLY file, with the layout of its vertices."""
 
     format: str  # one of ORDERS
     comments: tuple[str, ...]
@@ -231,7 +231,7 @@ def read_ply(path: Path) -> SplatFile:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         degree = _degree(path, header.dtype.names or ())
         warn_dropped(path, degree)
-        rendering, size = rendering_of(path, header), header.count * header.dtype.itemsize
+        rendering, size = read_rendering_comment(path, header), header.count * header.dtype.itemsize
         if header.format == "ascii":
             file.seek(0)
             parameters = _parameters(path, read_ascii(path, file.read(), header))
@@ -292,8 +292,8 @@ def render_mode(header: PlyHeader) -> str:
     return "mip" if any(MIP.match(text) for text in header.comments) else "default"
 
 
-def rendering_of(path: Path, header: PlyHeader) -> dict[str, Any]:
-    """Return the values of our JSON comment, or {}.  Raises DataError for an invalid number."""
+def read_rendering_comment(path: Path, header: PlyHeader) -> dict[str, Any]:
+    """Return the values of clsplat's JSON comment, or {}.  Raises DataError for an invalid number."""
     text = next((text.removeprefix(RENDERING) for text in header.comments if text.startswith(RENDERING)), "")
     try:
         values = json.loads(text or "{}")

@@ -216,10 +216,11 @@ def flip_axes_in_place(parameters: Parameters, axes: Sequence[float] = FLIP) -> 
 
 
 def _signs(parameters: Parameters, axes: Sequence[float]) -> Parameters:
+    """Return the factors, 1 or -1, of the columns of each table that changes when axes flip."""
     by_axis = dict(zip("xyz", axes, strict=True))
-    (x, y, z), odd = axes, [math.prod(by_axis[axis] for axis in names) for names in PARITY]
-    rest = np.repeat(odd, 3)[: parameters["sh_rest"].shape[1]]
-    signs = {"means": axes, "quats": (1, y * z, x * z, x * y), "sh_rest": rest}
+    (x, y, z), parities = axes, [math.prod(by_axis[axis] for axis in names) for names in PARITY]
+    sh_signs = np.repeat(parities, 3)[: parameters["sh_rest"].shape[1]]
+    signs = {"means": axes, "quats": (1, y * z, x * z, x * y), "sh_rest": sh_signs}
     return {name: np.array(values, np.float32) for name, values in signs.items()}
 
 
@@ -266,20 +267,20 @@ def usual_near(means: NDArray[np.floating]) -> float:
     return NEAR_FRACTION * typical_size(means)
 
 
-def too_large(parameters: Parameters) -> NDArray[np.bool_]:
+def exceeds_limit(parameters: Parameters) -> NDArray[np.bool_]:
     """Return which Gaussians have finite log scales, SH coefficients, or motions beyond MAX_VALUE, [N]."""
-    return np.asarray(np.any([_exceeds_limit(parameters[name]) for name in LIMITED if name in parameters], axis=0))
+    return np.asarray(np.any([_row_exceeds_limit(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
 def too_large_message(parameters: Parameters) -> str:
     """Return how many Gaussians have values that are too large, and in which tables; '' if none."""
-    if not (count := int(too_large(parameters).sum())):
+    if not (count := int(exceeds_limit(parameters).sum())):
         return ""
-    names = ", ".join(name for name in LIMITED if name in parameters and _exceeds_limit(parameters[name]).any())
+    names = ", ".join(name for name in LIMITED if name in parameters and _row_exceeds_limit(parameters[name]).any())
     return f"{count:,} of {len(parameters['means']):,} Gaussians have {names} beyond {MAX_VALUE:g}"
 
 
-def _exceeds_limit(table: Floats) -> NDArray[np.bool_]:
+def _row_exceeds_limit(table: Floats) -> NDArray[np.bool_]:
     """Return which rows have finite values beyond MAX_VALUE, [N]."""
     size = np.abs(table)
     return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
@@ -326,7 +327,7 @@ def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFi
             LOG.warning("%s: %s; they are dropped", path, message)
         if is_invalid.any():
             LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(is_invalid.sum()):,}")
-        is_invalid |= too_large(splats.parameters)
+        is_invalid |= exceeds_limit(splats.parameters)
         return splats.rows(~is_invalid) if is_invalid.any() else splats
     if options.not_finite == "keep" or not is_invalid.any():
         return splats

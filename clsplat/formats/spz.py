@@ -426,16 +426,16 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     if len(data) < HEADER4:
         raise DataError(f"{path}: has {len(data)} bytes; expected a header of {HEADER4}; copy or export it again")
     streams, table = struct.unpack_from("<BI", data, HEADER - 1)
-    present = [size for size in header.sizes if size]
-    if streams != len(present) or not HEADER4 <= table <= len(data) - 16 * streams:
+    sizes = [size for size in header.sizes if size]
+    if streams != len(sizes) or not HEADER4 <= table <= len(data) - 16 * streams:
         raise DataError(
-            f"{path}: has {streams} streams and their table at byte {table}; expected {len(present)} streams within "
+            f"{path}: has {streams} streams and their table at byte {table}; expected {len(sizes)} streams within "
             f"{len(data)} bytes; copy or export it again"
         )
     _check_size(path, header, _max_decoded(data))
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
     start, frames = table + 16 * streams, []
-    for number, size in enumerate(present):
+    for number, size in enumerate(sizes):
         stored, declared = struct.unpack_from("<2Q", data, table + 16 * number)
         if declared != size or stored > len(data) - start:
             raise DataError(

@@ -44,12 +44,12 @@ def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Cal
         gaussians.set("logit_opacity", logits)
 
 
-def find_largest_allowed(allowed: Callable[[int], bool], count: int) -> int:
+def find_largest_allowed(is_allowed: Callable[[int], bool], count: int) -> int:
     """Find the largest allowed number from 0 to `count` by bisection, up to `count` / RESOLUTION."""
     low, high, step = 0, count + 1, max(1, count // RESOLUTION)
     while high - low > step:
         middle = (low + high) // 2
-        low, high = (middle, high) if allowed(middle) else (low, middle)
+        low, high = (middle, high) if is_allowed(middle) else (low, middle)
     return low
 
 
@@ -75,11 +75,11 @@ class PruneRedundant(Rule):
         views = survey.sample_views(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 
-        def allowed(number: int) -> bool:
+        def is_allowed(number: int) -> bool:
             return evaluate_without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
 
         chosen = np.zeros(len(order), bool)
-        chosen[order[: find_largest_allowed(allowed, len(order))]] = True
+        chosen[order[: find_largest_allowed(is_allowed, len(order))]] = True
         edit.choose(chosen, copies=0, kept=0)
 
 

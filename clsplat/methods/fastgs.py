@@ -47,7 +47,7 @@ class ByWrongPixels(Rule):
     error_above: Share = 0.1
     """Error above which a pixel is wrong: mean over channels, scaled to [0, 1] in each view."""
 
-    def wrong(self, edit: Edit) -> WrongPixels:
+    def count_wrong_pixels(self, edit: Edit) -> WrongPixels:
         """Return the counts for the Gaussians before the edit."""
         return edit.survey.cached(count_wrong_pixels, self.views, self.error_above)
 
@@ -62,7 +62,7 @@ class RevertGrowth(ByWrongPixels):
     """Mean number of wrong pixels per view, rounded down, above which a Gaussian may grow."""
 
     def mark(self, edit: Edit) -> None:
-        edit.undo_growth(self.wrong(edit).pixels <= edit.at(self.pixels_above))
+        edit.undo_growth(self.count_wrong_pixels(edit).pixels <= edit.at(self.pixels_above))
 
 
 class PruneSampled(SampledPruning, ByWrongPixels):
@@ -75,7 +75,7 @@ class PruneSampled(SampledPruning, ByWrongPixels):
 
     def weights(self, edit: Edit) -> Floats:
         with np.errstate(divide="ignore"):
-            return np.asarray(1 / (1 - self.wrong(edit).score))
+            return np.asarray(1 / (1 - self.count_wrong_pixels(edit).score))
 
 
 class PruneInaccurate(ByWrongPixels):
@@ -89,4 +89,4 @@ class PruneInaccurate(ByWrongPixels):
     """Score above which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:
-        edit.choose(self.wrong(edit).score > self.score_above, copies=0, kept=0)
+        edit.choose(self.count_wrong_pixels(edit).score > self.score_above, copies=0, kept=0)

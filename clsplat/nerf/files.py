@@ -95,7 +95,7 @@ class FieldModel:
         return sha256(path)
 
     def __repr__(self) -> str:
-        return f"FieldModel({self.shape.learned:,} parameters)"
+        return f"FieldModel({self.shape.parameter_count:,} parameters)"
 
 
 def is_field(path: Path) -> bool:

@@ -71,7 +71,7 @@ class GridShape(Settings):
         return np.array(rows, np.uint32)
 
     @property
-    def learned(self) -> int:
+    def parameter_count(self) -> int:
         """Number of trained features in all levels."""
         return FEATURES * int(self.table[:, 2].sum())
 
@@ -220,18 +220,18 @@ class FieldShape(Settings):
     @property
     def parameters(self) -> int:
         """Length of the table of parameters, rounded up to whole lines."""
-        return self.network_parameters + (-(-self.grid.learned // LINE) * LINE if self.grid else 0)
+        return self.network_parameters + (-(-self.grid.parameter_count // LINE) * LINE if self.grid else 0)
 
     @property
-    def learned(self) -> int:
+    def parameter_count(self) -> int:
         """Number of trained parameters, without padding."""
-        of_grid = self.grid.learned if self.grid else 0
-        return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers) + of_grid
+        grid_count = self.grid.parameter_count if self.grid else 0
+        return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers) + grid_count
 
     def initial_parameters(self, seed: int) -> NDArray[np.float32]:
         """Return initial parameters, [parameters]: weights uniform within sqrt(6 / (inputs + outputs)) (Glorot and
         Bengio 2010) and biases of 0, as in the released code; a grid's entries are close to 0."""
-        random, values = np.random.default_rng([seed, self.learned]), np.zeros(self.parameters, np.float32)
+        random, values = np.random.default_rng([seed, self.parameter_count]), np.zeros(self.parameters, np.float32)
         for layer in self.layers:
             limit = np.sqrt(6 / (len(layer.inputs) + layer.outputs))
             weights = np.zeros((layer.rows, layer.columns), np.float32)
@@ -239,7 +239,7 @@ class FieldShape(Settings):
             weights[np.ix_(layer.inputs, range(layer.outputs))] = sample
             values[layer.first : layer.first_bias] = weights.ravel()
         if self.grid:
-            entries = values[self.network_parameters : self.network_parameters + self.grid.learned]
+            entries = values[self.network_parameters : self.network_parameters + self.grid.parameter_count]
             entries[:] = random.uniform(-MAX_INITIAL, MAX_INITIAL, len(entries))
         return values
 

@@ -100,7 +100,7 @@ class LearnedField(TrainedField):
     @property
     def parameters(self) -> int:
         """The number of trained parameters."""
-        return self.field.shape.learned
+        return self.field.shape.parameter_count
 
     def shape_as_data(self) -> dict[str, Any]:
         """Return its shape as data for JSON."""

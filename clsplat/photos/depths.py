@@ -128,8 +128,8 @@ class PointDepths:
         self, device: Device, tracks: Tracks, names: Sequence[str], extent: float, maps: DepthMaps | None = None
     ) -> None:
         self.device, self.tracks, self.names, self.extent, self.maps = device, tracks, names, extent, maps
-        self._rows = [tracks.seen.get(name, np.empty(0, np.int64)) for name in names]
-        counts = np.bincount(np.concatenate([*tracks.seen.values(), np.empty(0, np.int64)]))
+        self._rows = [tracks.rows.get(name, np.empty(0, np.int64)) for name in names]
+        counts = np.bincount(np.concatenate([*tracks.rows.values(), np.empty(0, np.int64)]))
         self._counts = np.pad(counts, (0, len(tracks.positions) - len(counts)))
         self._cache: dict[tuple[int, int, int], KnownDepths | None] = {}
 

@@ -115,7 +115,7 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Expo
 
 def sample_points(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
     """Return the rows of the points that a photograph shows, [S], and their colors there, [S, 3] in [0, 1]."""
-    rows = tracks.seen.get(view.name, np.empty(0, np.int64))
+    rows = tracks.rows.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
     rotated = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # independent of threads
     x, y, z = rotated + view.world_to_camera[:, 3:]

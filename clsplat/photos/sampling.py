@@ -51,7 +51,7 @@ class Order(Settings):
     """Which view a step trains on."""
 
     @abstractmethod
-    def at(self, pool: ViewPool, step: int) -> View:
+    def view_at(self, pool: ViewPool, step: int) -> View:
         """Return the view of a step, counted from 1; it must depend only on the pool, its seed and the step."""
 
 
@@ -60,7 +60,7 @@ class Uniform(Order):
 
     type: Literal["uniform"] = "uniform"
 
-    def at(self, pool: ViewPool, step: int) -> View:
+    def view_at(self, pool: ViewPool, step: int) -> View:
         return pool.shuffled(range(len(pool.views)), step)
 
 
@@ -70,7 +70,7 @@ class ShuffleOrder(Order):
 
     type: Literal["shuffle"] = "shuffle"
 
-    def at(self, pool: ViewPool, step: int) -> View:
+    def view_at(self, pool: ViewPool, step: int) -> View:
         return pool.shuffled([*range(len(pool.views)), *pool.finest], step)
 
 
@@ -80,7 +80,7 @@ class StackOrder(Order):
 
     type: Literal["stack"] = "stack"
 
-    def at(self, pool: ViewPool, step: int) -> View:
+    def view_at(self, pool: ViewPool, step: int) -> View:
         rng = pool.random(step)
         if rng.random() < FINEST_FRACTION:
             return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
@@ -153,6 +153,6 @@ class Sampler:
 
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
-        view, divisor = self.settings.order.at(self._pool, step), self.settings.divisor(step)
+        view, divisor = self.settings.order.view_at(self._pool, step), self.settings.divisor(step)
         small = view.resized(view.downscale * divisor)
         return Sample(small, view, self._numbers[id(view)], self.settings.transforms, step)

@@ -134,8 +134,8 @@ def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Ma
 
 def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:
     """Return the positions of the dataset's points in a photograph, [K, 2] px; with tracks, only visible points."""
-    if scene.tracks is not None and view.name in scene.tracks.seen:
-        positions = scene.tracks.positions[scene.tracks.seen[view.name]]
+    if scene.tracks is not None and view.name in scene.tracks.rows:
+        positions = scene.tracks.positions[scene.tracks.rows[view.name]]
     else:
         positions = scene.points.positions if scene.points is not None else np.zeros((0, 3))
     camera, pose = view.camera, view.world_to_camera.astype(np.float64)

@@ -86,7 +86,7 @@ def _cached_sha256(file: Path, inode: int, size: int, time: int) -> str:
 
 
 def _map_paths(pipeline: Pipeline, change: Change, scene: str | None) -> Pipeline:
-    """Return the pipeline with changed paths of the files that it reads, and with another folder of its scene."""
+    """Return the pipeline with its input paths mapped by `change`, and with `scene` as its scene folder."""
     settings = pipeline.settings
     without_scene = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
     changed = _map_value(without_scene, settings.scene.path, change)

@@ -193,9 +193,9 @@ class _Node:
 
 
 def _to_plain(default: BaseModel) -> dict[str, Any]:
-    """Return a default as in a file: its tag, and the keys whose values are not their defaults."""
-    written = default.model_dump(mode="json", exclude_defaults=True)
-    return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
+    """Return a model as a pipeline file holds it: its tag, and the keys whose values differ from their defaults."""
+    changed = default.model_dump(mode="json", exclude_defaults=True)
+    return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **changed}
 
 
 def _address(key_path: KeyPath) -> str:

@@ -178,7 +178,7 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
 
 def _class_lists() -> tuple[list[type], list[type]]:
     """Return the lists of all settings and all readers, which importing `clsplat.pipeline.file` has filled."""
-    return Settings.defined, Reader.defined
+    return Settings.subclasses, Reader.subclasses
 
 
 def _is_within(module: str, package: str) -> bool:

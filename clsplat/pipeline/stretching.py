@@ -54,14 +54,14 @@ class Axis:
         return int(bounded) if bounded.denominator == 1 else float(bounded)
 
     def scale_start(self, start: int, every: float) -> int:
-        """Return a stretched `start`: between the last action that it excludes and the first that it allows."""
+        """Return the stretched `start`, which excludes and allows the same actions as before."""
         number = count_fired(every, start)
         return max(
             0, min(max(self.scale(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
         )
 
     def scale_stop(self, stop: int, every: float) -> int:
-        """Return a stretched `stop`: after the last action that it allows."""
+        """Return the stretched `stop`, which allows the same actions as before."""
         number = count_fired(every, stop - 1)
         return min(
             max(self._action_step(every, number) + 1, min(self.scale(stop), self._action_step(every, number + 1))),
@@ -69,7 +69,7 @@ class Axis:
         )
 
     def scale_until(self, until: int, every: float) -> int:
-        """Return a stretched `until`: after the actions before it, and not after the next one."""
+        """Return the stretched `until`, with the same number of actions before it."""
         number = count_fired(every, until - 1)
         return max(
             1, min(max(self._action_step(every, number) + 1, self.scale(until)), self._action_step(every, number + 1))

@@ -31,11 +31,11 @@ Floats = NDArray[np.float64]
 
 
 def no_depth_reason(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
-    """Return why depth cannot be estimated from all or the named photographs, in words; "" if it may be possible.
+    """Return, in words, why depth cannot be estimated from the photographs `names` or all; "" if it may be possible.
 
     It tests all good pairs, since the best pair of each photograph may come from one of several viewpoints.  It does
-    not test a model, since COLMAP invents one for a rotating camera, whose points have angles of a few degrees.  If the
-    pairs cover less than half of the photographs, it returns "", since further attempts may find more pairs.
+    not test a reconstruction: even for a purely rotating camera, COLMAP may return one with parallax of a few degrees.
+    If the pairs cover less than half of the photographs, it returns "", since further attempts may find more pairs.
     """
     with open_database(pycolmap, database) as rows:
         all_names = {image.image_id: image.name for image in rows.read_all_images()}

@@ -28,7 +28,7 @@ CAMERA = np.dtype(
 
 @dataclass(frozen=True)
 class DeviceCamera:
-    """A view's camera on the device, with the size of its planes, in whole tiles."""
+    """A view's camera on the device, and the size of its planes, rounded up to whole tiles."""
 
     array: Array  # [1] camera_t
     width: int

@@ -82,7 +82,7 @@ def size_of(loaded: Loaded) -> dict[str, int | None]:
     """Return the number of Gaussians or of network parameters, with the keys of metrics.json."""
     if isinstance(loaded, Model):
         return {"gaussians": len(loaded)}
-    return {"gaussians": None, "parameters": loaded.shape.learned}
+    return {"gaussians": None, "parameters": loaded.shape.parameter_count}
 
 
 # The model and the photos of a command, given as a file, a dataset folder, or a run folder.

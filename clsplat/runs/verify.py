@@ -245,7 +245,7 @@ def check(pipeline: str) -> dict[str, Any]:
     Raises ConfigError, and DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):
-        return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.learned}
+        return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.parameter_count}
     state = RunState.read(Path(pipeline))
     if not state.phase and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))

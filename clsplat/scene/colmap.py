@@ -332,9 +332,9 @@ class ColmapReader(Reader):
         views = [make_view(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
         views = sorted((views[i] for i in files.existing(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
-        original = [view for view in views if view.image_path not in files.reduced]
+        original = [view for view in views if view.image_path not in files.downscaled_files]
         points, tracks = (table.cloud(), make_tracks(images, table, original)) if table else (None, None)
-        views = [fit_to_photograph(view) if view.image_path in files.reduced else view for view in views]
+        views = [fit_to_photograph(view) if view.image_path in files.downscaled_files else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         tracks = tracks and tracks.shifted(scene.origin).on_faces(scene.views)
         return replace(scene, tracks=tracks, skipped=files.skipped)
@@ -351,7 +351,7 @@ class ColmapReader(Reader):
         parts.expect(files)
         for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
             if view := parts.attempt(make_view, image, cameras, file, mask):
-                parts.views.append(fit_to_photograph(view) if file in files.reduced else view)
+                parts.views.append(fit_to_photograph(view) if file in files.downscaled_files else view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = len(image.points)
 

@@ -62,9 +62,9 @@ def _image(number: int, view: View, camera: int, points2d: NDArray[Any]) -> byte
 
 def _points2d(points: PointCloud | None, view: View, tracks: Tracks | None) -> NDArray[Any]:
     """Return the 2D points of a view: the points of its track that are in front of the camera."""
-    if points is None or tracks is None or view.name not in tracks.seen:
+    if points is None or tracks is None or view.name not in tracks.rows:
         return np.zeros(0, POINT2D)
-    rows, residuals = tracks.seen[view.name], tracks.residuals.get(view.name, NO_RESIDUAL) / view.downscale
+    rows, residuals = tracks.rows[view.name], tracks.residuals.get(view.name, NO_RESIDUAL) / view.downscale
     pixels = project_points(view, points.positions[rows]) + np.nan_to_num(residuals)
     is_finite = np.isfinite(pixels).all(axis=1)
     table = np.zeros(np.count_nonzero(is_finite), POINT2D)

@@ -239,7 +239,7 @@ def _transparent_gray(data: bytes) -> int | None:
 
 
 def _without_rotation(data: bytes) -> bytes:
-    """Return a TIFF without its orientation, by which OpenCV always rotates; other files unchanged."""
+    """Return a TIFF without its orientation tag, which OpenCV always applies; other files unchanged."""
     offset = find_orientation(data) if data[:4] in (b"II*\0", b"MM\0*") else None
     return data if offset is None else data[:offset] + (b"\1\0" if data[:1] == b"I" else b"\0\1") + data[offset + 2 :]
 

@@ -92,26 +92,26 @@ class FileLookup:
         excluded: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.listed, self.names = list(names), list(names)  # the names in the dataset, and those of views
+        self.listing, self.names = list(names), list(names)  # the names in the dataset, and those of the views
         self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
-        self.matched: dict[int, int] = {}  # the length of the common end of each inexact match
-        self.reduced: set[Path] = set()  # photographs from a folder such as images_4
+        self.matches: dict[int, int] = {}  # the length of the common end of each inexact match
+        self.downscaled_files: set[Path] = set()  # photographs from a folder such as images_4
         self.choices: dict[int, list[Path]] = {}  # several files that fit a name equally well
         unmatched = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
         self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
-        self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matched)
-        if self.matched:
+        self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matches)
+        if self.matches:
             logger.info("%s: %s", root, self.note)
 
     def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
         """Use the file that exactly matches a name, and return whether it exists."""
-        for name in filter(_is_safe, dict.fromkeys((self.listed[i], PureWindowsPath(self.listed[i]).as_posix()))):
+        for name in filter(_is_safe, dict.fromkeys((self.listing[i], PureWindowsPath(self.listing[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
                 self.paths[i] = path
                 if os.path.exists(path):
                     self.names[i] = name
-                    if name != self.listed[i]:
-                        self.matched[i] = name.count("/") + 1
+                    if name != self.listing[i]:
+                        self.matches[i] = name.count("/") + 1
                     return True
         return False
 
@@ -139,7 +139,7 @@ class FileLookup:
         return files
 
     def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
-        targets = list(map(self._target, self.listed)) if unmatched else []
+        targets = list(map(self._target, self.listing)) if unmatched else []
         by_key = defaultdict[str, set[Parts]](set)
         for target in targets:
             for key in _keys(target):
@@ -149,7 +149,7 @@ class FileLookup:
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
             siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
             for parts, path in siblings or files:
-                if rank := self._rank(self.listed[i], targets[i], parts, path):
+                if rank := self._rank(self.listing[i], targets[i], parts, path):
                     ranked[rank].append((parts, path))
             best = ranked[max(ranked)] if ranked else []
             if len(best) > 1:
@@ -159,12 +159,12 @@ class FileLookup:
                 rivals = by_key[_stem(path.name)] - {targets[i]}
                 if all(_common_end(rival, parts) < length for rival in rivals):
                     base = self.folder if path.is_relative_to(self.folder) else self.root
-                    self.names[i], self.paths[i], self.matched[i] = path.relative_to(base).as_posix(), path, length
-                    self.reduced |= {path} if _divisor(parts[:-length]) > 1 else set()
+                    self.names[i], self.paths[i], self.matches[i] = path.relative_to(base).as_posix(), path, length
+                    self.downscaled_files |= {path} if _divisor(parts[:-length]) > 1 else set()
 
-    def _rank(self, listed: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
+    def _rank(self, dataset_name: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return how well a file fits a name, or None if it does not."""
-        length, name = _common_end(target, parts), PureWindowsPath(listed)
+        length, name = _common_end(target, parts), PureWindowsPath(dataset_name)
         above = {*parts[:-length]}
         is_other = any(map(OTHER_CONTENT.search, above)) or (SPLITS & above and SPLITS.intersection(target))
         if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
@@ -175,12 +175,12 @@ class FileLookup:
     @property
     def note(self) -> str:
         """The number of inexact matches and their criterion, in one sentence; "" if all names are exact."""
-        for i, length in self.matched.items():
-            count = f"{len(self.matched)} of {pluralize(len(self.listed), 'image' if self.strict else 'photograph')}"
+        for i, length in self.matches.items():
+            count = f"{len(self.matches)} of {pluralize(len(self.listing), 'image' if self.strict else 'photograph')}"
             criterion = "base name" if length == 1 else "the end of their paths"
-            scaling = ", with cameras scaled to these smaller photographs" if self.reduced else ""
+            scaling = ", with cameras scaled to these smaller photographs" if self.downscaled_files else ""
             file = self.paths[i].relative_to(self.root).as_posix()
-            return f"{count} matched by {criterion}, such as {file} for {quote(self.listed[i])}{scaling}"
+            return f"{count} matched by {criterion}, such as {file} for {quote(self.listing[i])}{scaling}"
         return ""
 
     def existing(self, where: Path, missing: Missing) -> list[int]:
@@ -192,7 +192,7 @@ class FileLookup:
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
         if absent := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
             fault = f"{where}: {_missing_text([str(self.paths[i]) for i in absent], len(self.paths))}"
-            for name in [self.listed[i] for i in absent if not _is_safe(self.listed[i])][:1]:
+            for name in [self.listing[i] for i in absent if not _is_safe(self.listing[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
                 skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
@@ -208,7 +208,7 @@ class FileLookup:
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
         for i, choices in self.choices.items():
             fit = [relative[path].as_posix() for path in choices]
-            return f" ({first_few(fit)} fit {quote(self.listed[i])} equally well)"
+            return f" ({first_few(fit)} fit {quote(self.listing[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
         matched = {*self.paths}

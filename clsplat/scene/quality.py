@@ -61,7 +61,7 @@ def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
     """Return the depths of the points that a view observes, scene units."""
     if scene.tracks is None:
         return points_in_image(view, scene.points)
-    points = scene.tracks.positions[scene.tracks.seen.get(view.name, [])]
+    points = scene.tracks.positions[scene.tracks.rows.get(view.name, [])]
     depths = points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
     return np.asarray(depths[depths > 0])
 
@@ -163,11 +163,11 @@ def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
 
     Raises DataError.
     """
-    shows, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    masks = [mask for mask in (None if shows is None else shows == 0, unmasked) if mask is not None]
+    transparency, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    masks = [mask for mask in (None if transparency is None else transparency == 0, unmasked) if mask is not None]
     return np.logical_and.reduce(masks) if masks else None
 
 
 def _is_transparent(view: View) -> bool:
-    shows, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    return shows is not None and bool((shows if unmasked is None else shows[unmasked]).any())
+    transparency, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    return transparency is not None and bool((transparency if unmasked is None else transparency[unmasked]).any())

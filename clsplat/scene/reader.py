@@ -73,12 +73,12 @@ class Reader(ABC):
     root: Path | None = None  # of the scene, where files are looked for; None: the folder of the dataset
     folder: Path = Path()  # of the dataset, in `root`
     choice: str = ""  # among several datasets
-    defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
+    subclasses: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         name = (cls.__module__, cls.__qualname__)
-        Reader.defined[:] = [kind for kind in Reader.defined if (kind.__module__, kind.__qualname__) != name] + [cls]
+        cls.subclasses[:] = [kind for kind in cls.subclasses if (kind.__module__, kind.__qualname__) != name] + [cls]
 
     def __init__(self) -> None:
         missing = [field for field in ("name", "expects") if not hasattr(self, field)]
@@ -117,5 +117,5 @@ class Reader(ABC):
 
 def reader_classes() -> list[type[Reader]]:
     """Return the classes that have no subclasses and are not abstract, in the order of their definition."""
-    bases = {base for kind in Reader.defined for base in kind.__mro__[1:]}
-    return [kind for kind in Reader.defined if kind not in bases and not inspect.isabstract(kind)]
+    bases = {base for kind in Reader.subclasses for base in kind.__mro__[1:]}
+    return [kind for kind in Reader.subclasses if kind not in bases and not inspect.isabstract(kind)]

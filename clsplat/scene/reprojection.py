@@ -39,7 +39,7 @@ def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
     if tracks is not None:
         for old, new in zip(scene.views, views, strict=True):
             if old.name in tracks.residuals:
-                positions = tracks.positions[tracks.seen[old.name]]
+                positions = tracks.positions[tracks.rows[old.name]]
                 displacement = project_points(old, positions) - project_points(new, positions)
                 residuals[old.name] = tracks.residuals[old.name] + displacement
         tracks = replace(tracks, residuals={**tracks.residuals, **residuals})
@@ -55,8 +55,8 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
         distances = np.linalg.norm(tracks.residuals.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
         is_known = np.isfinite(distances)
         if is_known.any():
-            np.add.at(sums, tracks.seen[view.name][is_known], distances[is_known])
-            np.add.at(counts, tracks.seen[view.name][is_known], 1)
+            np.add.at(sums, tracks.rows[view.name][is_known], distances[is_known])
+            np.add.at(counts, tracks.rows[view.name][is_known], 1)
     errors = sums[counts > 0] / counts[counts > 0]
     return errors if len(errors) and errors.mean() > EXACT else None
 
@@ -66,12 +66,12 @@ def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = MAX_ERRO
 
     Views without known observations, and views not in `views`, keep all points.
     """
-    rows, residuals = dict(tracks.seen), dict(tracks.residuals)
+    rows, residuals = dict(tracks.rows), dict(tracks.residuals)
     for view in sorted(views, key=lambda view: -view.downscale):  # the largest size of a photograph is last and counts
         if view.name in tracks.residuals:
             vectors = tracks.residuals[view.name]
             is_accurate = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN, unknown
-            rows[view.name], residuals[view.name] = tracks.seen[view.name][is_accurate], vectors[is_accurate]
+            rows[view.name], residuals[view.name] = tracks.rows[view.name][is_accurate], vectors[is_accurate]
     return Tracks(tracks.positions, rows, residuals)
 
 

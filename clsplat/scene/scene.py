@@ -32,7 +32,7 @@ class Tracks:
     """Points from structure from motion, and the photographs that show them."""
 
     positions: NDArray[np.floating]  # [M, 3], scene units
-    seen: Mapping[str, NDArray[np.int64]]  # by name of the view: rows of `positions`, in order of the point ids
+    rows: Mapping[str, NDArray[np.int64]]  # by name of the view: rows of `positions`, in order of the point ids
     residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     # by name of the view, [K, 2] px of the original photograph: from the projection of each point to its observation
 
@@ -42,20 +42,20 @@ class Tracks:
 
     def on_faces(self, views: Iterable["View"]) -> "Tracks":
         """Return the tracks with the points of wide photographs divided among the views of their faces."""
-        by_view = dict(self.seen)
+        by_view = dict(self.rows)
         for view in views:
-            if view.lens is not None and view.lens.face and photograph_name(view.name) in self.seen:
-                rows, camera = self.seen[photograph_name(view.name)], view.camera
+            if view.lens is not None and view.lens.face and photograph_name(view.name) in self.rows:
+                rows, camera = self.rows[photograph_name(view.name)], view.camera
                 x, y, z = view.world_to_camera @ np.vstack([self.positions[rows].T, np.ones(len(rows))])
                 with np.errstate(all="ignore"):
                     x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
                     by_view[view.name] = rows[(z > 0) & (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)]
         names = {view.name for view in views}
-        return replace(self, seen={name: rows for name, rows in by_view.items() if name in names or name in self.seen})
+        return replace(self, rows={name: rows for name, rows in by_view.items() if name in names or name in self.rows})
 
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
         """Return the tracks of the views in `names`, which maps old names to new ones."""
-        rows = {names[old]: rows for old, rows in self.seen.items() if old in names}
+        rows = {names[old]: rows for old, rows in self.rows.items() if old in names}
         return Tracks(self.positions, rows, {names[old]: rows for old, rows in self.residuals.items() if old in names})
 
 

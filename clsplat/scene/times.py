@@ -21,7 +21,7 @@ class Clock:
     def normalize_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the timestamps of points in a file as times in [0, 1], of the same shape.
 
-        Raises DataError when some are outside the range of the scene by more than single precision explains.
+        Raises DataError if some are outside the range of the scene by more than a rounding error in single precision.
         """
         span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
         slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)

@@ -49,7 +49,7 @@ class JsonFrame:
         return self._values[key] if key in self._values else self._common.get(key)
 
     def array(self, key: str) -> Floats:
-        """Return a list of numbers as an array, without checks; an empty array if it is not one."""
+        """Return a list of numbers as an unchecked array; an empty array for any other value."""
         try:
             return np.array(self.value(key), np.float64)
         except (ValueError, TypeError, OverflowError):
@@ -154,7 +154,7 @@ class FrameFiles(FileLookup):
                 size = self._first_size
         view = make_view(frame, self.names[i], size, clock)
         view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
-        return fit_to_photograph(view) if path in self.reduced else view
+        return fit_to_photograph(view) if path in self.downscaled_files else view
 
     def scene(
         self, path: Path, views: list[View], test: Set[str], points: PointCloud | None, background: Background = "black"
@@ -350,7 +350,7 @@ class NerfstudioReader(Reader):
         clock = make_clock(transforms.path, transforms.moments())
         files = FrameFiles(self.root or path, path, transforms.frames)
         views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
-        renamed = dict(zip(files.listed, files.names, strict=True))
+        renamed = dict(zip(files.listing, files.names, strict=True))
         train, test = (_read_list(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}

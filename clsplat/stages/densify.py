@@ -144,6 +144,6 @@ class Densify(Scheduled):
             sizes = [view.camera.width * view.camera.height for view in views]
             yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(run, edit)
         if self.budget and self.every and self.stop:
-            left = len(fire_steps(self.every, run.step - 1, self.stop))
-            context = BudgetContext(run.step / self.stop, left, run.image_downscale)
+            edits = len(fire_steps(self.every, run.step - 1, self.stop))
+            context = BudgetContext(run.step / self.stop, edits, run.image_downscale)
             yield self.budget.limit(edit, context, run.scalars)

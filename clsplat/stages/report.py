@@ -54,14 +54,14 @@ def advice(run: Run) -> list[str]:
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *from_training_views(metrics, has_exposures=color_model(run) is not None),
-        *from_test_views(test),
-        *from_capture(views, run.original.views),
+        *advise_on_training_views(metrics, has_exposures=color_model(run) is not None),
+        *advise_on_test_views(test),
+        *advise_on_capture(views, run.original.views),
         *sky_advice(run),
     ]
 
 
-def from_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> Iterator[str]:
+def advise_on_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> Iterator[str]:
     """Yield advice from the metrics of training views.  has_exposures: whether training learns exposures."""
     if names := find_outliers({view.view: view.psnr for view in metrics}):
         yield (
@@ -77,13 +77,13 @@ def from_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> 
         )
 
 
-def from_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
+def advise_on_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
     """Yield advice from the PSNR of test views, dB by name."""
     if names := find_outliers(psnr):
         yield f"{_join_names(names)}: much worse than the other test views; take more photos of what is visible there"
 
 
-def from_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
+def advise_on_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
     """Yield advice from the number of training views and the positions of all views."""
     number = len({view.name for view in train})
     if number < FEW_PHOTOS:
@@ -238,9 +238,9 @@ def is_overfit(run: Run) -> bool:
 
 
 def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
-    """Return a split that was not trained on, and the last PSNR of its views and of training views.
+    """Return the validation or test split, and the last PSNR of its views and of training views.
 
-    Validation views are preferred to test views; training views that were not measured count as in the log.
+    Validation views are preferred.  Training views that were not measured have the PSNR of the training log.
     """
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
     for split in ("validation", "test"):

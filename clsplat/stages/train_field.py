@@ -114,7 +114,7 @@ class TrainField(Training):
         if run.stage_step:
             raise DataError("train_field.field: the checkpoint has a field of another shape or unit; train it again")
         field = LearnedField.initial(shape, run.seed, run.photographs.background)
-        LOG.info("training a field with %s parameters", f"{self.field.learned:,}")
+        LOG.info("training a field with %s parameters", f"{self.field.parameter_count:,}")
         return field
 
     def _step(self, run: Run, field: LearnedField, pool: ViewPool) -> None:
@@ -133,7 +133,7 @@ class TrainField(Training):
     def _sample(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
         """Yield the photos of a step."""
         for number in range(self.photographs):
-            view = self.order.at(pool, (step - 1) * self.photographs + number + 1)
+            view = self.order.view_at(pool, (step - 1) * self.photographs + number + 1)
             photograph = run.photographs.get(view)
             if photograph.mask is not None:
                 raise ConfigError(f"train_field: {view.name} has a mask, which fields do not support; remove the masks")
@@ -175,4 +175,4 @@ class ExportField(Stage):
             load_field(file)
         except DataError as error:
             raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
-        LOG.info("wrote a field with %s parameters to %s", f"{field.shape.learned:,}", file)
+        LOG.info("wrote a field with %s parameters to %s", f"{field.shape.parameter_count:,}", file)

@@ -41,7 +41,7 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
-    """Return the state of a cell.  names: of the sweep, and of the cell in the sweep."""
+    """Return the state of a cell.  names: the name of the sweep, and the name of the cell in it."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
@@ -69,7 +69,10 @@ def _steps(pipeline: dict[str, Any]) -> int | None:
 
 
 def _figures(folder: CellFolder) -> dict[str, Any]:
-    """Return the PSNR and SSIM of a result at its first size, of test views if there are any, steps, and Gaussians."""
+    """Return the PSNR, SSIM, steps, and Gaussians of a result.
+
+    PSNR and SSIM are those of the first downscale factor, of test views if there are any, else of training views.
+    """
     with suppress(DataError):
         metrics = read_metrics(folder.result / METRICS)
         sizes = [*metrics.test.values(), *metrics.train.values()]

@@ -63,7 +63,7 @@ def differences(
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
     """Return the classes of a list's items by type, if the items are addressed by type."""
-    classes = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := variant_tag(kind))}
+    classes = {tag[1]: kind for kind in Settings.subclasses if kind.keyed_by_type and (tag := variant_tag(kind))}
     types = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
     return {name: classes[name] for name in types} if all(name in classes for name in types) else {}
 

@@ -77,7 +77,7 @@ def test_level_weight_is_close_to_the_papers():
 def test_levels_are_dense_while_corners_fit_and_are_contiguous():
     grid = GridShape(levels=4, coarsest=4, finest=32, entries=1024)
     assert grid.table.tolist() == [[4, 0, 125, 0], [8, 125, 729, 0], [16, 854, 1024, 1], [32, 1878, 1024, 1]]
-    assert grid.learned == FEATURES * (125 + 729 + 1024 + 1024)
+    assert grid.parameter_count == FEATURES * (125 + 729 + 1024 + 1024)
     assert GridShape(levels=1, coarsest=3, finest=3).table.tolist() == [[3, 0, 64, 0]]
 
 
@@ -85,7 +85,7 @@ def test_grid_parameters_follow_the_networks_and_start_near_zero():
     plain, gridded = (FieldShape(degrees=2, grid=one) for one in (None, GridShape(levels=2, entries=16)))
     assert gridded.position_rows == plain.position_rows + 2 * FEATURES
     first = gridded.initial_parameters(3)
-    own = first[gridded.network_parameters : gridded.network_parameters + gridded.grid.learned]
+    own = first[gridded.network_parameters : gridded.network_parameters + gridded.grid.parameter_count]
     assert 0 < np.abs(own).min() < np.abs(own).max() < 1e-4
     assert FieldShape.model_validate(gridded.model_dump()) == gridded
 

@@ -164,7 +164,7 @@ def test_preparation_result_is_synced_before_it_is_trusted(tmp_path, calls):
             (out / "deep" / "x.png").write_bytes(b"x")
             return {}
 
-    Settings.defined.remove(Write)  # not a step in other tests
+    Settings.subclasses.remove(Write)  # not a step in other tests
     root = tmp_path / "prepared"
     planned = [PlannedStep(Write(stage="write"), "", "", root / "write-1", "no result yet")]
     prepare(planned, tmp_path, root)

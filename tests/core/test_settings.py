@@ -45,7 +45,7 @@ def forget_variants(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Remove the variants that a test defines."""
     load("smoke")  # the first pipeline of a process makes all variants known that there are
     with monkeypatch.context() as patch:
-        patch.setattr(Settings, "defined", list(Settings.defined))
+        patch.setattr(Settings, "subclasses", list(Settings.subclasses))
         yield
     rebuild_models()
 

@@ -55,7 +55,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
 def test_field_run_writes_the_usual_outputs(finished):
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["gaussians"] is None
-    assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, color_width=16).learned
+    assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, color_width=16).parameter_count
     assert set(metrics["test"]) == {"1", "2", "4"}
     assert all(one["views"] == 2 for one in metrics["test"].values())
     assert json.loads((finished / "status.json").read_text())["state"] == "done"
@@ -130,7 +130,7 @@ def test_model_commands_refuse_field_runs(finished):
             require_model(path)
     with pytest.raises(DataError, match="is a field"):
         clsplat.convert(finished, finished / "a.ply")
-    assert clsplat.check(finished / "field.npz")["parameters"] == clsplat.load_field(finished).shape.learned
+    assert clsplat.check(finished / "field.npz")["parameters"] == clsplat.load_field(finished).shape.parameter_count
 
 
 def test_field_file_gives_the_metrics_and_images_of_its_run(finished, tmp_path):
@@ -280,7 +280,7 @@ def test_published_recipe_has_the_published_network_and_rates():
     assert stage.field == FieldShape()
     width, position, direction = 256, 6 * 16, 3 + 6 * 4
     trunk = (position + 1) * width + 6 * (width + 1) * width + (width + position + 1) * width
-    assert stage.field.learned == trunk + (width + 1) * (1 + width) + (width + direction + 1) * 128 + 129 * 3
+    assert stage.field.parameter_count == trunk + (width + 1) * (1 + width) + (width + direction + 1) * 128 + 129 * 3
     assert stage.rate_at(1) == pytest.approx(5e-4 * (0.01 + 0.99 * math.sin(math.pi / 5000)), rel=1e-4)
     assert stage.rate_at(1_000_000) == pytest.approx(5e-6)
 

@@ -39,10 +39,10 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
 
 def test_grid_parameters_are_trained(finished):
     field = clsplat.load_field(finished)
-    own = slice(field.shape.network_parameters, field.shape.network_parameters + field.shape.grid.learned)
+    own = slice(field.shape.network_parameters, field.shape.network_parameters + field.shape.grid.parameter_count)
     moved = np.abs(field.parameters - field.shape.initial_parameters(0))[own]
     assert 0.05 < (moved > 1e-3).mean() < 0.95  # some lie where no sample is
-    assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.learned
+    assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.parameter_count
 
 
 def test_killed_grid_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path, pipeline):

@@ -88,7 +88,7 @@ def test_missing_or_damaged_map_is_named(tmp_path):
 
 def test_depths_match_the_ground_truth(device, yard, tmp_path):
     tracks = type("T", (), {"positions": yard.points.positions, "seen": {}})
-    tracks.seen = {view.name: np.arange(len(yard.points)) for view in yard.views}
+    tracks.rows = {view.name: np.arange(len(yard.points)) for view in yard.views}
     names = [view.name for view in yard.views]
     depths = PointDepths(device, tracks, names, 1.0, DepthMaps(tmp_path / "maps"))
     for number, view in enumerate(yard.views[:3]):

@@ -41,8 +41,8 @@ def test_gains_are_recovered(rng):
 def test_exif_fills_in_for_photographs_without_tracks(rng):
     """Two of eight show too few points; cameras noted those, and two others, from another middle."""
     wall = Wall(rng)
-    seen = {name: rows[:19] if name in ("2.png", "5.png") else rows for name, rows in wall.tracks.seen.items()}
-    wall.tracks = replace(wall.tracks, seen=seen)
+    seen = {name: rows[:19] if name in ("2.png", "5.png") else rows for name, rows in wall.tracks.rows.items()}
+    wall.tracks = replace(wall.tracks, rows=seen)
     shown = wall.measured()
     assert shown.log_gains.keys() == {f"{i}.png" for i in (0, 1, 3, 4, 6, 7)}
     truth = dict(zip(seen, wall.log_gains, strict=True))
@@ -72,7 +72,7 @@ class Photograph:
 
 def test_run_starts_from_tracks_and_exif(rng, tmp_path):
     wall = Wall(rng)
-    wall.tracks = replace(wall.tracks, seen={**wall.tracks.seen, "2.png": np.arange(19)})
+    wall.tracks = replace(wall.tracks, rows={**wall.tracks.rows, "2.png": np.arange(19)})
     wall.write(tmp_path)
     light = {view.name: float(np.exp(2.2 * wall.log_gains[i].mean())) for i, view in enumerate(wall.views)}
     write_exposures(tmp_path / "images", {name: CameraExposure(one, 1.0, 1.0) for name, one in light.items()})
@@ -142,10 +142,10 @@ def test_view_dependent_light_is_not_exposure(rng):
 
 def test_undetermined_gains_are_omitted(rng):
     wall = Wall(rng)
-    seen = {**wall.tracks.seen, "3.png": np.empty(0, np.int64)}
-    wall.tracks = replace(wall.tracks, seen=seen)
+    seen = {**wall.tracks.rows, "3.png": np.empty(0, np.int64)}
+    wall.tracks = replace(wall.tracks, rows=seen)
     assert wall.measured().log_gains.keys() == {view.name for view in wall.views} - {"3.png"}
-    nothing = measure_exposures(replace(wall.tracks, seen={}), wall.views, lambda view: (wall.photograph(view), None))
+    nothing = measure_exposures(replace(wall.tracks, rows={}), wall.views, lambda view: (wall.photograph(view), None))
     assert nothing.log_gains == {}
     assert nothing.spread == 0
 
@@ -169,8 +169,8 @@ def test_tracks_are_written_and_read(rng, tmp_path):
     images, read = read_images(tmp_path), read_point_table(tmp_path)
     tracks = make_tracks(images, read)
     assert tracks.positions == pytest.approx(wall.tracks.positions)
-    assert {name: rows.tolist() for name, rows in tracks.seen.items()} == {
-        name: rows.tolist() for name, rows in wall.tracks.seen.items()
+    assert {name: rows.tolist() for name, rows in tracks.rows.items()} == {
+        name: rows.tolist() for name, rows in wall.tracks.rows.items()
     }
     assert [len(image.points) for image in images] == [60] * len(images)
     write_model(tmp_path, wall.views, points)
@@ -181,7 +181,7 @@ def test_text_tracks_follow_point_ids(tmp_path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n1 1 7 2 2 -1 3 3 5 4 4 5 9 9 77\n")
     (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 2\n")
     tracks = make_tracks(read_images(tmp_path), read_point_table(tmp_path))
-    assert tracks.seen["a.png"].tolist() == [1, 0], "by id; 77 is no point"
+    assert tracks.rows["a.png"].tolist() == [1, 0], "by id; 77 is no point"
 
 
 def test_undistorted_scenes_keep_tracks(rng, tmp_path):

@@ -28,7 +28,7 @@ def test_sample_is_the_ordered_view_at_the_size_of_the_step(tiny_scene):
     settings = ViewSettings(order=ShuffleOrder(), resolution={"points": [[0, 2], [20, 1]], "between": "steps"})
     sampler, pool = Sampler(views, settings, seed=5), ViewPool(views, 5)
     for step in range(1, 40):
-        view, sample = ShuffleOrder().at(pool, step), sampler.at(step)
+        view, sample = ShuffleOrder().view_at(pool, step), sampler.at(step)
         divisor = 2 if step < 20 else 1
         assert (sample.view.name, sample.view.downscale) == (view.name, view.downscale * divisor)
         assert sample.view.camera.width == 40 / (view.downscale * divisor)

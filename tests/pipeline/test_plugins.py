@@ -111,11 +111,11 @@ def test_hash_covers_kernels_and_their_headers(tmp_path):
     ],
 )
 def test_failing_plugin_is_one_line_and_registers_nothing(tmp_path, text, message):
-    before = list(Settings.defined)
+    before = list(Settings.subclasses)
     with pytest.raises(ConfigError, match=message) as error:
         plugins.load_file(write(tmp_path, "bad", text))
     assert "\n" not in str(error.value)
-    assert Settings.defined == before
+    assert Settings.subclasses == before
     load("splat", ["densify.rules=[clone]"])
 
 
@@ -289,7 +289,7 @@ def test_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypat
             plugins.load_file(file)
         plugins._loaded.clear()
         del sys.modules["a_helper"]
-        Settings.defined[:] = [kind for kind in Settings.defined if kind.__module__ != "clsplat_plugin_mine"]
+        Settings.subclasses[:] = [kind for kind in Settings.subclasses if kind.__module__ != "clsplat_plugin_mine"]
     assert len(digests) == 2
 
 
@@ -333,7 +333,7 @@ def test_pipeline_with_a_missing_or_changed_plugin_is_refused(tmp_path):
     plugins._loaded.clear()
     with pytest.raises(ConfigError, match=r"needs the plug-in 'mine', which is not loaded; use --plugin"):
         load(str(saved))
-    Settings.defined[:] = [kind for kind in Settings.defined if not kind.__module__.startswith("clsplat_plugin_")]
+    Settings.subclasses[:] = [kind for kind in Settings.subclasses if not kind.__module__.startswith("clsplat_plugin_")]
     file.write_text(file.read_text() + "\n# changed\n")
     plugins.load_file(file)
     with pytest.raises(

@@ -39,7 +39,7 @@ class Copy(Step):
         return {"length": len(text)}
 
 
-Settings.defined.remove(Copy)  # not a step in other tests
+Settings.subclasses.remove(Copy)  # not a step in other tests
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ class Linked(Copy):
         return {}
 
 
-Settings.defined.remove(Linked)
+Settings.subclasses.remove(Linked)
 
 
 def test_result_without_its_images_is_redone(photos, tmp_path):
@@ -218,7 +218,7 @@ class Slow(Copy):
         return {}
 
 
-Settings.defined.remove(Slow)
+Settings.subclasses.remove(Slow)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device"), RuntimeError("defect")])

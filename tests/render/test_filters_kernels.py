@@ -129,7 +129,7 @@ def test_specks_keep_their_brightness_when_zoomed_out(device):
 
 
 def test_screen_filter_with_a_key_without_effect_is_refused():
-    count = len(Settings.defined)
+    count = len(Settings.subclasses)
     with pytest.raises(ConfigError, match=r"Wide: its key 'radius' has no effect; override ScreenFilter.numbers"):
 
         class Wide(ScreenFilter):
@@ -144,5 +144,5 @@ def test_screen_filter_with_a_key_without_effect_is_refused():
         def numbers(self) -> tuple[float, float, float]:
             return self.radius**2, 0.0, 0.0
 
-    del Settings.defined[count:]
+    del Settings.subclasses[count:]
     assert Broad().numbers() == (4.0, 0.0, 0.0)

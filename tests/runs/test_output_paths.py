@@ -52,7 +52,7 @@ def text_fields() -> list[tuple[type[Settings], str]]:
         marks = getattr(kind, "__metadata__", ())
         return () if any(isinstance(mark, VariantName) for mark in marks) else typing.get_args(kind)
 
-    own = [kind for kind in Settings.defined if kind.__module__.startswith("clsplat.")]
+    own = [kind for kind in Settings.subclasses if kind.__module__.startswith("clsplat.")]
     return [
         (kind, name)
         for kind in [*own, PipelineFile, Matrix, MatrixFile]
@@ -65,7 +65,7 @@ def text_fields() -> list[tuple[type[Settings], str]]:
 
 def test_every_string_setting_is_an_input_or_checked_output():
     found = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
-    assert Execution in Settings.defined
+    assert Execution in Settings.subclasses
     checked = {
         f"{kind.__name__}.{n}" for kind, n in text_fields() if issubclass(kind, Stage) and n in kind.named_outputs()
     }
@@ -73,7 +73,7 @@ def test_every_string_setting_is_an_input_or_checked_output():
     assert found == READ | NAMES | checked, "a new text: check it with path_in_run, or list it as one that is read"
 
 
-WRITING = [kind for kind in Settings.defined if issubclass(kind, Stage) and kind.named_outputs()]
+WRITING = [kind for kind in Settings.subclasses if issubclass(kind, Stage) and kind.named_outputs()]
 
 
 @pytest.mark.parametrize("kind", WRITING, ids=lambda kind: kind.__name__)
@@ -145,7 +145,7 @@ def pipeline(tmp_path: Path, last: str) -> Path:
 
 
 def test_optional_output_field_of_a_plugin_is_checked():
-    defined = list(Settings.defined)
+    defined = list(Settings.subclasses)
 
     class Animate(Stage):
         stage: Literal["animate"] = "animate"
@@ -153,7 +153,7 @@ def test_optional_output_field_of_a_plugin_is_checked():
 
         def run(self, run: Run) -> None: ...
 
-    Settings.defined[:] = defined
+    Settings.subclasses[:] = defined
     assert Animate.named_outputs() == {"video": (".mp4",)}
     assert Animate().outputs(Path("run")) == []
     assert Animate(video="a/b.mp4").outputs(Path("run")) == [Path("run/a/b.mp4")]

@@ -233,7 +233,7 @@ def test_colmap_keeps_observations(model, scene_of, tmp_path, rng):
     found = clsplat.read_scene(tmp_path / "out").tracks
     np.testing.assert_array_equal(found.positions, scene.tracks.positions)
     for view in scene.views:
-        np.testing.assert_array_equal(found.seen[view.name], scene.tracks.seen[view.name])
+        np.testing.assert_array_equal(found.rows[view.name], scene.tracks.rows[view.name])
         np.testing.assert_allclose(found.residuals[view.name], scene.tracks.residuals[view.name], atol=1e-9)
     data, at, images = (tmp_path / "out/sparse/0/points3D.bin").read_bytes(), 8, read_images(tmp_path / "out/sparse/0")
     while at < len(data):

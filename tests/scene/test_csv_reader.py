@@ -20,12 +20,12 @@ HEADER = "name,qw,qx,qy,qz,tx,ty,tz,fx,fy,cx,cy,width,height"
 
 @pytest.fixture
 def _plugin() -> Iterator[None]:
-    defined = list(Reader.defined)
+    defined = list(Reader.subclasses)
     spec = importlib.util.spec_from_file_location("csv_reader", EXAMPLE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     yield
-    Reader.defined[:] = defined  # other tests expect shipped readers only
+    Reader.subclasses[:] = defined  # other tests expect shipped readers only
 
 
 @pytest.fixture

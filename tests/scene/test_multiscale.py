@@ -131,7 +131,7 @@ def views_of(count: int, *scales: float) -> list[View]:
 def draw_views(views: list[View], order: str, steps: int | list[int], seed: int = 0) -> list[View]:
     """The views of some steps, or of all from 1 to `steps`."""
     pool, chosen = ViewPool(views, seed), variants(Order)[order]()
-    return [chosen.at(pool, step) for step in (range(1, steps + 1) if isinstance(steps, int) else steps)]
+    return [chosen.view_at(pool, step) for step in (range(1, steps + 1) if isinstance(steps, int) else steps)]
 
 
 def scale_fractions(views: list[View], order: str, steps: int) -> dict[float, float]:

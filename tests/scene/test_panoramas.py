@@ -187,7 +187,7 @@ def test_points_belong_to_the_faces_that_show_them(panoramas: Path) -> None:
     scene = read_scene(panoramas, 8)
     positions = scene.views[0].position + np.array([[3.0, 0, 0], [0, 0, 3], [0, 0, -3], [0, 3, 0]])
     tracks = Tracks(positions, {"IMG_0000.jpg": np.arange(4)}).on_faces(scene.views)
-    shown = {Path(name).stem: rows.tolist() for name, rows in tracks.seen.items() if len(rows) and "/" in name}
+    shown = {Path(name).stem: rows.tolist() for name, rows in tracks.rows.items() if len(rows) and "/" in name}
     assert shown == {"cube_right": [0], "cube_front": [1], "cube_back": [2], "cube_down": [3]}
 
 

@@ -19,9 +19,9 @@ SHIPPED = ["multi-camera video", "COLMAP", "Blender", "multi-scale Blender", "ne
 
 @pytest.fixture(autouse=True)
 def _forget_readers() -> Iterator[None]:
-    defined = list(Reader.defined)
+    defined = list(Reader.subclasses)
     yield
-    Reader.defined[:] = defined
+    Reader.subclasses[:] = defined
 
 
 class OneFile(Reader):

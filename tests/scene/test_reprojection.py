@@ -62,10 +62,10 @@ def test_points_with_large_errors_give_no_depth():
     missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
     tracks = Tracks(np.zeros((7, 3)), {"a": rows, "b": rows[:1], "c": rows}, missed)
     found = filter_tracks(tracks, [view, replace(view, name="c")])
-    assert {name: seen.tolist() for name, seen in found.seen.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
+    assert {name: rows.tolist() for name, rows in found.rows.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
     np.testing.assert_array_equal(found.residuals["a"], missed["a"][1:3])
-    assert filter_tracks(tracks, [view.resized(2)]).seen["a"].tolist() == [1, 3, 5]
-    assert filter_tracks(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], (
+    assert filter_tracks(tracks, [view.resized(2)]).rows["a"].tolist() == [1, 3, 5]
+    assert filter_tracks(tracks, [view.resized(2), view, view.resized(4)]).rows["a"].tolist() == [3, 5], (
         "in several sizes"
     )
 
@@ -91,7 +91,7 @@ def test_nonnumeric_positions_in_text_are_ignored(tmp_path):
     write_image(tmp_path / "images" / "a.png", np.zeros((48, 64, 3), np.uint8))
     tracks = read_scene(tmp_path, 0).tracks
     assert tracks is not None
-    assert tracks.seen["a.png"].tolist() == [1, 0]
+    assert tracks.rows["a.png"].tolist() == [1, 0]
     np.testing.assert_array_equal(tracks.residuals["a.png"], [[np.nan, np.nan], [3, 0]])
 
 

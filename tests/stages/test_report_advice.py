@@ -12,11 +12,11 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.report import (
     FEW_PHOTOS,
+    advise_on_capture,
+    advise_on_test_views,
+    advise_on_training_views,
     find_outliers,
     find_widest_gap,
-    from_capture,
-    from_test_views,
-    from_training_views,
 )
 from clsplat.training.modules.sky_choice import sky_advice
 
@@ -44,28 +44,28 @@ def test_views_far_below_the_median_are_named_worst_first():
 
 
 def test_training_photographs_that_disagree_are_named():
-    (text,) = from_training_views(measured([30, 31, 10, 30]), has_exposures=False)
+    (text,) = advise_on_training_views(measured([30, 31, 10, 30]), has_exposures=False)
     assert text.startswith("2.jpg disagrees with the other photos")
-    (text,) = from_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_exposures=False)
+    (text,) = advise_on_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_exposures=False)
     assert text.startswith("9.jpg, 10.jpg, 11.jpg and 2 more disagree with")
-    assert not [*from_training_views([], has_exposures=False)]
+    assert not [*advise_on_training_views([], has_exposures=False)]
 
 
 @pytest.mark.parametrize(("gained", "has_exposures", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
 def test_differing_colors_are_reported_if_none_are_trained(gained, has_exposures, said):
-    texts = [*from_training_views(measured([30, 30, 31], gained), has_exposures)]
+    texts = [*advise_on_training_views(measured([30, 30, 31], gained), has_exposures)]
     assert len(texts) == said
     assert all("would gain 1.5 dB" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
 def test_images_without_fitted_colors_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
-    assert "would gain 1.5 dB" in "".join(from_training_views(found, has_exposures=False))
-    assert not [*from_training_views(found[2:], has_exposures=False)]
+    assert "would gain 1.5 dB" in "".join(advise_on_training_views(found, has_exposures=False))
+    assert not [*advise_on_training_views(found[2:], has_exposures=False)]
 
 
 def test_much_worse_test_views_are_named():
-    (text,) = from_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
+    (text,) = advise_on_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
     assert text.startswith("b: much worse")
 
 
@@ -82,9 +82,9 @@ def test_added_sky_is_reported_with_its_reason():
 
 
 def test_few_images_are_reported():
-    assert "only 1 training photograph" in "".join(from_capture(views_around([0]), views_around([0])))
+    assert "only 1 training photograph" in "".join(advise_on_capture(views_around([0]), views_around([0])))
     many = views_around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
-    assert not [*from_capture(many, many)]
+    assert not [*advise_on_capture(many, many)]
 
 
 @pytest.mark.parametrize("turn", [0, 250])

@@ -54,7 +54,7 @@ class Panoramas(Room):
         return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
 
     def photograph(self, pose: Array, size: int) -> "np.ndarray":
-        return self.expose(pose, size, range(size // 2))
+        return self.render_rows(pose, size, range(size // 2))
 
 
 WALLS = tuple(wall(axis, side) for axis in range(3) for side in (-1, 1))

@@ -70,7 +70,7 @@ class FieldCase:
         for layer in shape.layers:
             parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
         if shape.grid:
-            entries = parameters[shape.network_parameters : shape.network_parameters + shape.grid.learned]
+            entries = parameters[shape.network_parameters : shape.network_parameters + shape.grid.parameter_count]
             entries[:] = rng.normal(0, 0.5, len(entries))
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)

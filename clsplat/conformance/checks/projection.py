@@ -245,7 +245,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
 
 
 @CHECKS.add("project_forward")
-def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Results:
+def gaussians_hidden_from_views(device: Device, rng: np.random.Generator) -> Results:
     for count, views in ((17, 2), (65, HIDDEN_VIEWS + 1)):
         yield from check_hidden(device, random_case(rng, count), rng, views)
 

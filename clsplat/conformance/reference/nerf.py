@@ -224,18 +224,18 @@ class HashLevel:
 
     def forward(self, table: Floats, positions: Floats, variances: Floats) -> Floats:
         """Return features of samples, [S, F], from a table of entries, [entries, F]; 0 outside of the cube."""
-        entries, weights = self._inside(positions, variances)
+        entries, weights = self._masked_corners(positions, variances)
         return np.asarray((table[entries] * weights[..., None]).sum(axis=1))
 
     def backward(self, grad_features: Floats, positions: Floats, variances: Floats) -> Floats:
         """Return the gradients of the table, [entries, F], from those of the features."""
-        entries, weights = self._inside(positions, variances)
+        entries, weights = self._masked_corners(positions, variances)
         actual = np.zeros((self.entries, grad_features.shape[1]))
         np.add.at(actual, entries, weights[..., None] * grad_features[:, None])
         return actual
 
-    def _inside(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return entries and weights of corners, with weight 0 outside of the cube, times the weight of the level."""
+    def _masked_corners(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """Return the entries of corners, and their weights in the level, which are 0 outside of the cube."""
         inside = np.all((positions >= 0) & (positions <= 1), axis=1)
         entries, weights = self.corners(np.where(inside[..., None], positions, 0.5))
         return entries, weights * (inside * self.weights(variances))[:, None]

@@ -46,10 +46,10 @@ def _cameras(inspection: Inspection) -> list[Markup]:
     """Draw training and test cameras without outliers, and points, from above and from the side."""
     outliers, scene, table = set(inspection.facts.outlier_cameras), inspection.parts.scene, inspection.parts.points
     test = {view.name for view in scene.split("test")} if scene else set()
-    kept = [view for view in inspection.parts.views if view.name not in outliers]
+    inliers = [view for view in inspection.parts.views if view.name not in outliers]
     views = {
-        "training": [view for view in kept if view.name not in test],
-        "test": [view for view in kept if view.name in test],
+        "training": [view for view in inliers if view.name not in test],
+        "test": [view for view in inliers if view.name in test],
     }
     points: NDArray[np.floating] = np.empty((0, 3)) if table is None else table.positions
     finite = points[(np.abs(points) < MAX_VALUE).all(axis=1)]

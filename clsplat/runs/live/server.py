@@ -277,7 +277,7 @@ class Handlers:
         else:
             view = parse_camera(request.query.get("camera", ""))
             if "time" in request.query:
-                view = replace(view, time=timestamp(request.query["time"]))
+                view = replace(view, time=parse_timestamp(request.query["time"]))
         preview = PreviewRequest(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
         if not live.requests.wait_for(preview, WAIT):
             raise RequestError(503, "too many previews are requested")
@@ -309,7 +309,7 @@ class Handlers:
         return self.live.shown
 
 
-def timestamp(text: str) -> float:
+def parse_timestamp(text: str) -> float:
     """Parse a timestamp.  Raises RequestError."""
     try:
         value = float(text)

@@ -76,6 +76,7 @@ class TrainingStep:
         self._saved[id(state)] = value
 
     def saved(self, state: "ModuleState") -> Any:
+        """Return the value that an earlier hook of the module saved in this step, or None."""
         return self._saved.get(id(state))
 
 
@@ -267,7 +268,7 @@ def implicit_modules() -> dict[str, type[TrainingModule]]:
     """Return the classes of modules that are never listed, by type."""
     return {
         module.implicit_type: module
-        for module in Settings.defined
+        for module in Settings.subclasses
         if issubclass(module, TrainingModule) and module.implicit_type
     }
 

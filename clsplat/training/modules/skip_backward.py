@@ -95,7 +95,8 @@ class SkipBackwardState(ModuleState):
         step.save(self, visit)
 
     def update(self, step: TrainingStep) -> None:
-        self.scalars.update(visit.scalars if (visit := step.saved(self)) else {})
+        if visit := step.saved(self):
+            self.scalars.update(visit.scalars)
 
     update_skipped = update
 

@@ -166,22 +166,22 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
         )
         return lambda pose: pose
     matrix, scale = _affine(file)
-    rotation, shift = matrix[:, :3], matrix[:, 3]
+    rotation, translation = matrix[:, :3], matrix[:, 3]
     applied = _applied_transform(scene)
 
     @np.errstate(all="ignore")  # poses that are not finite are rejected later
     def move(pose: Floats) -> Floats:
-        """Invert x' = scale · (rotation x + shift), nerfstudio's transform."""
+        """Invert x' = scale · (rotation x + translation), nerfstudio's transform."""
         center = -pose[:, :3].T @ pose[:, 3]
         turned = pose[:, :3] @ rotation @ applied[:, :3].T
-        position = applied[:, :3] @ (rotation.T @ (center / scale - shift)) + applied[:, 3]
+        position = applied[:, :3] @ (rotation.T @ (center / scale - translation)) + applied[:, 3]
         return np.column_stack([turned, -turned @ position])
 
     return move
 
 
 def _affine(file: Path) -> tuple[Floats, float]:
-    """Read the rotation and shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
+    """Read the rotation and translation, [3, 4], and the scale of a file WORLD.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
@@ -191,7 +191,7 @@ def _affine(file: Path) -> tuple[Floats, float]:
 
 
 def _rigid(frame: JsonFrame, key: str) -> Floats:
-    """Read a rotation and a shift, [3, 4].  Raises DataError."""
+    """Read a rotation and a translation, [3, 4].  Raises DataError."""
     try:
         matrix = np.array(frame.value(key), np.float64)[:3]
     except (ValueError, TypeError, OverflowError, IndexError):
