@@ -5,7 +5,15 @@ import json
 import pytest
 
 from clsplat.runs.live.preview import LiveState
-from clsplat.runs.live.server import Handlers, Request, RequestError, host_name, parse_camera, parse_request, timestamp
+from clsplat.runs.live.server import (
+    Handlers,
+    Request,
+    RequestError,
+    host_name,
+    parse_camera,
+    parse_request,
+    parse_timestamp,
+)
 
 TOKEN = "secret-token"
 
@@ -88,9 +96,9 @@ def test_impossible_camera_is_refused(text):
 
 @pytest.mark.parametrize("text", ["x", "nan", "1.01", "-0.1"])
 def test_time_is_from_0_to_1(text):
-    assert timestamp("0.35") == 0.35
+    assert parse_timestamp("0.35") == 0.35
     with pytest.raises(RequestError, match="time: expected a timestamp from 0"):
-        timestamp(text)
+        parse_timestamp(text)
 
 
 def test_page_that_missed_the_end_is_not_counted_as_informed():
