@@ -202,7 +202,7 @@ SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
 
 
 def examine(device: str | Device | None = None) -> DeviceReport:
-    """Run all checks on a device, open or by name.  Raises DeviceError if there is none that works."""
+    """Run all checks on a device; None chooses the default one.  Raises DeviceError if no device works."""
     info = device.info if isinstance(device, Device) else choose(device)
     default = resolve_schedule(info, "auto")
     report, started = DeviceReport(info, default), time.perf_counter()

@@ -139,13 +139,13 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
         with raising_output_error(path):
             file = _acquire(path, folder)
 
-        def require_held() -> None:
+        def require_lock() -> None:
             with suppress(OSError):  # an unreadable folder: the next write reports that
                 if not file.closed and not _is_still_at(file, path):
                     raise OutputError(lost_lock_message(path, folder))
 
         try:
-            yield require_held
+            yield require_lock
         finally:
             with suppress(OSError):  # Windows cannot remove an open file
                 if _is_still_at(file, path):

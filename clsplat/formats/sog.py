@@ -187,8 +187,8 @@ class _Sog:
         scales, opacity = self._decode("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
         logit = logits(opacity[:, None] / 255.0)
         if self.old:
-            lows, highs = self._ends("sh0", 4)
-            logit = (lows[3] + (highs[3] - lows[3]) * (opacity[:, None] / 255.0)).astype(np.float32)
+            minimum, maximum = self._ranges("sh0", 4)
+            logit = (minimum[3] + (maximum[3] - minimum[3]) * (opacity[:, None] / 255.0)).astype(np.float32)
         parameters = {
             "means": self._means(),
             "quats": self._quats(),
@@ -202,9 +202,9 @@ class _Sog:
 
     def _means(self) -> NDArray[np.float32]:
         low, high = (self._pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
-        lows, highs = self._ends("means", 3)
-        span = np.where(highs > lows, highs - lows, 1)
-        t = lows + (low | high << np.uint16(8)) / 65535.0 * span
+        minimum, maximum = self._ranges("means", 3)
+        span = np.where(maximum > minimum, maximum - minimum, 1)
+        t = minimum + (low | high << np.uint16(8)) / 65535.0 * span
         with np.errstate(over="ignore"):  # infinity is refused later
             return (np.sign(t) * np.expm1(np.abs(t))).astype(np.float32)
 
@@ -256,10 +256,10 @@ class _Sog:
             return np.asarray(entries.astype(np.float32)[levels])
         part = self._part(name)
         if name == "shN":
-            lows, highs = (self._numbers(f"shN.{key}", [part.get(key)], 1) for key in ("mins", "maxs"))
+            minimum, maximum = (self._numbers(f"shN.{key}", [part.get(key)], 1) for key in ("mins", "maxs"))
         else:
-            lows, highs = (ends[: levels.shape[1]] for ends in self._ends(name, 3))
-        return (lows + levels / 255.0 * (highs - lows)).astype(np.float32)
+            minimum, maximum = (values[: levels.shape[1]] for values in self._ranges(name, 3))
+        return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
     def _pixels(self, name: str, number: int) -> NDArray[np.uint8]:
         """Return the first pixels of an image, one per splat, [count, 4]."""
@@ -293,10 +293,10 @@ class _Sog:
             )
         return [self.files.read(file) for file in names]
 
-    def _ends(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _ranges(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part = self._part(name)
-        lows, highs = (self._numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
-        return lows, highs
+        minimum, maximum = (self._numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
+        return minimum, maximum
 
     def _numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
         """Validate a list of at least `count` numbers."""
@@ -396,11 +396,11 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
     wide = p["means"].astype(np.float64)
     t = np.sign(wide) * np.log1p(np.abs(wide))
     ends = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
-    lows, highs = (np.array([_short(end, way) for end in row]) for row, way in ends)
-    span = np.where(highs > lows, highs - lows, 1)
-    levels = np.rint(65535 * (t - lows) / span).astype(np.uint16)
+    minimum, maximum = (np.array([_short(end, way) for end in row]) for row, way in ends)
+    span = np.where(maximum > minimum, maximum - minimum, 1)
+    levels = np.rint(65535 * (t - minimum) / span).astype(np.uint16)
     files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
-    return {"mins": lows.tolist(), "maxs": highs.tolist(), "files": files}
+    return {"mins": minimum.tolist(), "maxs": maximum.tolist(), "files": files}
 
 
 def _alpha(p: Parameters) -> NDArray[np.float64]:
@@ -495,7 +495,7 @@ def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
 
 
 def _zip(images: dict[str, bytes]) -> bytes:
-    """Return a ZIP without timestamps, operating system, and compression."""
+    """Return an uncompressed ZIP whose bytes depend on neither time nor operating system."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, data in images.items():

@@ -309,7 +309,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return logits of opacities; if most are outside of [0, 1], they are logits already, as a note says."""
+    """Return logits of opacities; values mostly outside of [0, 1] are taken for logits, with a note."""
     if np.count_nonzero((alpha < 0) | (alpha > 1)) > MIN_OUTSIDE * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)

@@ -31,7 +31,7 @@ class ViewPool:
         self.finest = [i for i, view in enumerate(views) if view.downscale == finest]  # indices into `views`
         self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
-    def shuffled(self, entries: Sequence[int], step: int) -> View:
+    def shuffled_view(self, entries: Sequence[int], step: int) -> View:
         """Return the view of a step; each epoch uses all `entries`, indices into `views`, in a new order."""
         epoch, index = divmod(step - 1, len(entries))
         return self.views[entries[int(self._shuffle(epoch, len(entries))[index])]]
@@ -61,7 +61,7 @@ class Uniform(Order):
     type: Literal["uniform"] = "uniform"
 
     def view_at(self, pool: ViewPool, step: int) -> View:
-        return pool.shuffled(range(len(pool.views)), step)
+        return pool.shuffled_view(range(len(pool.views)), step)
 
 
 class ShuffleOrder(Order):
@@ -71,7 +71,7 @@ class ShuffleOrder(Order):
     type: Literal["shuffle"] = "shuffle"
 
     def view_at(self, pool: ViewPool, step: int) -> View:
-        return pool.shuffled([*range(len(pool.views)), *pool.finest], step)
+        return pool.shuffled_view([*range(len(pool.views)), *pool.finest], step)
 
 
 class StackOrder(Order):
@@ -84,7 +84,7 @@ class StackOrder(Order):
         rng = pool.random(step)
         if rng.random() < FINEST_FRACTION:
             return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
-        return pool.shuffled(range(len(pool.views)), step)
+        return pool.shuffled_view(range(len(pool.views)), step)
 
 
 LOG = logging.getLogger("clsplat")

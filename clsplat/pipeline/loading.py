@@ -155,10 +155,10 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
             settings.check_conflicts()
             conflict = None
         except ValidationError as error:
-            where, complaint = first_fault(error, PipelineFile)
-            contains_key = where == key_path[: len(where)]
+            fault_path, complaint = first_fault(error, PipelineFile)
+            contains_key = fault_path == key_path[: len(fault_path)]
             raise OverrideError(
-                override, complaint if contains_key else f"{key_path_text(where)}: {complaint}"
+                override, complaint if contains_key else f"{key_path_text(fault_path)}: {complaint}"
             ) from error
         except ConfigError as error:
             conflict = (conflict[0] if conflict else override), error
@@ -254,8 +254,8 @@ def _tag_stage(item: Any, key_path: tuple[str | int, ...], document: Document, p
     if isinstance(item, str):
         return {"stage": item}
     if not (isinstance(item, dict) and len(item) == 1 and isinstance(next(iter(item.values())), dict | None)):
-        where = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in key_path[:2])
-        raise ConfigError(f"{path}:{document.line(key_path)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
+        key = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in key_path[:2])
+        raise ConfigError(f"{path}:{document.line(key_path)}: {key}: expected '- stage' or '- stage: {{key: value}}'")
     name, fields = next(iter(item.items()))
     fields = dict(fields or {})
     if "stage" in fields:

@@ -92,10 +92,10 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
     }
 
 
-def require(recorded: Mapping[str, str], where: str) -> None:
-    """Raise ConfigError if a recorded plug-in is missing or has changed; `where` names the record."""
+def require(recorded: Mapping[str, str], source: str) -> None:
+    """Raise ConfigError if a recorded plug-in is missing or has changed; `source` names the record."""
     if faults := differences(recorded):
-        raise ConfigError(f"{where}: {faults[0]}")
+        raise ConfigError(f"{source}: {faults[0]}")
 
 
 def differences(recorded: Mapping[str, str]) -> list[str]:

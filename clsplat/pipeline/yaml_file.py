@@ -100,8 +100,8 @@ def _short(text: str, path: Path, file: Path) -> str:
     edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
     for key_path, value in {"name": path.stem, **values}.items():
         if not (node := _node(root, key_path)):
-            where = f"{file}:{document.line(('short', key_path))}: short"
-            raise ConfigError(f"{where}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
+            line = f"{file}:{document.line(('short', key_path))}: short"
+            raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
     for first, last, new in sorted(edits, reverse=True):
         text = text[:first] + new + text[last:]
@@ -219,7 +219,7 @@ class _Reader:
         return data
 
     def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
-        """Return the map that `<<` refers to; a key that the outer map has too keeps the line of the outer map."""
+        """Return the map that `<<` refers to; the line of a key that the outer map also has does not change."""
         if not isinstance(node, MappingNode):
             raise _NotAllowed(node, "expected a map after '<<'")
         outer, self._lines = self._lines, {}

@@ -51,12 +51,12 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
     with raising_output_error(out):
         make_folder(out)
     try:
-        with lock.lock_folder(out) as require_held:
+        with lock.lock_folder(out) as require_lock:
             state = RunState.read(out)  # again: another process may have run there before the lock was taken
             check_run_folder(state, start)
             remove_partial_files(out, border=PIPELINE)
             old_status = read_text(out / STATUS) if state.phase is Phase.DONE else None
-            status = StatusFile(out, require_held, **values)
+            status = StatusFile(out, require_lock, **values)
             status.begin()
             try:
                 with closing(status):  # the next owner of the folder writes its own
@@ -64,13 +64,13 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
             except BaseException as error:
                 if old_status is not None and not status.has_run:
                     with suppress(OutputError):
-                        status.require_held()
+                        status.require_lock()
                         write_text(out / STATUS, old_status)
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # keep the log, which has the traceback
                 if PIPELINE not in state.names and not status.now.step and not is_defect:
                     written = EARLY_RUN_FILES if status.now.cells else RUN_FILES - {CHECKPOINTS}
                     with suppress(OutputError):
-                        status.require_held()
+                        status.require_lock()
                         _remove_unused(out, written, keep={LOCK} if new_folders else EARLY_RUN_FILES)
                 raise
     except BaseException:

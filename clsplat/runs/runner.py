@@ -144,7 +144,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         LOG.warning("%s", finding.text)
     if run.best is None and (text := overfitting_note(run)):
         LOG.info("%s", text)
-    run.status.require_held()
+    run.status.require_lock()
     write_metrics(pipeline, run)
     damaged = damaged_files(run.out, previous)
     check_outputs(pipeline, run, damaged)

@@ -31,7 +31,7 @@ class Phase(IntEnum):
     STATELESS = 3
     """It has started, but both its status and its checkpoints are missing."""
     DONE = 4
-    """It has finished; `RunState.damaged` lists files that are missing or changed."""
+    """It has finished; `RunState.bad_files` lists files that are missing or changed."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class RunState:
         return load(str(self.out / PIPELINE))
 
     @cached_property
-    def damaged(self) -> list[str]:
+    def bad_files(self) -> list[str]:
         """The files that are missing or changed; for a finished run also a missing list of checksums."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
@@ -91,14 +91,14 @@ class RunState:
     def require_same(self, pipeline: Pipeline) -> None:
         """Raise ConfigError if a finished run had other settings."""
         is_known = self.phase is Phase.DONE and PIPELINE in self.names
-        if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.damaged:
+        if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.bad_files:
             raise ConfigError(
                 f"{self.out}: has a run with other settings: {difference}; use another folder, or the same settings"
             )
 
     def is_complete(self, pipeline: Pipeline) -> bool:
         """Return whether a run of this pipeline is finished, with all files intact."""
-        return self.phase is Phase.DONE and not self.difference(pipeline) and not self.damaged
+        return self.phase is Phase.DONE and not self.difference(pipeline) and not self.bad_files
 
     @property
     def steps_key(self) -> str:

@@ -213,7 +213,7 @@ def verdict(result: dict[str, Any]) -> str:
 
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
     """Return how to restore the files of a run: from an intact checkpoint, or from the start."""
-    if state.phase is Phase.DONE and "cells" not in state.status and not state.damaged and PIPELINE in state.names:
+    if state.phase is Phase.DONE and "cells" not in state.status and not state.bad_files and PIPELINE in state.names:
         return "ignore them: all outputs are intact, and only longer training needs these files"
     intact = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
     can_continue = "cells" in state.status or any(path in intact for path in state.checkpoints)

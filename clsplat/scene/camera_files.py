@@ -115,7 +115,7 @@ def _view(frame: JsonFrame, number: int) -> View:
     width, height, fx, fy = (frame.number(key) or 0.0 for key in ("width", "height", "fx", "fy"))
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
-            f"{frame.where}: the camera is {width:g}x{height:g} with focal lengths {fx:g}, {fy:g}; expected positive "
+            f"{frame.source}: the camera is {width:g}x{height:g} with focal lengths {fx:g}, {fy:g}; expected positive "
             f"numbers, sizes of at most {MAX_SIDE}: export the file again"
         )
     cx, cy = frame.number("cx"), frame.number("cy")
@@ -126,13 +126,13 @@ def _view(frame: JsonFrame, number: int) -> View:
         pose = np.column_stack([rotation.T, -rotation.T @ position])
         return View(name if isinstance(name, str) else f"{number:05d}", camera, pose)
     except PoseError as error:
-        raise DataError(f"{frame.where}: {error}; remove that camera or export the file again") from error
+        raise DataError(f"{frame.source}: {error}; remove that camera or export the file again") from error
 
 
 def _array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
     array = frame.array(key)
     if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"{frame.where}: {key} is {quote(frame.value(key))}; expected finite numbers, {shape}")
+        raise DataError(f"{frame.source}: {key} is {quote(frame.value(key))}; expected finite numbers, {shape}")
     return array
 
 

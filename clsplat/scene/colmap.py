@@ -40,9 +40,9 @@ REMEDY = "copy or export the model again"
 
 
 class CameraRecord(NamedTuple):
-    """A camera; `where` is its position in the file, for messages."""
+    """A camera; `source` is its position in the file, for messages."""
 
-    where: str
+    source: str
     model: str
     width: int
     height: int
@@ -55,7 +55,7 @@ class ImageRecord(NamedTuple):
     `points` are the ids of the 3D points that the image shows, [K], and `pixels` their positions, [K, 2] px.
     """
 
-    where: str
+    source: str
     name: str
     camera: int
     quaternion: tuple[float, ...]
@@ -64,19 +64,19 @@ class ImageRecord(NamedTuple):
     pixels: NDArray[np.float64] = np.empty((0, 2))
 
 
-def parameter_count(where: str, model: str) -> int:
-    """Return the number of parameters of a camera model.  Raises DataError, with `where`, for an unknown model."""
+def parameter_count(source: str, model: str) -> int:
+    """Return the number of parameters of a camera model.  Raises DataError, with `source`, for an unknown model."""
     if model not in PARAMETERS:
-        raise DataError(f"{where}: unknown camera model {quote(model)}; expected one of {', '.join(PARAMETERS)}")
+        raise DataError(f"{source}: unknown camera model {quote(model)}; expected one of {', '.join(PARAMETERS)}")
     return PARAMETERS[model]
 
 
-def decode(where: str, data: bytes) -> str:
-    """Decode UTF-8.  Raises DataError, prefixed with `where`, for other bytes."""
+def decode(source: str, data: bytes) -> str:
+    """Decode UTF-8.  Raises DataError, prefixed with `source`, for other bytes."""
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not UTF-8 text ({error}); {REMEDY}") from error
+        raise DataError(f"{source}: not UTF-8 text ({error}); {REMEDY}") from error
 
 
 # Read the text files of a COLMAP model.
@@ -86,13 +86,13 @@ LARGEST_ID = 2**63 - 1
 
 def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
-    for where, line in _lines(path):
+    for source, line in _lines(path):
         if line:
             layout = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
             words = line.split()
-            number, model, width, height = _convert(where, words[:4], (int, str, int, int), layout)
-            params = _convert(where, words[4:], [float] * parameter_count(where, model), f"the parameters of {model}")
-            yield number, CameraRecord(where, model, width, height, tuple(params))
+            number, model, width, height = _convert(source, words[:4], (int, str, int, int), layout)
+            params = _convert(source, words[4:], [float] * parameter_count(source, model), f"the parameters of {model}")
+            yield number, CameraRecord(source, model, width, height, tuple(params))
 
 
 def images_text(path: Path) -> Iterator[ImageRecord]:
@@ -100,7 +100,7 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     kinds = (int, *[float] * 7, int, str)
     image: ImageRecord | None = None  # its points may follow on the next line
-    for where, line in _lines(path):
+    for source, line in _lines(path):
         if image and _is_points2d(line):
             points, pixels = _points2d(line)
             yield image._replace(points=points, pixels=pixels)
@@ -108,8 +108,8 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
         elif line:
             if image:
                 yield image
-            _, *pose, camera, name = _convert(where, line.split(maxsplit=9), kinds, layout)
-            image = ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]))
+            _, *pose, camera, name = _convert(source, line.split(maxsplit=9), kinds, layout)
+            image = ImageRecord(source, name, camera, tuple(pose[:4]), tuple(pose[4:]))
     if image:
         yield image
 
@@ -140,7 +140,7 @@ def points_text(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
     kinds = (_id, float, float, float, _byte, _byte, _byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout) for where, line in _lines(path) if line]
+    rows = [_convert(source, line.split(maxsplit=8)[:8], kinds, layout) for source, line in _lines(path) if line]
     table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
     ids = np.array([row[0] for row in rows], np.int64).reshape(-1)
     return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6], ids)
@@ -154,14 +154,14 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
             yield f"{path}: line {number}", line
 
 
-def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
+def _convert(source: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
     """Convert each word to its kind.  Raises DataError with the line."""
     if len(words) != len(kinds):
-        raise DataError(f"{where}: expected {layout}, found {len(words)} of {len(kinds)} words; {REMEDY}")
+        raise DataError(f"{source}: expected {layout}, found {len(words)} of {len(kinds)} words; {REMEDY}")
     try:
         return [kind(word) for kind, word in zip(kinds, words, strict=True)]
     except ValueError as error:
-        raise DataError(f"{where}: {shorten(str(error))}; expected {layout}: remove that entry or {REMEDY}") from error
+        raise DataError(f"{source}: {shorten(str(error))}; expected {layout}: remove that entry or {REMEDY}") from error
 
 
 def _id(word: str) -> int:
@@ -188,7 +188,7 @@ class _Binary:
         self.path, self.data, self.offset = path, read_file(path), 0
 
     @property
-    def where(self) -> str:
+    def source(self) -> str:
         """The position in the file, for messages."""
         return f"{self.path}: byte {self.offset}"
 
@@ -197,7 +197,7 @@ class _Binary:
         available = len(self.data) - self.offset
         if size > available:
             raise DataError(
-                f"{self.where}: expected {size} bytes of {label}, found {available}; truncated or damaged: {REMEDY}"
+                f"{self.source}: expected {size} bytes of {label}, found {available}; truncated or damaged: {REMEDY}"
             )
         self.offset += size
         return self.offset - size
@@ -213,14 +213,14 @@ class _Binary:
 
     def text(self, label: str) -> str:
         """Read UTF-8 text up to the next zero byte."""
-        where, end = self.where, self.data.find(b"\0", self.offset)
+        source, end = self.source, self.data.find(b"\0", self.offset)
         start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, label)
-        return decode(where, self.data[start:end])
+        return decode(source, self.data[start:end])
 
     def finish(self) -> None:
         if self.offset < len(self.data):
             raise DataError(
-                f"{self.where}: {len(self.data) - self.offset} bytes follow the last record; damaged: {REMEDY}"
+                f"{self.source}: {len(self.data) - self.offset} bytes follow the last record; damaged: {REMEDY}"
             )
 
 
@@ -228,11 +228,11 @@ def cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
     file = _Binary(path)
     for _ in range(file.count(24, "cameras")):
-        where = file.where
+        source = file.source
         number, model, width, height = file.read("<IiQQ", "a camera")
         name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
-        params = file.read(f"<{parameter_count(where, name)}d", "camera parameters")
-        yield number, CameraRecord(where, name, width, height, params)
+        params = file.read(f"<{parameter_count(source, name)}d", "camera parameters")
+        yield number, CameraRecord(source, name, width, height, params)
     file.finish()
 
 
@@ -240,14 +240,14 @@ def images_binary(path: Path) -> Iterator[ImageRecord]:
     """Yield the registered images, in the order of the file."""
     file = _Binary(path)
     for _ in range(file.count(73, "images")):
-        where = file.where
+        source = file.source
         _, *pose, camera = file.read("<I7dI", "an image")
         name = file.text("an image name")
         count = file.count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
         points = np.frombuffer(file.data, POINT2D, count, start)
         points = points[points["point"] >= 0]
-        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), points["point"], points["xy"])
+        yield ImageRecord(source, name, camera, tuple(pose[:4]), tuple(pose[4:]), points["point"], points["xy"])
     file.finish()
 
 
@@ -281,7 +281,7 @@ def read_cameras(folder: Path) -> dict[int, CameraRecord]:
     cameras: dict[int, CameraRecord] = {}
     for number, camera in cameras_binary(file) if file.suffix == ".bin" else cameras_text(file):
         if number in cameras:
-            raise DataError(f"{camera.where}: a second camera {number}; expected different ids: {REMEDY}")
+            raise DataError(f"{camera.source}: a second camera {number}; expected different ids: {REMEDY}")
         cameras[number] = camera
     return cameras
 
@@ -421,14 +421,14 @@ def make_view(
     """Return the view of an image.  Raises DataError if the image or its camera is invalid."""
     if image.camera not in cameras:
         raise DataError(
-            f"{image.where}: image {quote(image.name)} has camera {image.camera}; expected one of the cameras file, "
+            f"{image.source}: image {quote(image.name)} has camera {image.camera}; expected one of the cameras file, "
             f"{sorted(cameras)[:8]}: {REMEDY}"
         )
     try:
         pose = pose_matrix(image.quaternion, image.translation)
     except ValueError as error:
         raise DataError(
-            f"{image.where}: the pose of {quote(image.name)} is {error}: remove that image or {REMEDY}"
+            f"{image.source}: the pose of {quote(image.name)} is {error}: remove that image or {REMEDY}"
         ) from error
     lens = intern_lens(_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
@@ -441,7 +441,7 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
     is_valid = min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(focals) >= MIN_FOCAL
     if not is_valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
-            f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters "
+            f"{camera.source}: camera {number} is {camera.width}x{camera.height} with parameters "
             f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
             f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
         )
@@ -449,7 +449,7 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
         return Lens(camera.width, camera.height, camera.model, camera.params)
     if camera.params != sizes:
         raise DataError(
-            f"{camera.where}: camera {number} is EQUIRECTANGULAR with parameters {quote(camera.params)}; expected the "
+            f"{camera.source}: camera {number} is EQUIRECTANGULAR with parameters {quote(camera.params)}; expected the "
             f"size of its images, {camera.width}, {camera.height}: {REMEDY}"
         )
     return panorama_lens(*sizes)

@@ -32,10 +32,10 @@ ELSEWHERE = "…"  # instead of folders outside of the scene, in paths of missin
 logger = logging.getLogger("clsplat")
 
 
-def safe_join(folder: Path, name: str, where: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `where`, when the path is outside the folder."""
+def safe_join(folder: Path, name: str, source: str) -> Path:
+    """Return `folder / name`.  Raises DataError, starting with `source`, when the path is outside the folder."""
     if not _is_safe(name):
-        raise DataError(f"{where}: the file name {quote(name)} is not a path below {folder}; rename it")
+        raise DataError(f"{source}: the file name {quote(name)} is not a path below {folder}; rename it")
     return folder / name
 
 
@@ -183,15 +183,15 @@ class FileLookup:
             return f"{count} matched by {criterion}, such as {file} for {quote(self.listing[i])}{scaling}"
         return ""
 
-    def existing(self, where: Path, missing: Missing) -> list[int]:
+    def existing(self, source: Path, missing: Missing) -> list[int]:
         """Return the indices of the files that exist.
 
         Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are.
-        where: the dataset, for messages.
+        source: the dataset, for messages.
         """
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
         if absent := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
-            fault = f"{where}: {_missing_text([str(self.paths[i]) for i in absent], len(self.paths))}"
+            fault = f"{source}: {_missing_text([str(self.paths[i]) for i in absent], len(self.paths))}"
             for name in [self.listing[i] for i in absent if not _is_safe(self.listing[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:

@@ -38,10 +38,10 @@ MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
 class JsonFrame:
-    """One image of a file: its values, with those of the whole file as defaults; `where` is for messages."""
+    """One image of a file: its values, with those of the whole file as defaults; `source` is for messages."""
 
-    def __init__(self, folder: Path, where: str, values: dict[str, Any], common: dict[str, Any] | None = None) -> None:
-        self.folder, self.where = folder, where
+    def __init__(self, folder: Path, source: str, values: dict[str, Any], common: dict[str, Any] | None = None) -> None:
+        self.folder, self.source = folder, source
         self._values, self._common = values, common or {}
 
     def value(self, key: str) -> Any:
@@ -64,14 +64,14 @@ class JsonFrame:
             with suppress(ValueError):
                 value = float(value)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
-            raise DataError(f"{self.where}: {key} is {quote(value)}; expected {BELOW_MAX}: export the file again")
+            raise DataError(f"{self.source}: {key} is {quote(value)}; expected {BELOW_MAX}: export the file again")
         return float(value)
 
     def file_name(self, key: str) -> str | None:
         """Return a path with forward slashes and without a leading `./`, or None.  Raises DataError."""
         value = self.value(key)
         if value is not None and not isinstance(value, str):
-            raise DataError(f"{self.where}: {key} is {quote(value)}; expected a path below {self.folder}")
+            raise DataError(f"{self.source}: {key} is {quote(value)}; expected a path below {self.folder}")
         return None if value is None else view_name(value)
 
     def image_name(self) -> str:
@@ -79,7 +79,7 @@ class JsonFrame:
         name = self.file_name("file_path")
         if name is None:
             raise DataError(
-                f"{self.where}: it has no `file_path`; expected the path of an image: export the file again"
+                f"{self.source}: it has no `file_path`; expected the path of an image: export the file again"
             )
         return name
 
@@ -99,7 +99,7 @@ class Transforms:
 
     def moments(self) -> list[tuple[str, float | None]]:
         """Return the position in the file and the `time` of every frame.  Raises DataError if one is not a number."""
-        return [(frame.where, frame.number("time")) for frame in self.frames]
+        return [(frame.source, frame.number("time")) for frame in self.frames]
 
     def points(self, clock: Clock | None = None) -> PointCloud | None:
         """Read the points; None without a file of points."""
@@ -123,21 +123,21 @@ class FrameFiles(FileLookup):
         self.frames = frames
         self.masks: dict[str, dict[int, Path]] = {"mask_path": {}, "static_path": {}}  # by key and frame
 
-    def find_masks(self, where: Path, rows: Sequence[int]) -> None:
+    def find_masks(self, source: Path, rows: Sequence[int]) -> None:
         """Find the masks of some of the frames.  Raises DataError when one is missing."""
         for key in self.masks:
             names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
             files = FileLookup(self.root, self.folder, [*names.values()], strict=True, excluded=self.paths)
-            files.existing(where, "refuse")
+            files.existing(source, "refuse")
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
-    def views(self, where: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
+    def views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
         """Return the views of the frames.  missing: what to do about missing images.
 
         Raises DataError for damaged numbers and missing files.
         """
-        rows = self.existing(where, missing)
-        self.find_masks(where, rows)
+        rows = self.existing(source, missing)
+        self.find_masks(source, rows)
         return [self.view(i, clock) for i in rows]
 
     def view(self, i: int, clock: Clock | None = None) -> View:
@@ -225,7 +225,7 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
-            f"{frame.where}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
+            f"{frame.source}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
             f"from w, h (at most {MAX_SIDE}) and fl_x, fl_y or camera_angle_x: export the file again"
         )
     cx, cy = frame.number("cx"), frame.number("cy")
@@ -241,7 +241,7 @@ def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> fl
     if length is not None or angle is None:
         return length
     if not 0 < angle < math.pi:
-        raise DataError(f"{frame.where}: {angle_key} is {angle}; expected an angle in (0, pi): export the file again")
+        raise DataError(f"{frame.source}: {angle_key} is {angle}; expected an angle in (0, pi): export the file again")
     return pixels / 2 / math.tan(angle / 2)
 
 
@@ -255,7 +255,7 @@ def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
     if keys is None or surplus:
         fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
-            f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
+            f"{frame.source}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "export the cameras with one of these, or pinhole images without distortion"
         )
     params = (camera.fx, camera.fy, camera.cx, camera.cy, *(values[key] for key in keys))
@@ -271,7 +271,7 @@ def read_pose(frame: JsonFrame) -> Floats:
         matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
     if not is_finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
-            f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
+            f"{frame.source}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
             "remove that frame or export the file again"
         )
     camera_to_world = np.eye(4)
@@ -424,7 +424,7 @@ def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.where}: label is {quote(label)}; expected the number of its halvings, 0 to 8: make it again"
+                f"{frame.source}: label is {quote(label)}; expected the number of its halvings, 0 to 8: make it again"
             )
         frames.append(frame)
     return frames

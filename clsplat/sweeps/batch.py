@@ -62,7 +62,7 @@ def has_result(source: Path, target: Path) -> bool:
             "and run the sweep again with --resume"
         )
     state = RunState.read(target)
-    return state.phase is Phase.DONE and state.sums == read_sums(source) and not state.damaged
+    return state.phase is Phase.DONE and state.sums == read_sums(source) and not state.bad_files
 
 
 PROGRESS_INTERVAL_S = 2.0  # between two reads of the cells' status files
@@ -97,7 +97,7 @@ class Batch:
     def on_change(self, started: str | None) -> None:
         """Called when a cell has started, with its name, or has ended, with None."""
 
-    def require_held(self) -> None:
+    def require_lock(self) -> None:
         """Raise OutputError if the folder now belongs to another process."""
 
     def run(self, execution: Execution, device: str | None) -> None:
@@ -192,7 +192,7 @@ class Batch:
         result, target = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.recording(cell.name):
             if self.overwrites or not has_result(result, target):
-                self.require_held()
+                self.require_lock()
                 copy_result(result, target)
 
 
@@ -323,5 +323,5 @@ class _Sweep(Batch):
         self.status.note(done=len({*self.outcomes, *self.failures}), failed=self.failures.texts())
         self.status.refresh()
 
-    def require_held(self) -> None:
-        self.status.require_held()
+    def require_lock(self) -> None:
+        self.status.require_lock()

@@ -271,7 +271,7 @@ def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterat
     with run_folder.open_run_folder(state, start, cells=count, done=0, failed={}) as status, recording_failures(status):
         write_text(out / PIPELINE, experiment.text)
         yield status, failures
-        status.require_held()
+        status.require_lock()
         compare(experiment, out, failures)
         if failures:
             raise failures.summary(count)

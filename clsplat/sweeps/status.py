@@ -84,15 +84,15 @@ def _figures(folder: CellFolder) -> dict[str, Any]:
 def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
     """Return the state of a cell by its last attempt."""
     status = read_status(attempt.path)
-    silent = now - attempt.last_beat
+    silence = now - attempt.last_beat
     failure = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
     if attempt.exit_code is not None:
         state = "stopped" if attempt.exit_code == 130 else "waiting"
     else:
-        state = "running" if silent < NO_BEAT_S else "silent"
+        state = "running" if silence < NO_BEAT_S else "silent"
     progress = {key: status.get(key) for key in ("step", "gaussians", "seconds_left", "stage", "device")}
     worker = {key: attempt.lease.get(key) for key in ("host", "worker")}
-    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker, **failure}
+    return {"state": state, "silent": round(max(0.0, silence)), **progress, **worker, **failure}
 
 
 def overview_text(status: dict[str, Any]) -> str:

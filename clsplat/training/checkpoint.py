@@ -383,7 +383,7 @@ def _warn_once(text: str) -> None:
 
 
 def _write(run: Run, kind: str) -> Path:
-    run.status.require_held()
+    run.status.require_lock()
     run.records.write()  # the state counts them
     state = State(
         format=FORMAT,

@@ -37,10 +37,10 @@ class Records:
     Lines are buffered until their stage is done, because a failed stage is repeated on resume.
     """
 
-    def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None) -> None:
-        """require_held: raises OutputError if the run no longer holds the folder's lock."""
+    def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None) -> None:
+        """require_lock: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
-        self._require_held = require_held
+        self._require_held = require_lock
         self.path, self.trial = out / RECORDS, out / TRIAL
         self.lines = 0  # of metrics.jsonl in the state of the run, including buffered ones
         self.lines_at_stage = 0  # of them at the start of the stage, which a resumed run repeats

@@ -84,7 +84,7 @@ class Run:
     on_step: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
-        self.records = Records(self.out, self.status.require_held)
+        self.records = Records(self.out, self.status.require_lock)
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}

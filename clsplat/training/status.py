@@ -129,11 +129,11 @@ class StatusFile:
     took over the folder, nothing is written, and the next `note` raises OutputError.
     """
 
-    def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None, **values: Any) -> None:
-        """require_held: raises OutputError if the run no longer holds the folder's lock."""
+    def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None, **values: Any) -> None:
+        """require_lock: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
-        self.lost: OutputError | None = None  # the error that `require_held` raised
-        self._require_held = require_held
+        self.lost: OutputError | None = None  # the error that `require_lock` raised
+        self._require_held = require_lock
         now = time.time()
         old = read_status(out)
         checkpoint = old.get("checkpoint")
@@ -164,7 +164,7 @@ class StatusFile:
         self.write()
         self._start_heartbeat()
 
-    def require_held(self) -> None:
+    def require_lock(self) -> None:
         """Raise OutputError if the run no longer holds its folder; called before each write there."""
         try:
             self._require_held()
@@ -216,7 +216,7 @@ class StatusFile:
 
         Raises OutputError if another run has taken over the folder.
         """
-        self.require_held()
+        self.require_lock()
         outer = {"stage": self.now.stage, "progress": self.now.progress}
         start, nested_before = time.perf_counter(), self._nested_seconds
         self._nested_seconds = 0.0
@@ -247,7 +247,7 @@ class StatusFile:
             self._write()
 
     def _write(self) -> None:
-        self.require_held()
+        self.require_lock()
         now = self.now.model_copy(update={"time": time.time()})
         write_text(self.out / STATUS, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
 

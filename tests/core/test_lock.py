@@ -325,12 +325,12 @@ def test_run_that_wakes_up_notices_the_takeover(tmp_path, monkeypatch):
             lock, "owner_record", lambda: json.dumps({**json.loads(own()), "host": "another", "boot": "another"})
         )
         first = lock.lock_folder(tmp_path)
-        require_held = first.__enter__()
+        require_lock = first.__enter__()
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": time.time() - 61}))
     lock._held.clear()
     with lock.lock_folder(tmp_path) as second:
         with pytest.raises(OutputError, match=f"replaced while .* process {os.getpid()} on .* holds it now"):
-            require_held()
+            require_lock()
         first.__exit__(None, None, None)
         second()
     assert not (tmp_path / LOCK).exists()

@@ -86,7 +86,7 @@ def test_last_stages_run_again_if_files_are_lost(saved_late, copy):
     for name in names:
         change(copy / name)
     (copy / "metrics.json").unlink()
-    assert sorted(state.RunState.read(copy).damaged) == sorted([*names, "metrics.json"])
+    assert sorted(state.RunState.read(copy).bad_files) == sorted([*names, "metrics.json"])
     command("resume", copy)
     assert damaged(copy) == []
     assert (copy / "point_cloud.ply").read_bytes() == (saved_late / "point_cloud.ply").read_bytes()

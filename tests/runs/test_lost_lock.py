@@ -43,17 +43,17 @@ def removed(out: Path) -> dict[str, bytes]:
 
 
 def test_holder_can_check_its_lock(tmp_path):
-    with lock.lock_folder(tmp_path) as require_held:
-        require_held()
+    with lock.lock_folder(tmp_path) as require_lock:
+        require_lock()
         (tmp_path / LOCK).unlink()
         with pytest.raises(OutputError, match=f"{GONE}; nothing more was written") as gone:
-            require_held()
+            require_lock()
         assert gone.value.exit_code == 7
         (tmp_path / LOCK).write_text(OTHER)
         with pytest.raises(OutputError, match=f"{GONE}, and process 4321 on there holds it now; "):
-            require_held()
+            require_lock()
     assert (tmp_path / LOCK).read_text() == OTHER, "the other's is left alone"
-    require_held()  # after the block it is nobody's matter
+    require_lock()  # after the block it is nobody's matter
 
 
 def run(scene: Path, out: Path) -> None:

@@ -170,4 +170,4 @@ def test_run_state_follows_from_its_folder(name, tmp_path):
         (tmp_path / file).write_text(text)
     state = RunState.read(tmp_path)
     assert state.phase is phase
-    assert state.damaged == (["checksums.json"] if phase is Phase.DONE else [])
+    assert state.bad_files == (["checksums.json"] if phase is Phase.DONE else [])

@@ -134,7 +134,7 @@ def edits(device: Device, rng: np.random.Generator) -> Results:
         if gaussians.count != len(source):
             continue
         after = {name: gaussians.get(name) for name in gaussians.tables}
-        yield equal("list_rows", f"places after {label}", after["sh_rest"], before["sh_rest"][source])
+        yield equal("list_rows", f"rows after {label}", after["sh_rest"], before["sh_rest"][source])
         split = action[source] == ref.SPLIT
         second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
         fresh = split | ((action[source] == ref.CLONE) & second)

@@ -266,7 +266,7 @@ def _coverage(points: PointFacts) -> Iterator[Finding]:
 
 
 def _are(count: int, word: str, prefix: str = "") -> str:
-    """Return a count with its verb: `3 views are`, or with `before`: `are only 3 views`."""
+    """Return a count with its verb: `3 views are`, or with a prefix: `are only 3 views`."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {prefix}{pluralize(count, word)}" if prefix else f"{pluralize(count, word)} {verb}"
 

@@ -116,7 +116,7 @@ class Appearance(TrainingModule):
         return Decay(initial=initial, final=final, over=steps)
 
     def resolve_auto(self, run: Run) -> "Appearance":
-        """Return the module with the choice of `when: auto`, unless it was made before."""
+        """Decide whether `when: auto` is on, unless decided before, and return the module with the decision."""
         if self.when == "always" or self.chosen is not None:
             return self
         exposures = estimate_exposures(run)

@@ -77,12 +77,12 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
-            raise DataError(f"{frame.where}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
+            raise DataError(f"{frame.source}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
         matrix = {"transform_matrix": _rows(entry.get("camera_to_world"))}
-        pose = np.linalg.inv(read_pose(JsonFrame(path.parent, frame.where, matrix)))[:3]
+        pose = np.linalg.inv(read_pose(JsonFrame(path.parent, frame.source, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
-            raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1; export the path again")
+            raise DataError(f"{frame.source}: render_time is {time:g}; expected 0 to 1; export the path again")
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
     return CameraPath(views, rate, size)
 
@@ -146,7 +146,7 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
     try:
         return check_size((width, height)), check_fps(30.0 if fps is None else fps)
     except ConfigError as error:
-        raise DataError(f"{document.where}: {error}; export the path again") from error
+        raise DataError(f"{document.source}: {error}; export the path again") from error
 
 
 def _rows(numbers: Any) -> Any:
@@ -197,7 +197,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
     except (ValueError, TypeError, OverflowError, IndexError):
         matrix = np.empty(0)
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
-        raise DataError(f"{frame.where}: {key} is not 3x4 numbers with a rotation; export the file again")
+        raise DataError(f"{frame.source}: {key} is not 3x4 numbers with a rotation; export the file again")
     return matrix
 
 
