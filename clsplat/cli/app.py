@@ -112,8 +112,8 @@ class Common:
     device: str | None
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(value: bool) -> None:
+    if value:
         terminal.show(f"clsplat {full_version()}")
         raise typer.Exit
 

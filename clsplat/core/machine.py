@@ -190,7 +190,7 @@ class Owner:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is known to have exited; False for most processes on other hosts or in other containers.
+        """Whether the process is known to have exited; False for most processes on other hosts or in other containers.
 
         A process of an earlier boot has exited if it ran outside containers: containers on two machines may share a
         name.

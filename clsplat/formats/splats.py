@@ -117,7 +117,7 @@ class SplatFile:
     @property
     def sh_degree(self) -> int:
         """The SH degree."""
-        return sh_degree_of(self.parameters["sh_rest"].shape[1])
+        return columns_to_sh_degree(self.parameters["sh_rest"].shape[1])
 
     @property
     def has_sky(self) -> bool:
@@ -151,7 +151,7 @@ def sh_coefficients(degree: int) -> int:
     return (degree + 1) ** 2
 
 
-def sh_degree_of(columns: int) -> int:
+def columns_to_sh_degree(columns: int) -> int:
     """Return the SH degree of a table sh_rest with `columns` columns."""
     degree: int = round((1 + columns / 3) ** 0.5) - 1
     return degree
@@ -167,7 +167,7 @@ def with_degree(parameters: Parameters, degree: int) -> Parameters:
 
 def concatenate(parts: Sequence[Parameters]) -> Parameters:
     """Concatenate the rows of several tables, with their largest SH degree."""
-    degree = max(sh_degree_of(part["sh_rest"].shape[1]) for part in parts)
+    degree = max(columns_to_sh_degree(part["sh_rest"].shape[1]) for part in parts)
     tables = [with_degree(part, degree) for part in parts]
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 

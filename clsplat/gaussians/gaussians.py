@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError
-from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients, sh_degree_of
+from clsplat.formats.splats import MOTION, PARAMETERS, columns_to_sh_degree, sh_coefficients
 from clsplat.gaussians.sh_offload import HostTables, slot_defines
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, Struct, check_rows, moment_tables
@@ -85,7 +85,7 @@ class Gaussians:
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _align(self.count)
-        self.sh_degree = sh_degree_of(parameters["sh_rest"].shape[1])
+        self.sh_degree = columns_to_sh_degree(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
         self.deferred: DeferredUpdates | None = None  # deferred Adam updates
         self.on_host: HostTables | None = None  # tables in host memory

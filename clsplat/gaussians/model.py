@@ -26,11 +26,11 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
+    columns_to_sh_degree,
     inverse_opacities,
     not_finite,
     opacities,
     sh_coefficients,
-    sh_degree_of,
     transform,
     usual_near,
 )
@@ -187,7 +187,7 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """The SH degree."""
-        return sh_degree_of(self.sh_rest.shape[1])
+        return columns_to_sh_degree(self.sh_rest.shape[1])
 
     @property
     def near(self) -> float:

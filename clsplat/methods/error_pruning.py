@@ -26,9 +26,9 @@ RESOLUTION = 256  # the search for the number to prune is accurate to 1/256 of t
 def squared_error(survey: Survey, views: list[View]) -> float:
     """Return the squared error of the renders, summed over unmasked pixels."""
     total = 0.0
-    for look in survey.render(views):
-        difference = inside(look.frame, look.frame.image.get()) - look.photograph.image() / np.float32(255)
-        total += float((difference[look.counted()].astype(np.float64) ** 2).sum())
+    for render in survey.render(views):
+        difference = inside(render.frame, render.frame.image.get()) - render.photograph.image() / np.float32(255)
+        total += float((difference[render.counted()].astype(np.float64) ** 2).sum())
     return total
 
 

@@ -28,12 +28,12 @@ def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongP
     """Count the wrong pixels that each Gaussian contributes to, over `views` training views."""
     sampled = survey.sample_views(views)
     total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
-    for look in survey.render(sampled):
-        error, counted = look.error().astype(np.float64), look.counted()
+    for render in survey.render(sampled):
+        error, counted = render.error().astype(np.float64), render.counted()
         is_wrong = counted & (normalize(error, counted) > error_above)
-        pixels = look.sum(BLENDED, is_wrong).astype(np.int64)  # integers below 2^24: exact in float32
+        pixels = render.sum(BLENDED, is_wrong).astype(np.int64)  # integers below 2^24: exact in float32
         total += pixels
-        weighted += look.loss(LOSSES) * pixels
+        weighted += render.loss(LOSSES) * pixels
     return WrongPixels(total // max(len(sampled), 1), normalize(weighted, np.ones(len(weighted), bool)))
 
 

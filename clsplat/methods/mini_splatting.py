@@ -37,8 +37,8 @@ def find_unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
     A view needs its heaviest Gaussians, which together make up the fraction `weight_per_view` of its weight.
     """
     hidden = np.zeros((len(survey.views), survey.count), bool)
-    for row, look in zip(hidden, survey.render(survey.views), strict=True):
-        row[:] = (look.radius() > 0) & ~heaviest(look.sum(WEIGHT).astype(np.float64), weight_per_view)
+    for row, render in zip(hidden, survey.render(survey.views), strict=True):
+        row[:] = (render.radius() > 0) & ~heaviest(render.sum(WEIGHT).astype(np.float64), weight_per_view)
     return hidden
 
 

@@ -22,11 +22,11 @@ def normalize_by_median(values: NDArray[np.floating]) -> Floats:
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 
 
-def pixel_weights(look: RenderedView) -> Floats:
+def pixel_weights(render: RenderedView) -> Floats:
     """Return the error of a view's pixels plus the edges of its photograph, each scaled to [0, 1], [height, width]."""
-    counted = look.counted()
-    edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
-    return normalize(look.error().astype(np.float64), counted) + normalize(edges, counted)
+    counted = render.counted()
+    edges = np.abs(scipy.ndimage.laplace(render.photograph.image().mean(axis=2), mode="nearest"))
+    return normalize(render.error().astype(np.float64), counted) + normalize(edges, counted)
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
@@ -37,13 +37,13 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
     sampled = survey.sample_views(views)
-    for view, look in zip(sampled, survey.render(sampled), strict=True):
-        radius = look.radius()
+    for view, render in zip(sampled, survey.render(sampled), strict=True):
+        radius = render.radius()
         row = view.world_to_camera[2]
-        depth = (look.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
-        pixels = look.sum(BLENDED, pixel_weights(look)), look.sum(BLENDED, np.ones(look.counted().shape))
-        values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, look.sum(WEIGHT))
-        loss = look.loss(LOSSES) * (radius > 0)
+        depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
+        pixels = render.sum(BLENDED, pixel_weights(render)), render.sum(BLENDED, np.ones(render.counted().shape))
+        values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, render.sum(WEIGHT))
+        loss = render.loss(LOSSES) * (radius > 0)
         losses += loss
         terms += loss * sum(factor * normalize_by_median(np.where(radius > 0, value, 0)) for factor, value in values)
     return losses, terms

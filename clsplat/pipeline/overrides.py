@@ -39,7 +39,7 @@ def split(text: str) -> tuple[list[str], str]:
 
 
 def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
-    """Change the data, in which each stage has its name as `stage`; return the key path in the file.
+    """Apply `KEY=VALUE` to a file's data, whose stages have the form {stage: NAME, …}; return the key path in the file.
 
     Raises OverrideError.
     """

@@ -111,7 +111,7 @@ class RunState:
         """Return how training longer differs from a run that was planned as long; '' if it is the same."""
         training = self.pipeline.settings.training
         last = training.steps
-        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.due(last)]
+        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(last)]
         if not names or self.status.get("step", 0) < last:
             return ""
         return f"'{names[0]}' was due at step {last}, the last one, so the result differs from a run planned as long"

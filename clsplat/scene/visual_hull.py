@@ -54,7 +54,7 @@ class Silhouette:
         return Projection(inside, row[inside], column[inside], depth[inside])
 
     def radius(self, size: float, depth: Floats) -> int:
-        """Return an upper bound, px, of the projected radius of a ball at the smallest of some depths."""
+        """Return an upper bound, px, of the projected radius of a ball of radius `size` at any of these depths."""
         c = self.view.camera
         slant = math.hypot(1, max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy)
         return min(math.ceil(slant * size * max(c.fx, c.fy) / float(depth.min())), max(c.width, c.height))

@@ -127,7 +127,7 @@ class ValidatedTraining(Training):
             return
         last = first + self.steps
         stages = [stage for stage in self.order_stages(self.during) if _validates(stage)]
-        if not any(stage.due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
+        if not any(stage.is_due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs a measurement of the validation views until the last step; lower "
                 "the `every` of `evaluate` in `during`, or remove it to get a default one"
@@ -303,7 +303,7 @@ class Optimize(ValidatedTraining):
             memory.check(count, offload_advice(run))
         is_tight = memory.host or memory.limit < ROOMY * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
-        forecast = Forecast.from_rules(run.step, last_step, [stage.due for stage in self._density])
+        forecast = Forecast.from_rules(run.step, last_step, [stage.is_due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
@@ -363,7 +363,7 @@ class Optimize(ValidatedTraining):
             return
         run.image_downscale = views.divisor(run.step)
         with run.editing_tables():
-            for stage in (stage for stage in self.during if stage.edits and stage.due(run.step)):
+            for stage in (stage for stage in self.during if stage.edits and stage.is_due(run.step)):
                 stage.act(run)
             run.edited = True
 
@@ -391,7 +391,7 @@ class Optimize(ValidatedTraining):
         photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.prefetch(sampler.at(run.step + number).view for number in ahead)
-        stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
+        stale = {name for stage in self.during if stage.is_due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.differentiate(photograph, run.step, sample.transforms)
         return view, set() if run.stage_step == self.steps else stale

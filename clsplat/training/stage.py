@@ -119,7 +119,7 @@ class Scheduled(Stage):
     def finish(self, run: Run) -> None:
         """Finish after the last step of the training; a resumed run may call this again."""
 
-    def due(self, step: int, is_last: bool = False) -> bool:
+    def is_due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step.  is_last: whether it is the last of the training."""
         if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):
             return False
@@ -197,7 +197,7 @@ class Training(Stage):
         """Return the stages of `during` that will run in a training that starts after a global step."""
         last = step + self.steps
         before = range(step + 1, last)  # no edit runs after the last step
-        return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
+        return [s for s in self.inner if any(map(s.is_due, before)) or (not s.edits and s.is_due(last, True))]
 
     @property
     def inner(self) -> list[Scheduled]:
@@ -225,7 +225,7 @@ class Training(Stage):
     def act_between(self, run: Run) -> None:
         """Run the due stages that do not edit; a failed stage runs again on resume."""
         for index, stage in enumerate(self.inner):
-            due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
+            due = run.stage_step > 0 and (stage.is_due(run.step, self.has_ended(run)) or stage.is_overdue(run))
             if index < run.during_index or stage.edits or not due:
                 continue
             run.during_index = index + 1  # before it runs, for the checkpoint that it may write

@@ -148,7 +148,7 @@ class Blocks:
         if len(self.scene.original.downscales) > 1:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
-    def question(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and model."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
         texts = {
@@ -264,7 +264,7 @@ def train_in_blocks(
     execution: where blocks are trained, as cells of a sweep store.  Raises ClsplatError, which names a failed block.
     """
     blocks = Blocks(scene, out, plan or BlocksPlan(), device, execution)
-    with claim_folder(out, blocks.question(), RECORD, "a scene in blocks", "another --out"):
+    with claim_folder(out, blocks.identity(), RECORD, "a scene in blocks", "another --out"):
         partition = blocks.partition()
         if only_plan:
             return {**blocks.plan_data(partition), "run": None}

@@ -245,7 +245,7 @@ class Search:
 
     out: Path
     target: CompressionTarget
-    question: dict[str, Any]  # inputs and options that identify the search
+    identity: dict[str, Any]  # inputs and options that identify the search
     source: Point  # the original model
     split: str  # name of the measured views
     scene: str  # name on pages
@@ -259,7 +259,7 @@ class Search:
         """Return the record of the search as JSON data."""
         chosen = self.chosen
         return {
-            **self.question,
+            **self.identity,
             "target": self.target.text,
             "split": self.split,
             "source": asdict(self.source),
@@ -271,7 +271,7 @@ class Search:
         """Write the measurements as JSON and as a page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
         measured = self.target, self.source, self.points, self.chosen, self.split
-        write_text(self.out / PAGE, page(*measured, self.scene, self.question["model"], result))
+        write_text(self.out / PAGE, page(*measured, self.scene, self.identity["model"], result))
 
 
 def compress(
@@ -301,13 +301,13 @@ def compress(
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
     require_static(source.file, first.to_splat_file(), form)
-    question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
-    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": fractions, "steps": steps}
+    identity: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
+    identity |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": fractions, "steps": steps}
     size = model_bytes(source.file)  # fails for a damaged model, before the folder is created
-    with claim_folder(out, question, RECORD, "a search", "another --out"):
+    with claim_folder(out, identity, RECORD, "a search", "another --out"):
         warn_about_losses(_result_path(out, form), first.to_splat_file())
         original = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
-        search = Search(out, goal, question, original, measurer.split, source.scene_name)
+        search = Search(out, goal, identity, original, measurer.split, source.scene_name)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
         previous = 1.0
         for keep in fractions:

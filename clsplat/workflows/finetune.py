@@ -152,30 +152,31 @@ def _has_name(stage: Any, name: str) -> bool:
 
 # A folder in which models are trained for one set of inputs, so that interrupted work can resume.
 
-LABELS = {"sha256": "the model's bytes"}  # of keys of a question, for messages
+LABELS = {"sha256": "the model's bytes"}  # of keys of an identity, for messages
 
 
 @contextmanager
-def claim_folder(out: Path, question: dict[str, Any], record: str, content: str, remedy: str) -> Iterator[None]:
-    """Create and lock a folder, write the question to its record, and remove files of killed processes.
+def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str, remedy: str) -> Iterator[None]:
+    """Create and lock a folder, write the identity of the work to its record, and remove files of killed processes.
 
-    content: a noun for messages, such as "a search"; remedy: what to give instead of this folder.
+    identity: inputs and options of the work, by key; content: a noun for messages, such as "a search"; remedy: what to
+    give instead of this folder.
     Raises ConfigError if the folder belongs to something else, and OutputError if another process uses it.
     """
-    _require_same_question(out, question, record, content, remedy)
+    _require_same_identity(out, identity, record, content, remedy)
     with raising_output_error(out):
         make_folder(out)
     with lock.lock_folder(out):
-        _require_same_question(
-            out, question, record, content, remedy
+        _require_same_identity(
+            out, identity, record, content, remedy
         )  # again, because another process may have started
         remove_partial_files(out, border=PIPELINE)
         if not (out / record).exists():
-            write_text(out / record, json.dumps(question, indent=1) + "\n")
+            write_text(out / record, json.dumps(identity, indent=1) + "\n")
         yield
 
 
-def _require_same_question(out: Path, question: dict[str, Any], record: str, content: str, remedy: str) -> None:
+def _require_same_identity(out: Path, identity: dict[str, Any], record: str, content: str, remedy: str) -> None:
     """Raise ConfigError if a folder has the record of other inputs, or files but no record."""
     if not path_exists(out / record):
         if path_exists(out) and not (out.is_dir() and all(_is_leftover(path.name) for path in out.iterdir())):
@@ -187,7 +188,7 @@ def _require_same_question(out: Path, question: dict[str, Any], record: str, con
         previous = None
     if not isinstance(previous, dict):
         raise ConfigError(f"{out / record}: is not the record of {content}; remove {out} or give {remedy}")
-    differing = [LABELS.get(key, key) for key, value in question.items() if previous.get(key) != value]
+    differing = [LABELS.get(key, key) for key, value in identity.items() if previous.get(key) != value]
     if differing:
         raise ConfigError(f"{out}: has {content} that differs in {', '.join(differing)}; remove it or give {remedy}")
 

@@ -78,10 +78,10 @@ class LevelTrainer:
         """Return a context that locks the training folder, if anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
-        question: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
-        question |= {"keep": self.plan.keep, "steps": self.steps, "downscale": self.plan.downscale}
-        question["photographs"] = self.measurer.identity()
-        return claim_folder(self.folder, question, RECORD, "the training of levels", "the name of another folder")
+        identity: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
+        identity |= {"keep": self.plan.keep, "steps": self.steps, "downscale": self.plan.downscale}
+        identity["photographs"] = self.measurer.identity()
+        return claim_folder(self.folder, identity, RECORD, "the training of levels", "the name of another folder")
 
     def measure(self, model: Model) -> DetailLevel:
         """Measure the PSNR of a level without training it."""

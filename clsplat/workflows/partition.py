@@ -129,8 +129,8 @@ class Membership:
         return np.asarray(best | self.inside | (self.coverage > self.min_coverage))
 
     @property
-    def assigned(self) -> NDArray[np.bool_]:
-        """As `view_blocks`, [V, B], but a block without views gets the view that shows most of it."""
+    def assignment(self) -> NDArray[np.bool_]:
+        """Which view trains which block, [V, B]: `view_blocks`; a block without views gets the one with most of it."""
         blocks = self.view_blocks
         for block in np.flatnonzero(~blocks.any(axis=0)):
             blocks[self.coverage[:, block].argmax(), block] = True
@@ -264,7 +264,7 @@ class Partitioner:
                 float(pairs[owner == number].sum() / (pairs.sum() or 1)),
                 start := needed[number] | (owner == number),
                 self._view_entries(members, number),
-                self._memory(int(start.sum()), np.flatnonzero(members.assigned[:, number]).tolist()),
+                self._memory(int(start.sum()), np.flatnonzero(members.assignment[:, number]).tolist()),
                 self.model.origin,
             )
             for number, cell in enumerate(partition_cells)
@@ -283,7 +283,7 @@ class Partitioner:
             coverage[view], visible = view_coverage(render, owner, len(partition))
             visible_in_block[Membership(coverage[[view]], inside[[view]], min_coverage).view_blocks[0]] |= visible
         members = Membership(coverage, inside, min_coverage)
-        for view, block in np.argwhere(members.assigned & ~members.view_blocks):
+        for view, block in np.argwhere(members.assignment & ~members.view_blocks):
             (render,) = self._render([self.views[view]])
             visible_in_block[block] |= view_coverage(render, owner, len(partition))[1]
         return members, visible_in_block | ~visible_in_block.any(
@@ -302,7 +302,7 @@ class Partitioner:
                 "why": members.reason(view, block),
                 "share": round(float(members.coverage[view, block]), 4),
             }
-            for view in np.flatnonzero(members.assigned[:, block]).tolist()
+            for view in np.flatnonzero(members.assignment[:, block]).tolist()
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:

@@ -138,16 +138,16 @@ def test_correct_device_is_checked_once(monkeypatch, info, empty_cache):
 
 @pytest.mark.parametrize("variable", ["PYOPENCL_BUILD_OPTIONS", "POCL_VECTORIZER_PREFER_VECTOR_WIDTH", "CL_CONFIG_X"])
 def test_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
-    before = quick._record(info, "wide", "radix")
+    before = quick._record_file(info, "wide", "radix")
     monkeypatch.setenv(variable, "-DTILE=8")
-    assert quick._record(info, "wide", "radix") != before
+    assert quick._record_file(info, "wide", "radix") != before
     assert host.system()["environment"][variable] == "-DTILE=8"
 
 
 def test_cache_path_does_not_change_the_record(monkeypatch, info, tmp_path):
-    before = quick._record(info, "wide", "radix")
+    before = quick._record_file(info, "wide", "radix")
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
-    assert quick._record(info, "wide", "radix") == before
+    assert quick._record_file(info, "wide", "radix") == before
 
 
 def test_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):

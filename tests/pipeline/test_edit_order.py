@@ -24,7 +24,7 @@ def edits(training: Training, recipe: Training) -> list[tuple[int, int]]:
     found = [(int(step), -1) for step in training.views.changes]
     for place, stage in enumerate(training.during):
         if stage.edits and recipe.during[place].every != 1:
-            found += [(step, place) for step in range(1, training.steps) if stage.due(step)]
+            found += [(step, place) for step in range(1, training.steps) if stage.is_due(step)]
     return sorted(found)
 
 
@@ -78,7 +78,7 @@ def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
 def test_averaging_starts_after_growth_even_in_few_steps(steps):
     """It began before in 200 steps: 40 cadences of 2.9 steps, each cut to 2, end sooner than 2 of 47."""
     training = stretch_to_steps(load("fast").settings, steps).training
-    last = [max([0, *(n for n in range(1, steps) if stage.due(n))]) for stage in training.during]
+    last = [max([0, *(n for n in range(1, steps) if stage.is_due(n))]) for stage in training.during]
     (average,) = [stage for stage in training.during if stage.stage == "average"]
     assert all(
         average.start >= step for step, stage in zip(last, training.during, strict=True) if stage.stage == "densify"

@@ -72,7 +72,7 @@ def test_every_scheduled_stage_of_a_shipped_pipeline_acts():
             last = before + loop.steps
             for stage in loop.during:
                 steps = range(before + 1, last + (0 if stage.edits else 1))  # nothing is edited after the last step
-                if not any(stage.due(step) for step in steps):
+                if not any(stage.is_due(step) for step in steps):
                     faults.append(f"{name}: {stage.stage}, every {stage.every}")
             before = last
     assert not faults, "\n".join(faults)

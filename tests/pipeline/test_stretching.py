@@ -34,7 +34,7 @@ def test_stretched_long_recipe_equals_the_short_one():
     assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233.334, 23.3334, 116, 3500)
     assert [rule.start for rule in densify.rules] == [0, 0, 0, 700]
     assert (reset.every, reset.stop) == (700.002, 3500)
-    assert [step for step in range(1, 7000) if white.due(step)] == [116]
+    assert [step for step in range(1, 7000) if white.is_due(step)] == [116]
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -68,7 +68,7 @@ def test_stages_that_end_act_equally_often(name, factor):
         if before.stop is None or before.every == 1:
             continue
         counts = [
-            sum(stage.due(step) for step in range(1, training.steps))
+            sum(stage.is_due(step) for step in range(1, training.steps))
             for stage, training in ((before, old), (after, new))
         ]
         assert counts[0] == counts[1], before
@@ -107,7 +107,7 @@ def test_stretched_average_starts_at_the_same_fraction(tmp_path, steps):
     assert new == stretch_to_steps(settings, steps).training
     (average,) = [stage for stage in new.during if stage.stage == "average"]
     assert average.start == 2000 * steps // 3400
-    assert sum(average.due(step) for step in range(1, steps)) == 27
+    assert sum(average.is_due(step) for step in range(1, steps)) == 27
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_corrected_step_count_keeps_later_stages(tmp_path, name, done, left):
     assert new.steps == done + left
     for before, after in zip(settings.training.during, new.during, strict=True):
         for step in range(1, done + 1):
-            assert before.due(step) == after.due(step)
+            assert before.is_due(step) == after.is_due(step)
         assert before.start <= done or done < after.start + 1 < new.steps
 
 
@@ -136,7 +136,7 @@ def test_corrected_count_is_after_growth_and_small_photographs(name):
     is_fixed = not isinstance(resolution, DetailDivisor)
     assert at_step(resolution, last) == at_step(resolution, training.steps) if is_fixed else last >= resolution.until
     grows = [stage for stage in training.during if stage.stage == "densify" and stage.stop]
-    assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
+    assert not any(stage.is_due(step) for stage in grows for step in range(last, training.steps))
 
 
 def test_detail_schedule_is_not_cut_before_full_size():

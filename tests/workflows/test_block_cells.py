@@ -65,7 +65,7 @@ def test_views_belong_by_camera_by_coverage_or_to_the_best_block():
     inside = np.array([[False, False, False], [False, True, False], [False, False, False]])
     members = Membership(share, inside, min_coverage=0.05)
     chosen = [[True, True, True], [True, True, False], [True, False, False]]  # the last block has but a best view
-    assert members.assigned.tolist() == chosen
+    assert members.assignment.tolist() == chosen
     reasons = [members.reason(view, block) for view, block in ((0, 0), (1, 0), (1, 1), (0, 2))]
     assert reasons == ["coverage", "best", "inside", "best"]
 
