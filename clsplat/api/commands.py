@@ -387,7 +387,7 @@ def convert(
     """Merge models into one file, in the format of its extension; return `format`, `gaussians`, and `bytes`.
 
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
-    drop_below: an opacity.  Gaussians that are not finite are dropped.
+    drop_below: an opacity.  Gaussians that are not finite, or without rotation, are dropped.
     time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
     timestamp, to the folder `out` as PLY, or to files named `out` with a number added; world: write world coordinates
     instead of an origin.

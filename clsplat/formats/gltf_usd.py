@@ -10,6 +10,7 @@ does not say whether viewers rotate SH with a node.
 import base64
 import json
 import logging
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, one_line, quote
+from clsplat.core.errors import DataError, first_few, one_line, quote
 from clsplat.core.files import is_inside
 from clsplat.core.harmonics import map_colors
 from clsplat.core.quaternions import rotation_matrix
@@ -51,6 +52,7 @@ LOG = logging.getLogger("clsplat")
 EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or without effect
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SHARED = 8  # times that a byte may be read on average, because equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
@@ -72,6 +74,9 @@ class Gltf:
         self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
         self.notes: set[str] = set()  # about the file, for the user
         self.is_mip = False
+        if unknown := [name for name in tree.get("extensionsRequired", []) if not SUPPORTED.fullmatch(name)]:
+            names = first_few(list(map(quote, unknown)))
+            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it without")
         pairs = [(part, matrix) for mesh, matrix in self._meshes() for part in tree["meshes"][mesh]["primitives"]]
         self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
@@ -211,6 +216,11 @@ class Gltf:
         if uri in self.files and (uri or not number):
             return self.files[uri]
         data = None
+        if isinstance(uri, str) and re.match("https?://", uri):
+            raise DataError(
+                f"{self.path}: buffer {number} is at {quote(uri)}, and clsplat does not read from the web; download it "
+                "into the folder of the file, and change its uri to the file name"
+            )
         if uri is None:
             data = None if number else self.binary
         elif uri.startswith("data:"):

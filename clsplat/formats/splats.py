@@ -317,9 +317,9 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Refuse, drop, or keep Gaussians with NaN or infinity; dropping includes values that are too large.
+    """Refuse, drop, or keep Gaussians with NaN or infinity.
 
-    Raises DataError.
+    Dropping includes values that are too large, and quaternions of length 0.  Raises DataError.
     """
     is_invalid = not_finite(splats.parameters)
     if options.not_finite == "drop":
@@ -328,6 +328,10 @@ def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFi
         if is_invalid.any():
             LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(is_invalid.sum()):,}")
         is_invalid |= exceeds_limit(splats.parameters)
+        has_rotation = splats.parameters["quats"].any(axis=1)
+        if count := int((~has_rotation).sum()):
+            LOG.warning("%s: dropped %s Gaussians with quaternions of length 0", path, f"{count:,}")
+        is_invalid |= ~has_rotation
         return splats.rows(~is_invalid) if is_invalid.any() else splats
     if options.not_finite == "keep" or not is_invalid.any():
         return splats

@@ -391,15 +391,15 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
 
 
 class _Gzip:
-    """A gzip member, read in parts.  Raises DataError if it is damaged."""
+    """The members of a gzip file, read in parts.  Raises DataError if one is damaged."""
 
     def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.file, self.stream = path, io.BytesIO(data), zlib.decompressobj(31)
+        self.path, self.data, self.file, self.stream = path, data, io.BytesIO(data), zlib.decompressobj(31)
 
     def read(self, size: int) -> bytes:
         """Return `size` bytes, or fewer at the end."""
         data = bytearray()
-        while len(data) < size and not self.stream.eof:
+        while len(data) < size and (not self.stream.eof or self._start_member()):
             packed = self.stream.unconsumed_tail or self.file.read(BLOCK)
             try:
                 part = self.stream.decompress(packed, size - len(data))
@@ -412,8 +412,17 @@ class _Gzip:
             data += part
         return bytes(data)
 
+    def _start_member(self) -> bool:
+        """Start the next gzip member; return False if there is none."""
+        start = self.file.tell() - len(self.stream.unused_data)
+        if self.data[start : start + 2] != b"\x1f\x8b":
+            return False
+        self.file.seek(start)
+        self.stream = zlib.decompressobj(31)
+        return True
+
     def require_end(self) -> None:
-        """Raise DataError if the gzip member is incomplete or followed by other data."""
+        """Raise DataError if the last gzip member is incomplete or followed by other data."""
         if not self.stream.eof:
             raise DataError(f"{self.path}: is truncated before the checksum of its gzip data; copy or export it again")
         if rest := len(self.stream.unused_data) + len(self.file.read()):

@@ -97,7 +97,7 @@ def verdict(report: dict[str, Any]) -> str:
     if not report["gaussians"]:
         return f"{report['model']}: it has no Gaussians; export it again"
     remedy = "write it again" if report["format"] == "streamed SOG" else "export it again"
-    if report["degenerate"]["not_finite"]:
+    if report["degenerate"]["not_finite"] or report["degenerate"]["no_rotation"]:
         remedy += ", or drop invalid Gaussians with `clsplat convert`"
     return f"{report['model']}: {'; '.join(report['findings'])}; {remedy}"
 

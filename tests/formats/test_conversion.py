@@ -267,6 +267,14 @@ def test_nonfinite_gaussians_are_dropped(tmp_path, rng, caplog):
         write(tmp_path / "b.glb", bad)
 
 
+def test_gaussians_without_rotation_are_dropped(tmp_path, rng, caplog):
+    bad = splats(rng, 20)
+    bad.parameters["quats"][3:5] = 0
+    write_ply(tmp_path / "a.ply", bad.parameters, {})
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 18
+    assert "dropped 2 Gaussians with quaternions of length 0" in caplog.text
+
+
 @pytest.mark.parametrize(("table", "value"), [("log_scales", 3e38), ("sh_base", -3e38), ("sh_rest", 1e16)])
 def test_values_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_path, rng, caplog):
     large = splats(rng, 20, 1)

@@ -180,6 +180,14 @@ REFUSED = {
     "asset": (change(["asset"], []), "its JSON is damaged"),
     "no splats": (change(["meshes", 0, "primitives", 0, "extensions"], {}), "has no Gaussians"),
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
+    "required extension": (
+        change(["extensionsRequired"], [KHR, "KHR_materials_unlit", "EXT_mesh_gpu_instancing"]),
+        "requires 'EXT_mesh_gpu_instancing', which clsplat cannot read; export it without",
+    ),
+    "web": (
+        change(["buffers", 0, "uri"], "https://a.org/a.bin"),
+        "buffer 0 is at 'https://a.org/a.bin', .* not read from the web; download it",
+    ),
     "elsewhere": (
         change(["buffers", 0, "uri"], "../a.bin"),
         "buffer 0 is '../a.bin'; expected data in the file, or a file in its folder",
