@@ -58,7 +58,9 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         if isinstance(error, DataError):
             raise
         empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
-        reason = shorten(one_line(error) or type(error).__name__)
+        reason = shorten(
+            (error.strerror if isinstance(error, OSError) else "") or one_line(error) or type(error).__name__
+        )
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"the disk cannot read it: {error.strerror}") from error
         raise DataError("is empty" if empty else f"differs from its checksum ({reason})") from error

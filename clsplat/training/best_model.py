@@ -50,7 +50,7 @@ class Best(BaseModel):
     """The scores of the best model so far."""
     degree: Annotated[int, Field(ge=0, le=3)]
     """Active degree of its spherical harmonics."""
-    metrics: dict[str, dict[str, Any]]
+    metrics: dict[str, dict[str, dict[str, Any]]]
     """Average metrics of the best model, by split and downscale."""
     scalars: dict[str, float] = {}
     """The scalars of the run at the step of the best model."""

@@ -39,6 +39,7 @@ from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.image import psnr
+from clsplat.scene.scene import SPLITS
 from clsplat.training import archive, best_model, field
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.archive import Arrays, split
@@ -50,7 +51,10 @@ from clsplat.training.sh_offload import make_room
 
 # The notes of a checkpoint: the state of a run without its tables.
 
-Count = Annotated[int, Field(ge=0)]
+LARGEST = 10**15  # counts and seconds above are damage; float64 holds all smaller whole numbers
+Count = Annotated[int, Field(ge=0, le=LARGEST)]
+Seconds = Annotated[float, Field(ge=0, le=LARGEST)]
+Metrics = dict[str, dict[str, dict[str, Any]]]  # averages by split and downscale factor
 
 
 class State(BaseModel):
@@ -72,9 +76,9 @@ class State(BaseModel):
     scalars: dict[str, float]  # of rules and budgets
     modules: dict[str, dict[str, float]]  # scalars of training modules, by type
     best: Best | None  # the best model by validation
-    train_seconds: float
-    cpu_seconds: float  # in the same time
-    metrics: dict[str, dict[str, Any]]
+    train_seconds: Seconds
+    cpu_seconds: Seconds  # in the same time
+    metrics: Metrics
     records: Count  # lines of metrics.jsonl
     model_hashes: dict[str, str]  # SHA-256 of model files, by path in the run folder
     changes: list[str]
@@ -325,10 +329,26 @@ def load(path: Path) -> tuple[State, Arrays]:
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    if state.stage_index > len(state.pipeline.get("stages", ())):  # equal if all stages have ended
+    scene, stages = (state.pipeline.get(key) for key in ("scene", "stages"))
+    if not isinstance(scene, dict) or not isinstance(stages, list):
+        raise DataError("its pipeline has no scene or no stages")
+    if state.stage_index > len(stages):  # equal if all stages have ended
         raise DataError(f"it has no stage {state.stage_index}")
+    for metrics in (state.metrics, state.best.metrics if state.best else {}):
+        _check_metrics(metrics)
     check_run_tables(state, tables)
     return state, tables
+
+
+def _check_metrics(metrics: Metrics) -> None:
+    """Raise DataError if metrics are not those of a run: numbers, except for reasons and the origin of LPIPS."""
+    averages = [figures for by_downscale in metrics.values() for figures in by_downscale.values()]
+    numbers = [
+        value for figures in averages for name, value in figures.items() if not re.search("_reason$|lpips_", name)
+    ]
+    is_complete = all(figures.get(name) is not None for figures in averages for name in ("psnr", "ssim", "views"))
+    if not (metrics.keys() <= set(SPLITS) and is_complete and all(isinstance(x, int | float | None) for x in numbers)):
+        raise DataError("its metrics are not those of a run")
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:

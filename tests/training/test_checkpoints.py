@@ -39,6 +39,13 @@ CRAFTED = {
     "other numbers": lambda notes, arrays: arrays.update({"stats/seen": arrays["stats/seen"].astype(np.float64)}),
     "not finite": lambda notes, arrays: arrays["gaussians/means"].fill(np.nan),
     "a moment not finite": lambda notes, arrays: arrays["adam/quats/moment2"].fill(np.inf),
+    "endless records": lambda notes, arrays: notes.update(records=10**30),
+    "time that is not a number": lambda notes, arrays: notes.update(train_seconds=float("nan")),
+    "words as metrics": lambda notes, arrays: notes.update(
+        metrics={"test": {"1": {"psnr": "x", "ssim": 1, "views": 2}}}
+    ),
+    "an unknown split": lambda notes, arrays: notes.update(metrics={"x": {}}),
+    "no scene": lambda notes, arrays: notes["pipeline"].pop("scene"),
     "no settings": lambda notes, arrays: notes.update(pipeline={}, stage_index=1),
 }
 
