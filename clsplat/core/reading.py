@@ -22,6 +22,22 @@ KINDS = {
     stat.S_IFBLK: "a device",
 }
 
+STARTS = (  # of files that are not what their names say: their first bytes, content, and remedy
+    (b"version https://git-lfs", "a Git LFS pointer", "fetch the content with `git lfs pull`"),
+    (b"<!doctype", "a web page", "download the file itself"),
+    (b"<html", "a web page", "download the file itself"),
+    (b"\x1f\x8b", "compressed with gzip", "unpack it"),
+)
+
+
+def require_content(path: Path, data: bytes) -> None:
+    """Raise DataError, with the cause, if a file that starts with `data` is empty or a failed download."""
+    if not data:
+        raise DataError(f"{path}: the file is empty; copy or export it again")
+    for start, content, remedy in STARTS:
+        if data.lstrip()[: len(start)].lower() == start:
+            raise DataError(f"{path}: the file is {content}; {remedy}")
+
 
 @contextmanager
 def open_file(

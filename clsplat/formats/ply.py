@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote, shorten
-from clsplat.core.reading import open_file
+from clsplat.core.reading import open_file, require_content
 from clsplat.formats.packing import open_hashed
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
@@ -99,6 +99,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
     """
     end = END.search(data, 0, MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
+        require_content(path, data)
         raise DataError(
             f"{path}: not a PLY file; expected a header from 'ply' to 'end_header' in its first {MAX_HEADER} bytes; "
             "copy or export it again"

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.core.reading import read_file
+from clsplat.core.reading import read_file, require_content
 from clsplat.formats.packing import (
     from_smallest_three,
     morton_order,
@@ -370,7 +370,10 @@ def _gzip(data: bytes) -> bytes:
 def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     """Decode header, parameters, and declared axes of versions 1 to 3, in gzip or plain."""
     stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
-    header = SpzHeader.parse(path, stream.read(HEADER))
+    start = stream.read(HEADER)
+    if start[:3] == b"ply":
+        require_content(path, data)  # says that it is compressed
+    header = SpzHeader.parse(path, start)
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
     _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded(data)))

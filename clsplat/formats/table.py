@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shorten
-from clsplat.core.reading import open_file
+from clsplat.core.reading import open_file, require_content
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply
 from clsplat.formats.gltf_usd import gltf_files, looks_like_gltf, read_gltf, write_glb, write_usda
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, check_rendering, parse_ply_header, read_ply, write_ply
@@ -190,12 +190,15 @@ def endings(reads: bool = False) -> list[str]:
 def detect(path: Path) -> Codec | None:
     """Return the format of a file by its content, or None; without a magic number, the name must fit, too.
 
-    Raises DataError if the file cannot be read.
+    Raises DataError if the file cannot be read, is empty, or is a failed download.
     """
     with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
     named = format_of_name(path)
-    return next((c for c in CODECS if c.matches(start) and (c.has_magic or named in (None, c))), None)
+    codec = next((c for c in CODECS if c.matches(start) and (c.has_magic or named in (None, c))), None)
+    if codec is None or not start.size:
+        require_content(path, start.data)
+    return codec
 
 
 def format_of_name(path: Path) -> Codec | None:

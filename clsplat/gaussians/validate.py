@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.reading import open_file
+from clsplat.formats.ply import MAX_HEADER
 from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message, typical_size
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_of_name, model_file
@@ -22,11 +24,18 @@ DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "fl
 
 
 def is_model(path: Path) -> bool:
-    """Return whether a path is a model, by content or name; pipeline files are not."""
+    """Return whether a path is a model, by content or name, or another binary file; pipeline files are not."""
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
-    return bool(format_of_name(file) or file.suffix.lower() in UNSUPPORTED or (file.is_file() and detect(file)))
+    if format_of_name(file) or file.suffix.lower() in UNSUPPORTED:
+        return True
+    return file.is_file() and (detect(file) is not None or _is_binary(file))
+
+
+def _is_binary(path: Path) -> bool:
+    with open_file(path) as file:
+        return b"\0" in file.read(MAX_HEADER)
 
 
 def examine(path: Path) -> dict[str, Any]:

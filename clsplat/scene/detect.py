@@ -52,13 +52,18 @@ def find_reader(path: Path) -> Reader | None:
 
 
 MAX_DEPTH = 2  # folders between a scene and the dataset in it
+DEEPEST = 4  # if there is none up to MAX_DEPTH
 logger = logging.getLogger("clsplat")
 
 
 def find_datasets(path: Path) -> list[Reader]:
-    """Return the reader of the dataset in a folder, otherwise of all datasets one or two levels below."""
+    """Return the reader of the dataset in a folder, otherwise of all datasets one or two levels below, or deeper."""
+    return _find_datasets(path, MAX_DEPTH) or _find_datasets(path, DEEPEST)
+
+
+def _find_datasets(path: Path, depth: int) -> list[Reader]:
     datasets = list[Reader]()
-    for folder, _ in walk_folders(path, MAX_DEPTH):
+    for folder, _ in walk_folders(path, depth):
         if not any(folder.is_relative_to(reader.folder) for reader in datasets) and (reader := find_reader(folder)):
             reader.root, reader.folder = path, folder
             datasets.append(reader)

@@ -230,8 +230,8 @@ def _stem(name: str) -> str:
 
 
 def _keys(parts: Parts) -> set[str]:
-    """Return the stems that files of a name may have: `a` for a.jpg, and `a.jpg` for a.jpg.png."""
-    return {_stem(parts[-1]), parts[-1]} if parts else set()
+    """Return the stems that files of a name may have: for a.jpg.png, `a.jpg.png`, `a.jpg`, and `a`."""
+    return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 
 def _common_end(a: Parts, b: Parts) -> int:

@@ -1,5 +1,6 @@
 """`clsplat convert` and `clsplat check MODEL`."""
 
+import gzip
 import json
 import re
 import shutil
@@ -492,6 +493,25 @@ def test_empty_result_is_an_error(tmp_path, rng):
         with pytest.raises(DataError, match="the model has no Gaussians, or none with valid values"):
             clsplat.convert(tmp_path / name, tmp_path / "c.ply")
     assert not (tmp_path / "c.ply").exists()
+
+
+FOREIGN = {
+    "lfs.ply": (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer; fetch the content with `git lfs"),
+    "page.spz": (b"\n<!DOCTYPE html>", "the file is a web page; download"),
+    "page.html": (b"<html>", "the file is a web page; download"),
+    "empty.glb": (b"", "the file is empty; copy"),
+    "a.ply.gz": (gzip.compress(b"ply\nformat ascii 1.0\nend_header\n"), "the file is compressed with gzip; unpack"),
+    "a.b3dm": (b"b3dm\1\0\0\0", "unknown model format"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_check_and_convert_give_the_same_cause(name, tmp_path):
+    content, words = FOREIGN[name]
+    (tmp_path / name).write_bytes(content)
+    for command in (clsplat.check, lambda file: clsplat.convert(file, tmp_path / "out.ply")):
+        with pytest.raises(DataError, match=f"{name}: .*{words}"):
+            command(tmp_path / name)
 
 
 def test_model_file_is_refused_as_a_pipeline(tmp_path, rng):

@@ -114,7 +114,7 @@ def test_refusals(tmp_path, rng):
     broken = {
         "truncated": (data[:-10], "truncated"),
         "header only": (data[:200], "not a PLY"),
-        "empty": (b"", "not a PLY"),
+        "empty": (b"", "the file is empty; copy"),
         "text": (b"hello", "not a PLY"),
         "huge count": (data.replace(b"element vertex 20", b"element vertex 99999999999999"), "truncated"),
         "ascii": (data.replace(b"binary_little_endian", b"ascii"), "expected one number for each property"),

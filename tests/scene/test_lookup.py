@@ -54,6 +54,7 @@ MATCHES = {  # the kind of dataset, the names in it, and the files on disk in th
     "dots and no suffix": (JSON, ["train.r.000", "train.r.001"], ["train.r.000.png", "train.r.001.png"]),
     "copies": ("colmap", ["a.jpg", "b.HEIC"], ["images/a.png", "images/b.jpg"]),
     "a second suffix": ("colmap", ["a.jpg"], ["images/a.jpg.png"]),
+    "a second suffix in the model": ("colmap", ["a.png.png"], ["images/a.png"]),
     "the folder in the name": ("colmap", ["images/a.jpg"], ["images/a.jpg"]),
     "next to the JSON": (JSON, ["images/a.jpg"], ["a.jpg"]),
     "input": ("colmap", ["a.jpg"], ["input/a.jpg"]),

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Camera, PointCloud, Reader, Scene, View, make_scene
 from clsplat.scene.colmap import ColmapReader
-from clsplat.scene.detect import format_names, is_scene, read_scene, readers
+from clsplat.scene.detect import find_datasets, format_names, is_scene, read_scene, readers
 from tests.support.orbit_scene import orbit, photograph, write
 from tests.support.refusals import refusal
 
@@ -147,3 +147,13 @@ def test_impossible_camera_is_refused_from_any_reader(tmp_path, changes):
 @pytest.mark.parametrize("pose", [np.zeros((3, 4)), np.full((3, 4), np.nan), np.eye(4)])
 def test_invalid_pose_is_a_data_error_from_any_reader(pose):
     assert "the pose of 'a.png'" in refusal(View, "a.png", Camera(64, 48, 60.0, 60.0, 32.0, 24.0), pose)
+
+
+def test_deep_dataset_is_found_if_there_is_no_other(tmp_path):
+    for folder in ("a/b/c", "a/b/c/d/e"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "transforms.json").write_text("{}")
+    assert [reader.folder for reader in find_datasets(tmp_path)] == [tmp_path / "a" / "b" / "c"]
+    (tmp_path / "z").mkdir()
+    (tmp_path / "z" / "transforms.json").write_text("{}")
+    assert [reader.folder for reader in find_datasets(tmp_path)] == [tmp_path / "z"]
