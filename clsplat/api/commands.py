@@ -330,7 +330,7 @@ def run_cell(
 ) -> Path:
     """Run a cell of a matrix, or a pipeline as a cell, and store its result; return the folder of the result.
 
-    index: of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
+    index: index of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
     """
     from clsplat.runs.model_file import with_scene_path
     from clsplat.sweeps.batch import run_one

@@ -414,7 +414,7 @@ MIN_DISTANCE2 = 4.0e-9  # extents², so that coincident points still get a size:
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0, extent: float = 1.0) -> Parameters:
     """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors.
 
-    extent: of the scene, scene units; used for a single point.
+    extent: extent of the scene, scene units; used for a single point.
     """
     count = len(points)
     log_scales = 0.5 * np.log(neighbor_distance2(points.positions, extent)) + math.log(scale)
@@ -433,7 +433,7 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
     """Return the exact mean squared distance to the three nearest neighbors, [N] scene units².
 
-    extent: of the scene, scene units; used for a single point.
+    extent: extent of the scene, scene units; used for a single point.
     """
     neighbors = min(4, len(positions))
     if neighbors < 2:

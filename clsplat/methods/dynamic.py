@@ -94,7 +94,7 @@ def divide_logits_in_time(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def require_motion(name: str, gaussians: Gaussians) -> None:
-    """Raise ConfigError if the Gaussians do not move.  name: of the rule or loss."""
+    """Raise ConfigError if the Gaussians do not move.  name: name of the rule or loss."""
     if not gaussians.is_moving:
         raise ConfigError(f"'{name}' needs Gaussians that move; set `model.time`, or remove '{name}'")
 

@@ -70,7 +70,7 @@ class Stillness:
         self._stations = {camera_key(group[0]): Station() for group in cameras[:MAX_CAMERAS]}
 
     @property
-    def held(self) -> int:
+    def camera_count(self) -> int:
         """The number of cameras whose sums are in memory."""
         return len(self._stations)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.nerf.shape import COLOR_ROWS, GRID, LAYERS, SAMPLES, DenseLayer, FieldShape, in_blocks
+from clsplat.nerf.shape import COLOR_ROWS, GRID, LAYERS, SAMPLES, DenseLayer, FieldShape, round_to_blocks
 from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
@@ -258,7 +258,7 @@ class Encoding:
                 rows=features.shape[1],
                 first_row=first + shape.grid_rows,
                 degrees=shape.degrees,
-                written=in_blocks(6 * shape.degrees),
+                written=round_to_blocks(6 * shape.degrees),
                 **shared,
             )
         features, first = self.network.direction(samples.tiles)

@@ -85,7 +85,7 @@ assert FEATURES == BLOCK  # so that the rows of a grid's level are whole blocks
 Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
 
 
-def in_blocks(count: int) -> int:
+def round_to_blocks(count: int) -> int:
     """Round a number of features up to a multiple of BLOCK."""
     return -(-count // BLOCK) * BLOCK
 
@@ -186,12 +186,12 @@ class FieldShape(Settings):
     @property
     def position_rows(self) -> int:
         """Number of rows of the encoded position."""
-        return sum(map(in_blocks, self.position_parts))
+        return sum(map(round_to_blocks, self.position_parts))
 
     @property
     def direction_rows(self) -> int:
         """Number of rows of the encoded direction."""
-        return in_blocks(3 + 6 * self.direction_degrees)
+        return round_to_blocks(3 + 6 * self.direction_degrees)
 
     @property
     def layers(self) -> list[DenseLayer]:
@@ -207,8 +207,8 @@ class FieldShape(Settings):
             inputs, rows = list[int](), 0
             for part in parts:
                 inputs += range(rows, rows + part)
-                rows += in_blocks(part)
-            layers.append(DenseLayer(name, first, tuple(inputs), rows, outputs, in_blocks(outputs)))
+                rows += round_to_blocks(part)
+            layers.append(DenseLayer(name, first, tuple(inputs), rows, outputs, round_to_blocks(outputs)))
             first = layers[-1].end
         return layers
 

@@ -138,7 +138,7 @@ class LearnedField(TrainedField):
         self.update(self._gradient, adam, self.updates)
 
     def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
-        """Update the parameters with Adam and a gradient, [P].  number: of the update, counted from 1."""
+        """Update the parameters with Adam and a gradient, [P].  number: number of the update, from 1."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,

@@ -88,7 +88,7 @@ def write_inputs(run: Run) -> None:
 def require_same_inputs(scene: Path, identity: Identity | None, out: Path, digest: str = "") -> None:
     """Raise ConfigError, with the changes, if a run was started with other photos, cameras, or points.
 
-    digest: of the earlier inputs, if a checkpoint has it.
+    digest: digest of the earlier inputs, if a checkpoint has it.
     """
     previous = _read_identity(out / INPUTS)
     digest = digest or (previous.digest if previous else "")

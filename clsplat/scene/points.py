@@ -44,7 +44,7 @@ class PointTable(NamedTuple):
     def cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the finite points; log the number of the others.
 
-        clock: of the frames; without it, points have no times.  Raises DataError for times in another unit.
+        clock: clock of the frames; without it, points have no times.  Raises DataError for times in another unit.
         """
         finite, times = self.is_finite(), None
         if not finite.all():

@@ -25,7 +25,7 @@ from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
-from clsplat.training.sh_offload import offload_advice, place_harmonics
+from clsplat.training.sh_offload import offload_advice, offload_harmonics
 from clsplat.training.stage import Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
@@ -349,7 +349,7 @@ class Optimize(ValidatedTraining):
             run.refresh_filter()
         for stage in self.during:
             stage.attach(run)
-        place_harmonics(run)
+        offload_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.resolve(views.full_size(last_step))

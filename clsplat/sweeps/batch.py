@@ -249,7 +249,7 @@ def run_one(
 ) -> Path:
     """Run a cell of a matrix, or a pipeline as a cell, unless its result is in the store; return its folder.
 
-    index: of the cell in the matrix, from 0.  Raises ClsplatError with the exit code of the run.
+    index: index of the cell in the matrix, from 0.  Raises ClsplatError with the exit code of the run.
     """
     experiment = load_experiment(pipeline, overrides)
     if experiment is None:

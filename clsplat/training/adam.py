@@ -81,7 +81,7 @@ class Rates(Settings):
     def at(self, step: int, extent: float) -> dict[str, float]:
         """Return the rates at a global step by the names of parameters and of motion fields.
 
-        extent: of the scene, scene units.  Raises ConfigError unless `resolve` was called.
+        extent: extent of the scene, scene units.  Raises ConfigError unless `resolve` was called.
         """
         if isinstance(self.means, FullSizeDecay):
             raise ConfigError(

@@ -51,7 +51,7 @@ class MotionRates(Settings):
         return [name for name in type(self).model_fields if name != "min_duration"]
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates at a global step by field name, and `min_duration`.  extent: of the scene, scene units."""
+        """Return the rates at a global step by field name, and `min_duration`.  extent: scene extent, scene units."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
         return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
 

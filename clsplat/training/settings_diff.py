@@ -22,7 +22,7 @@ class Difference(NamedTuple):
         return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"
 
     def is_moved_file(self, old_hashes: Mapping[str, str], new_hashes: Mapping[str, str]) -> bool:
-        """Return whether a file was only moved.  old_hashes, new_hashes: of the files that settings name, by path."""
+        """Return whether a file was only moved.  old_hashes, new_hashes: hashes of input files, by path."""
         is_text = isinstance(self.old, str) and isinstance(self.new, str)
         return is_text and self.old in old_hashes and old_hashes[self.old] == new_hashes.get(self.new)
 

@@ -13,7 +13,7 @@ FACTOR = 2  # on the number of Gaussians; an edit rarely adds more
 VIEWS = 16  # rendered to measure how many Gaussians a view sees
 
 
-def place_harmonics(run: Run) -> None:
+def offload_harmonics(run: Run) -> None:
     """Move the harmonics to the host before a training, if the settings require it or the device is too small.
 
     Must be called before Adam allocates their moments, which are larger.

@@ -62,7 +62,7 @@ def block_pipeline(
 ) -> Pipeline:
     """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: of the whole scene; fraction: of the pipeline's steps to train, with the rates of `_with_fewer_steps`.
+    extent: extent of the whole scene; fraction: part of the steps to train, with the rates of `_with_fewer_steps`.
     """
     data, last, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
     stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:last], start)]
@@ -77,7 +77,7 @@ def block_pipeline(
 
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
-    """Return the stages after training, for the merged model: evaluation, export, and reports."""
+    """Return a pipeline that starts from the merged model and runs the stages after training, or only exports it."""
     data, last = pipeline.resolved(), _count_until_last_edit(pipeline)
     stages = [*_with_start(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
     return checked(pipeline.path, Document({**data, "stages": stages}))
@@ -141,7 +141,7 @@ def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 def _limit_densify(densify: Densify, block: Block) -> Densify:
     """Limit a densify stage to the cell of a block and its share, by pairs, of the number of Gaussians."""
-    changed: dict[str, Any] = {"inside": block.growth}
+    changed: dict[str, Any] = {"inside": block.growth_box}
     if densify.max_gaussians is not None:
         changed["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
         if min(schedule_values(changed["max_gaussians"])) < 1:

@@ -124,7 +124,7 @@ class CompressionTarget:
         return cls(text.strip(), max_bytes=int(value * UNITS[unit]))
 
     def is_met(self, point: Point, psnr: float) -> bool:
-        """Return whether a file meets the target; psnr: of the original model, dB."""
+        """Return whether a file meets the target; psnr: PSNR of the original model, dB."""
         if self.max_bytes is not None:
             return point.bytes <= self.max_bytes
         return point.psnr >= psnr + (self.psnr_change or 0)

@@ -196,13 +196,13 @@ class Block:
         return self.cell.box.shifted(-self.origin)
 
     @property
-    def growth(self) -> Box:
+    def growth_box(self) -> Box:
         """The box in which Gaussians grow, in world coordinates."""
         return self.cell.extended(GROWTH).shifted(-self.origin)
 
     def data(self) -> dict[str, Any]:
         """Return the block's entry in the manifest."""
-        boxes = {"cell": self.box, "growth": self.growth}
+        boxes = {"cell": self.box, "growth": self.growth_box}
         return {
             "name": self.name,
             **{name: box.model_dump() for name, box in boxes.items()},

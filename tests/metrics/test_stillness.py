@@ -94,10 +94,10 @@ def test_static_scene_has_no_stillness_metrics(rng):
 def test_camera_with_one_time_needs_no_row_and_no_memory(rng, static):
     renders, photographs = stacks(rng)
     moving = [moment(f"m{i}", i / 19, x=1.0 + i, static_path=static) for i in range(20)]
-    assert Stillness(moving).held == 0
+    assert Stillness(moving).camera_count == 0
     fixed = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     places = [moment(f"p{i}{k}", k / 2, x=-1.0 - i) for i in range(9) for k in range(2)]
-    assert Stillness([*places, *fixed]).held == 8
+    assert Stillness([*places, *fixed]).camera_count == 8
     _, figures = gathered([*moving[:MOMENTS], *fixed], [*renders, *renders], [*photographs, *photographs])
     assert figures == gathered(fixed, renders, photographs)[1] != {}
 

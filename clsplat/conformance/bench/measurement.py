@@ -36,7 +36,7 @@ class _Times(BaseModel):
     densify: float
 
 
-class _Earlier(BaseModel):
+class _EarlierMeasurement(BaseModel):
     """The part of an earlier measurement that a comparison reads."""
 
     model_config = ConfigDict(extra="ignore")
@@ -52,7 +52,7 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
     name = load(pipeline).settings.name
     data = read_json(path, EXPECTED, ConfigError)
     try:
-        actual = _Earlier.model_validate(data)
+        actual = _EarlierMeasurement.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
         key_path = ".".join(map(str, first["loc"])) or "the file"

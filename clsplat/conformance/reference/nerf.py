@@ -79,9 +79,9 @@ class Composite:
 
     def weights(self) -> tuple[Floats, Floats]:
         """Return the weights of the samples, and the transmittance behind each, [R, N]."""
-        left = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
-        before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
-        return before - left, left
+        behind = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
+        in_front = np.concatenate([np.ones_like(behind[:, :1]), behind[:, :-1]], axis=1)
+        return in_front - behind, behind
 
     def colors(self) -> Floats:
         """Return the colors of the rays, [R, 3]."""
@@ -90,13 +90,13 @@ class Composite:
 
     def backward(self, grad_colors: Floats) -> tuple[Floats, Floats]:
         """Return the gradients of the raw colors and densities from those of the colors of the rays, [R, 3]."""
-        (colors, _), (weights, left) = self.samples, self.weights()
+        (colors, _), (weights, transmittance) = self.samples, self.weights()
         sigmoid = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
         grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * sigmoid * (1 - sigmoid)
         grad_weights = (grad_colors[:, None] * (colors - self.background)).sum(axis=-1)
         behind = np.cumsum((weights * grad_weights)[:, ::-1], axis=1)[:, ::-1] - weights * grad_weights
         slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
-        return grad_raw, (left * grad_weights - behind) * self.lengths * slope
+        return grad_raw, (transmittance * grad_weights - behind) * self.lengths * slope
 
 
 # Cones of pixels, their samples, and the encodings of the samples.

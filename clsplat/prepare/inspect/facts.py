@@ -169,7 +169,7 @@ class PointFacts:
 
 
 def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
-    """Measure the points of a dataset with points.  extent: of the cameras; centers: camera centers, [N, 3]."""
+    """Measure the points of a dataset with points.  extent: extent of the cameras; centers: their centers, [N, 3]."""
     assert parts.points is not None
     positions = parts.points.positions
     finite = (np.abs(positions) < MAX_VALUE).all(axis=1)

@@ -271,6 +271,6 @@ def row_length(shape: Sequence[int]) -> int:
 
 
 def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
-    """Return the bytes of grids on the device.  shape: nx, ny, nz; rows: of the largest view, in whole tiles."""
+    """Return the bytes of grids on the device.  shape: nx, ny, nz; rows: rows of the largest view, in whole tiles."""
     row, columns = row_length(shape), ENTRIES * shape[0] * shape[2]
     return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows)

@@ -399,7 +399,7 @@ def color_gradients(
 ) -> tuple[Array, Callable[[], Floats]]:
     """Return the gradient of `image`, and a function that waits for that of the matrix and returns it, [3, 4].
 
-    gradient: of the result of `transform_colors`.  Row sums are added in double precision, in order.
+    gradient: gradient of the result of `transform_colors`.  Row sums are added in double precision, in order.
     """
     grad_image, sums = workspace.array("grad_colored", image.shape), workspace.array("color sums", (SUMS, camera.rows))
     workspace.device.program("colors.cl").colors_backward(

@@ -60,7 +60,7 @@ class SkipBackward(TrainingModule):
         return SkipBackwardState(self, run.scene.split("train"))
 
     def decide(self, name: str, loss: float, scalars: Mapping[str, float]) -> Visit:
-        """Decide whether to skip a step after `start`.  name: of the scalar that holds the view's average."""
+        """Decide whether to skip a step after `start`.  name: name of the scalar that holds the view's average."""
         if not math.isfinite(loss):
             return Visit()
         steps, full, warm_up, above = (scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
