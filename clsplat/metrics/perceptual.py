@@ -20,8 +20,8 @@ from clsplat.core.reading import read_file
 # LPIPS with a network from a local ONNX file, run by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
-READ_SECONDS = 300  # a slow machine reads a network of 60 MB and runs it
-_read: set[str] = set()  # digests of the networks that OpenCV reads without a crash
+SECONDS = 300  # a slow machine reads a network of 60 MB, and runs it on images of up to one megapixel
+_tested: set[tuple[str, int, int]] = set()  # digest, height, and width: networks that run without a crash
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 
 
@@ -37,25 +37,20 @@ class Lpips:
         data = read_file(path, "an ONNX file of LPIPS")
         self.path, self.inputs = path, inputs
         self.digest = hashlib.sha256(data).hexdigest()
-        if self.digest not in _read:
-            child = run_module("clsplat.metrics.perceptual", seconds=READ_SECONDS, stdin=data)
-            if child.crash:
-                raise DataError(
-                    f"{path}: OpenCV {cv2.__version__} {child.crash} when it reads this file; export the network again"
-                )
-            _read.add(self.digest)
+        self._data, gray = data, np.full((64, 64, 3), 128, np.uint8)
+        self._test(*gray.shape[:2])
         try:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
             raise DataError(
                 f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_short(error)})"
             ) from error
-        gray = np.full((64, 64, 3), 128, np.uint8)
         if (distance := self.distance(gray, gray)) != 0:
             raise ConfigError(f"{path}: is not LPIPS; the distance of equal images is {distance:g}, expected 0")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3]."""
+        self._test(*image.shape[:2])
         try:
             for name, pixels in zip(INPUTS, (image, photograph), strict=True):
                 self._network.setInput(self._planes(pixels), name)
@@ -71,6 +66,17 @@ class Lpips:
                 f"{self.path}: expected one finite number for two images, got {output.size} of type {output.dtype}"
             )
         return float(output.ravel()[0])
+
+    def _test(self, height: int, width: int) -> None:
+        """Run the network in a child process, once per size.  Raises DataError if OpenCV crashes."""
+        if (self.digest, height, width) in _tested:
+            return
+        seconds = SECONDS * max(1.0, height * width / 1e6)
+        module, size = "clsplat.metrics.perceptual", (str(height), str(width))
+        if crash := run_module(module, *size, seconds=seconds, stdin=self._data).crash:
+            action = f"{crash} when it runs this network on images of {width}x{height}"
+            raise DataError(f"{self.path}: OpenCV {cv2.__version__} {action}; export the network again")
+        _tested.add((self.digest, height, width))
 
     def origin(self) -> dict[str, str]:
         """Return the input range and the network; values are only comparable if both are the same."""
@@ -225,5 +231,5 @@ def _flip_package() -> ModuleType:
 if __name__ == "__main__":  # a child process, which a damaged network may crash
     network = cv2.dnn.readNetFromONNX(np.frombuffer(sys.stdin.buffer.read(), np.uint8))
     for name in INPUTS:
-        network.setInput(np.zeros((1, 3, 64, 64), np.float32), name)
+        network.setInput(np.zeros((1, 3, *map(int, sys.argv[1:])), np.float32), name)
     network.forward()

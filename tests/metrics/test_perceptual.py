@@ -135,15 +135,19 @@ def test_files_that_are_not_lpips_are_refused(rng, network, tmp_path):
 
 
 def test_network_that_crashes_opencv_ends_no_process(network, monkeypatch):
-    """Children that crash in place of OpenCV, which does not crash at the same files in all versions."""
+    """Children crash instead of OpenCV, which does not crash at the same files, and image sizes, in all versions."""
     path = network()
-    ends = iter([ChildResult(-11, ""), ChildResult(0, "")])
+    ends = iter([ChildResult(-11, ""), ChildResult(0, ""), ChildResult(-11, "")])
     monkeypatch.setattr(perceptual_metrics, "run_module", lambda *words, **values: next(ends))
-    monkeypatch.setattr(perceptual_metrics, "_read", set())
-    with pytest.raises(DataError, match=r"distance.onnx: OpenCV .* crashes with SIGSEGV when it reads this file"):
+    monkeypatch.setattr(perceptual_metrics, "_tested", set())
+    crash = r"distance.onnx: OpenCV .* crashes with SIGSEGV when it runs this network on images of"
+    with pytest.raises(DataError, match=f"{crash} 64x64"):
         Lpips(path, "0..1")
     for _ in range(2):
-        Lpips(path, "0..1")
+        lpips = Lpips(path, "0..1")
+    small = np.zeros((48, 32, 3), np.uint8)
+    with pytest.raises(DataError, match=f"{crash} 32x48"):
+        lpips.distance(small, small)
 
 
 @pytest.mark.parametrize("name", ["segv.onnx", "lpips_11_1.bin"])
