@@ -144,7 +144,7 @@ def test_version_of_changed_code_differs(monkeypatch):
     monkeypatch.setattr("clsplat.core.resources.__version__", "1.0.dev0")
     first = compute()
     assert first.startswith("1.0.dev0+d")
-    monkeypatch.setattr("clsplat.core.resources._files_of_code", lambda: ["other"])
+    monkeypatch.setattr("clsplat.core.resources._list_code_files", lambda: ["other"])
     assert compute() not in (first, "1.0.dev0")
     monkeypatch.setattr("clsplat.core.resources.__version__", "1.0")
     assert compute() == "1.0"
