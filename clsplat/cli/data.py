@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat.core.errors import ConfigError
-from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
@@ -55,16 +54,6 @@ def synthetic(
     if times is not None and not moving:
         raise ConfigError("--times needs a dynamic scene; add --moving")
     print(write_dataset(out, Moving(seed=seed, **options) if moving else SyntheticOptions(seed=seed, **options)))
-
-
-@app.command()
-def multiscale(
-    source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
-    out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    levels: Annotated[int, typer.Option(min=1, max=8, help="Number of sizes: full, half, quarter, …")] = 4,
-) -> None:
-    """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
-    print(f"{write_multiscale(source, out, levels)} images written to {out}")
 
 
 @app.command()

@@ -175,5 +175,5 @@ def test_sharpest(values, parts, chosen):
 
 def test_data_tools_are_commands():
     listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
-    for name in ("photos", "video", "undistort", "multiscale", "synthetic", "fetch"):
+    for name in ("photos", "video", "undistort", "cameras", "synthetic", "fetch"):
         assert name in listing

@@ -10,12 +10,12 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
-from clsplat.data_tools.multiscale import pyramid, write_multiscale
 from clsplat.photos.sampling import Order, ViewPool
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View, load_image
+from tests.support.multiscale_scene import pyramid, write_multiscale
 from tests.support.refusals import refusal
 
 

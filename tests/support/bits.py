@@ -37,6 +37,7 @@ from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image, write_image
 from tests.support.city import City
+from tests.support.multiscale_scene import write_multiscale
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
@@ -291,7 +292,7 @@ class Place:
             write_dataset(self.folder / "city", City(size=40, train=8, test=2, lots=2), workers=1)
             thin(self.folder / "city" / "points3d.ply")
         if "multiscale" in scenes:
-            self.clsplat("data", "multiscale", "still", "multiscale", "--levels", "2")
+            write_multiscale(self.folder / "still", self.folder / "multiscale", 2)
         for name, lens in {"lens": LENS, "fisheye": FISHEYE}.items():
             self._write_lens(name, lens)
         self._write_masks()

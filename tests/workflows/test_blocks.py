@@ -13,11 +13,11 @@ import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, EmptyRegionError
 from clsplat.core.schedule import schedule_values
-from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.density.control import Box
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.workflows import finetune
+from tests.support.multiscale_scene import write_multiscale
 
 pytestmark = pytest.mark.slow
 
