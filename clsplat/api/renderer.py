@@ -21,10 +21,9 @@ from clsplat.opencl.discovery import Schedule
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Layers, layers
-from clsplat.render.rasterizer import Content, Frame, Rasterizer
+from clsplat.render.rasterizer import Content, Frame, Rasterizer, pose_gradient
 from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, to_color
-from clsplat.training.modules.camera_optimizer import pose_gradient
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]

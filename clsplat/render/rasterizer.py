@@ -1,6 +1,6 @@
 """Render Gaussians, and compute their gradients from the gradient of the image."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -143,7 +143,9 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
             deferred.catch_up(depth_key)
 
 
+LaterSums = Callable[[], np.ndarray[Any, np.dtype[np.float64]]]  # waits for sums in float64
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
+POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
 Content = Literal["color", "depth", "entropy", "inverse_depth"]
 # The planes are the color; or (depth of the mean in scene units, 1, 0); or the color and a fourth plane: the entropy of
@@ -166,6 +168,22 @@ class Frame:
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # of the planes
     model: DeviceModel  # the rendered model; a moving one at the timestamp of the camera
+
+
+def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> LaterSums:
+    """Return a function that waits for the pose gradient of the losses, [7].
+
+    The gradients are those of a translation of all Gaussians, of their rotation about the camera, in world axes, and of
+    the logarithm of a factor on the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
+    """
+    device = workspace.device
+    items = -(-model.gaussians.count // int(device.tuning["LANES"]))
+    sums = workspace.array("pose sums", (POSE_SUMS, -(-items // POSE_GROUP)))
+    device.program("poses.cl", **model.defines).pose_gradient(
+        items=items, **shape_arguments(frame.model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
+    )
+    group_sums = sums.get_later()
+    return lambda: np.cumsum(group_sums(), axis=1, dtype=np.float64)[:, -1]
 
 
 @dataclass(frozen=True)

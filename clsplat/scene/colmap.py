@@ -392,7 +392,9 @@ def find_models(path: Path) -> list[Path]:
     """Return `path` and folders below it that contain a COLMAP model, sorted by name."""
     sparse = path / "sparse"
     folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
-    return [folder for folder in folders if find_file(folder, "cameras") and find_file(folder, "images")]
+    files = {folder: sum(find_file(folder, stem) is not None for stem in ("cameras", "images")) for folder in folders}
+    complete = [folder for folder, count in files.items() if count == 2]
+    return complete or [folder for folder, count in files.items() if count == 1 and find_file(folder, "points3D")]
 
 
 def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:

@@ -179,7 +179,7 @@ def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, tmp_path, pipel
     if pipeline == "splat":
         assert json.loads(clsplat(*again, pipeline).stdout)["against"]["scenes"]["points3d"] == found
     refused = clsplat(*again, "absgs", expect=2)
-    assert f"expected the pipeline 'absgs', it has '{pipeline}'" in refused.stderr
+    assert f"expected the pipeline 'absgs', got '{pipeline}'" in refused.stderr
     assert found["work"]["gaussians"] > 100
     assert set(found["floors"]) <= set(found["stages"])
     assert 0 < found["memory"] < 2 * found["planned"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from clsplat.core.errors import DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import MODELS, PARAMETERS, read_cameras, read_images, read_point_table
 from clsplat.scene.detect import read_scene
@@ -233,6 +234,14 @@ def test_points_may_be_missing(tmp_path: Path) -> None:
     write_scene(tmp_path, tiny_model())
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     assert read_scene(tmp_path).points is None
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images"])
+def test_missing_file_of_a_model_is_named(tmp_path: Path, stem: str) -> None:
+    write_scene(tmp_path, tiny_model())
+    (tmp_path / "sparse" / "0" / f"{stem}.bin").unlink()
+    with pytest.raises(DataError, match=rf"sparse/0: no {stem}\.bin or {stem}\.txt"):
+        read_scene(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])

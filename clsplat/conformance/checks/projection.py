@@ -32,8 +32,7 @@ from clsplat.conformance.scenes import (
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
 from clsplat.render.filters import FilterViews, Smoothing
-from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
-from clsplat.training.modules.camera_optimizer import pose_gradient
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer, pose_gradient
 
 CHECKS = Checks()
 CULLED = 0xFFFFFFFF  # depth key

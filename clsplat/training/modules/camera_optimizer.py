@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -17,12 +17,9 @@ from clsplat.core.errors import DataError, PoseError, pluralize, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, explain_schedule
-from clsplat.gaussians.gaussians import DeviceModel
-from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ViewTable, adam_step
 from clsplat.render.camera import move_camera
-from clsplat.render.rasterizer import Frame, shape_arguments
-from clsplat.render.workspace import Workspace
+from clsplat.render.rasterizer import pose_gradient
 from clsplat.scene.quality import points_in_image
 from clsplat.scene.reprojection import replace_cameras
 from clsplat.scene.scene import Scene
@@ -34,7 +31,6 @@ Floats = NDArray[np.float64]
 VIEW_POSES = "view_poses.json"
 ROTATIONS, TRANSLATIONS, DEPTHS, FOCALS = "rotations", "translations", "depths", "focal_lengths"
 AXES = "x", "y", "z"
-SUMS, GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 RATE, MAX_RATE = 2e-4, 2e-3  # initial learning rates
 RATE_RATIO = 100  # of the initial rate to the final one
 ROTATION_RATIO = 0.3  # ours; a rotation about the pivot changes the image little, so its gradient is mostly noise
@@ -323,22 +319,6 @@ def median_depth(view: View, scene: Scene) -> float:
     """Return the median depth of the scene's points in a view's frustum, or the extent if there are too few points."""
     depths = points_in_image(view, scene.points)
     return float(np.median(depths)) if len(depths) >= MIN_POINTS else float(scene.extent)
-
-
-def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:
-    """Return a function that waits for the pose gradient of the losses, [7].
-
-    The gradients are those of a translation of all Gaussians, of their rotation about the camera, in world axes, and of
-    the logarithm of a factor on the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
-    """
-    device = workspace.device
-    items = -(-model.gaussians.count // int(device.tuning["LANES"]))
-    sums = workspace.array("pose sums", (SUMS, -(-items // GROUP)))
-    device.program("poses.cl", **model.defines).pose_gradient(
-        items=items, **shape_arguments(frame.model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
-    )
-    group_sums = sums.get_later()
-    return lambda: np.cumsum(group_sums(), axis=1, dtype=np.float64)[:, -1]
 
 
 def _center(pose: Floats) -> Floats:
