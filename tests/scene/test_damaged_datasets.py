@@ -161,7 +161,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
     "a photograph is missing": (without(f"images/{NAMES[2]}"), 3, MISSING),
     "the photographs are missing": (without("images"), 3, MISSING),
     "no points": (without("sparse/0/points3D.bin"), 0, ""),
-    "no cameras file": (without("sparse/0/cameras.bin"), 3, "no dataset found"),
+    "no cameras file": (without("sparse/0/cameras.bin"), 3, "no cameras.bin or cameras.txt"),
     "a folder of links to itself": (cyclic_folder, 3, MISSING),
     "a photograph that links to itself": (with_photo(lambda file: file.symlink_to(file)), 3, MISSING),
     "a photograph that is a folder": (with_photo(lambda file: file.mkdir()), 3, "it is a folder"),
