@@ -245,7 +245,7 @@ void sky_gather(
     grad_texels[channel * shown + index] = sum;
 }
 
-/* Adam on the learned texels that the view shows, each with the bias correction of its own updates: 1 - BETA^t, by the
+/* Adam on the learned texels that the view shows, with bias corrections by the updates of each: 1 - BETA^t, by the
  * recursion of the moments for a gradient of 1.  The gradient is in pixels of L1: a texel that is visible in less than
  * a pixel, as behind a wall, hardly changes.  One item = one texel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))

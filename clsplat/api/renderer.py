@@ -188,10 +188,10 @@ class Renderer:
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)
         arrays = {**{name: gradients[name] for name in model.gaussians.trained}, "mean2d": gradients.mean2d}
         tables = {name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()}
-        by_mean = by_depth[:, None] * pose[2, :3]
-        tables["means"] += by_mean.astype(np.float32)
         shift, turn, focal = np.split(pose_sums() if count else np.zeros(7), [3, 6])  # of the Gaussians, in world axes
         if depth is not None:
+            by_mean = by_depth[:, None] * pose[2, :3]
+            tables["means"] += by_mean.astype(np.float32)
             shift += by_mean.sum(axis=0)
             turn += np.cross(model.gaussians.get("means") - result.view.position, by_mean).sum(axis=0)
         rotation = pose[:, :3]

@@ -117,7 +117,8 @@ class RasterizerSettings(Settings):
     """MiB of gradient records at a time; default: the largest buffer of the device."""
     harmonics: Harmonics = "auto"
     """Memory for the spherical harmonics above band 0 and their Adam moments in training.  `host`: each step uploads
-    those that its view sees and downloads them again; the others are updated later (`optimize.update: deferred`).
+    the Gaussians that its view sees, and downloads them again; the others are updated later, as with
+    `optimize.update: deferred`.
     `auto`: the device, or the host once the device cannot hold the expected number of Gaussians."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles per launch, for devices whose display driver limits the time of a launch; 0: all."""

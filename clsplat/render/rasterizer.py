@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.core.errors import MemoryLimitError
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians, visibility_arguments
@@ -143,7 +144,6 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
             deferred.catch_up(depth_key)
 
 
-LaterSums = Callable[[], np.ndarray[Any, np.dtype[np.float64]]]  # waits for sums in float64
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
@@ -170,7 +170,9 @@ class Frame:
     model: DeviceModel  # the rendered model; a moving one at the timestamp of the camera
 
 
-def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> LaterSums:
+def pose_gradient(
+    workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array
+) -> Callable[[], NDArray[np.float64]]:
     """Return a function that waits for the pose gradient of the losses, [7].
 
     The gradients are those of a translation of all Gaussians, of their rotation about the camera, in world axes, and of

@@ -163,7 +163,7 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and th
     "EQUIRECTANGULAR": (2, _equirectangular),  # focal lengths in px per radian, instead of COLMAP's image size
 }
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover directions beside and behind the camera
+WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover directions behind the camera
 
 # Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
