@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from clsplat.core.errors import ConfigError
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
@@ -18,7 +17,6 @@ DATASET = f"The folder of a dataset: {format_names()}."
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
 Out = Annotated[Path, typer.Argument(help="Folder to write.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")]
 
 
 @app.callback()
@@ -29,31 +27,13 @@ def data() -> None:
 @app.command()
 def synthetic(
     out: Out,
-    size: Annotated[
-        int | None, typer.Option(min=8, help="Width and height of the images, pixels; default: 256, --moving: 160.")
-    ] = None,
-    train: Annotated[
-        int | None, typer.Option(min=1, help="Training views, or with --moving cameras; default: 60, or 10.")
-    ] = None,
-    test: Annotated[
-        int | None, typer.Option(min=1, help="Held-out views, or with --moving cameras; default: 12, or 2.")
-    ] = None,
-    seed: Seed = 0,
-    moving: Annotated[
-        bool, typer.Option("--moving", help="Make a dynamic scene (D-NeRF): a ball flies, a book turns, a lamp pulses.")
-    ] = False,
-    times: Annotated[
-        int | None, typer.Option(min=2, help="With --moving: times, every fifth held out; default: 30.")
-    ] = None,
+    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
+    train: Annotated[int, typer.Option(min=1, help="Training views.")] = 60,
+    test: Annotated[int, typer.Option(min=1, help="Held-out views.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
-    from clsplat.data_tools.moving import Moving
-
-    values = {"size": size, "train": train, "test": test, "times": times}
-    options = {name: value for name, value in values.items() if value is not None}
-    if times is not None and not moving:
-        raise ConfigError("--times needs a dynamic scene; add --moving")
-    print(write_dataset(out, Moving(seed=seed, **options) if moving else SyntheticOptions(seed=seed, **options)))
+    print(write_dataset(out, SyntheticOptions(size, train, test, seed)))
 
 
 @app.command()

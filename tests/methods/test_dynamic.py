@@ -14,7 +14,6 @@ import pytest
 import clsplat
 from clsplat.api.renderer import Renderer
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.data_tools.moving import Moving
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.formats.splats import MOTION
 from clsplat.gaussians.model import load
@@ -22,6 +21,7 @@ from clsplat.gaussians.structs import moment_tables
 from clsplat.stages.init_motion import add_motion, estimate_motion
 from clsplat.training import checkpoint
 from clsplat.training.memory import plan, table_widths
+from tests.support.moving_scene import Moving
 from tests.support.recipes import ONE_THREAD, STEPS, digest, short, train
 from tests.support.runs import train as train_overridden
 

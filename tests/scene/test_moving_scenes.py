@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.data_tools.moving import STATIC_SHAPES, Moving, shapes_at
 from clsplat.data_tools.sync_frames import write_sync_frames
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.prepare.inspect.findings import Inspection, summarize
@@ -22,6 +21,7 @@ from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.times import Clock, distinct_times, group_by_camera
 from clsplat.scene.times_file import write_times
+from tests.support.moving_scene import STATIC_SHAPES, Moving, shapes_at
 from tests.support.refusals import refusal
 from tests.support.transforms_scene import LENS, frames, several_cameras, write
 

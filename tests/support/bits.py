@@ -37,6 +37,7 @@ from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image, write_image
 from tests.support.city import City
+from tests.support.moving_scene import Moving
 from tests.support.multiscale_scene import write_multiscale
 
 ROOT = Path(__file__).parents[2]
@@ -279,14 +280,11 @@ class Place:
 
     def prepare(self, chosen: dict[str, Case]) -> None:
         """Make the scenes, the shortened recipes, and a model if a case starts from one."""
-        synthetic = "data", "synthetic"
-        self.clsplat(*synthetic, "still", "--size", "40", "--train", "8", "--test", "2")
+        self.clsplat("data", "synthetic", "still", "--size", "40", "--train", "8", "--test", "2")
         thin(self.folder / "still" / "points3d.ply")
         scenes = {case.scene for case in chosen.values()}
         if "moving" in scenes:
-            self.clsplat(
-                *synthetic, "moving", "--moving", "--size", "32", "--train", "3", "--test", "1", "--times", "6"
-            )
+            write_dataset(self.folder / "moving", Moving(size=32, train=3, test=1, times=6), workers=1)
             thin(self.folder / "moving" / "points3d.ply")
         if "city" in scenes:
             write_dataset(self.folder / "city", City(size=40, train=8, test=2, lots=2), workers=1)

@@ -13,13 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.progress import counted
-from clsplat.scene.images import write_image
-from clsplat.scene.points import write_points_ply
-from clsplat.scene.scene import PointCloud
-
-from .casting import World, camera_pose
-from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector
-from .still_life import (
+from clsplat.data_tools.casting import World, camera_pose
+from clsplat.data_tools.shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector
+from clsplat.data_tools.still_life import (
     SCENE_RADIUS,
     book_cover,
     candy,
@@ -33,7 +29,17 @@ from .still_life import (
     planks,
     tin,
 )
-from .synthetic import CAMERA_DISTANCE, LOOK_AT, SyntheticOptions, photographs, surface_points, write_transforms
+from clsplat.data_tools.synthetic import (
+    CAMERA_DISTANCE,
+    LOOK_AT,
+    SyntheticOptions,
+    photographs,
+    surface_points,
+    write_transforms,
+)
+from clsplat.scene.images import write_image
+from clsplat.scene.points import write_points_ply
+from clsplat.scene.scene import PointCloud
 
 MOVING_VERSION = 1  # increase it when the images change
 HELD_OUT, FIRST_HELD_OUT = 5, 2  # every fifth timestamp, from the third on
