@@ -136,14 +136,9 @@ def densify(
     """
     change = mark(edit, rules, limit, inside)
     make_room(change.after)
-    apply_marks(edit, tiler)
-    return change
-
-
-def apply_marks(edit: Edit, tiler: Tiler) -> None:
-    """Rearrange all tables according to the marks of the rules, and set the statistics to zero."""
     apply_edit(edit, tiler)
     edit.stats.clear()
+    return change
 
 
 def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Box | None = None) -> Change:

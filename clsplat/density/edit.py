@@ -81,7 +81,6 @@ class Edit:
         self.shrink = device.empty(count)
         self.shared = device.empty(count, np.uint32)
         self.rule = 0  # index of the rule that is marking
-        self.may_rewrite = True  # whether rules may change rows of tables as they mark
         self.max_rows: int | None = None  # rows at which growth stops; None: no limit
         self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # arguments of set_children
         self._program = device.program("density.cl")
@@ -182,12 +181,7 @@ class Edit:
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows copy them.
-
-        Raises ConfigError in an edit that may only remove Gaussians.
-        """
-        if not self.may_rewrite:
-            raise ConfigError(f"a rule changes {name} of Gaussians that it does not remove; use it in densify instead")
+        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows copy them."""
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
@@ -241,7 +235,6 @@ class Rule(Settings):
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     grows: ClassVar[bool] = True  # whether it may add Gaussians
-    rewrites: ClassVar[bool] = False  # whether it changes tables while marking (edit.set_rows), which later rules see
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""

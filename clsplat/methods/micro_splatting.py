@@ -171,7 +171,6 @@ class MergeNeighbors(Rule):
 
     type: Literal["merge_neighbors"] = "merge_neighbors"
     grows: ClassVar[bool] = False
-    rewrites: ClassVar[bool] = True
     conflicts = AT_REST
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "color_below"})
 

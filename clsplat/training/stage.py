@@ -54,7 +54,6 @@ class Stage(Settings):
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     removes: ClassVar[frozenset[str]] = frozenset()  # parts that no longer exist afterwards
     edits: ClassVar[bool] = False  # changes the model; in `during`, it runs between two steps
-    marks_edit: ClassVar[bool] = False  # calls run.editing_tables() itself; else the whole stage is an edit
 
     stage: str
     """Name of the stage."""
@@ -85,7 +84,7 @@ class Stage(Settings):
 
         A failed stage is repeated from its start on resume, so its records are dropped.
         """
-        edit = run.editing_tables() if self.edits and not self.marks_edit else nullcontext()
+        edit = run.editing_tables() if self.edits else nullcontext()
         with run.status.stage(self.stage), edit, run.records.stage():
             self.run(run)
 

@@ -29,25 +29,6 @@ def test_settings_with_static_positions_refuse_motion(override, what):
 
 
 @pytest.mark.parametrize(
-    ("stage", "words"),
-    [
-        ("cleanup", r".rules\[\d\]: 'prune_far' cannot be .*: it uses .*; leave one of them out"),
-        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it uses"),
-    ],
-)
-def test_static_only_stages_are_refused_on_loading(tmp_path, stage, words):
-    path = tmp_path / "x.yaml"
-    text = f"name: x\nmodel: {{time: {{}}}}\nstages:\n  - init\n  - {stage}\n  - export\n"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=rf"x.yaml: stages\[1\].{stage.partition(':')[0]}{words}"):
-        load(str(path))
-    path.write_text(text.replace("model: {time: {}}\n", ""))
-    load(str(path))
-    path.write_text(text.replace(stage, "cleanup: {rules: [prune_faint]}"))
-    load(str(path))
-
-
-@pytest.mark.parametrize(
     ("pipeline", "override", "bound"),
     [
         ("dynamic_7k", "optimize.rates.motion.turn=1e300", "at most 100"),

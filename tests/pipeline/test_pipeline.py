@@ -369,13 +369,9 @@ REFUSED = {
         replaced("  - init\n", ""),
         r"stages\[0\] optimize needs 'model', which no earlier stage makes \(made by init\)",
     ),
-    "statistics that a cleanup has dropped": (
-        replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup removes \(made again by optimize\)",
-    ),
     "statistics of a model that was replaced": (
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] init removes",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] init removes \(made again by optimize\)",
     ),
     "figures of a model that was replaced": (
         replaced("- export", "- init\n  - report"),

@@ -15,7 +15,7 @@ from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs import opening, runner
-from clsplat.stages.cleanup import PruneLeast, compute_band_energy, expand_bands, score_gaussians
+from clsplat.stages.reduction import PruneLeast, compute_band_energy, expand_bands, score_gaussians
 from clsplat.training.run import Run
 from tests.support.runs import train
 

@@ -1,4 +1,4 @@
-"""Make a model smaller: remove useless Gaussians, crop, prune, reduce spherical harmonics."""
+"""Make a model smaller: crop it, prune Gaussians, reduce spherical harmonics."""
 
 import logging
 from collections.abc import Collection
@@ -8,77 +8,17 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from clsplat.core.errors import EmptyRegionError, NumericError
-from clsplat.core.settings import OneOf
-from clsplat.density.control import Box, apply_marks, keep_rows, mark
-from clsplat.density.edit import Edit, Rule
+from clsplat.core.errors import EmptyRegionError
+from clsplat.density.control import Box, keep_rows
 from clsplat.density.importance import SCORES, Score, largest
-from clsplat.density.outliers import PruneFar
-from clsplat.density.statistics import SplatStats
-from clsplat.density.thresholds import SceneScale, Share
+from clsplat.density.thresholds import Share
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
-from clsplat.methods.adc import PruneFaint
-from clsplat.methods.mini_splatting import PruneUseless
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage
 
 LOG = logging.getLogger("clsplat")
-
-
-class Cleanup(Stage):
-    """Remove Gaussians that the training views hardly show and that would be visible from elsewhere, such as floaters.
-
-    All rules see the model before the cleanup.  A Gaussian that two rules would remove is counted for the first one.
-    """
-
-    stage: Literal["cleanup"] = "cleanup"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    removes: ClassVar[frozenset[str]] = frozenset({"stats"})
-    edits: ClassVar[bool] = True
-    marks_edit: ClassVar[bool] = True
-
-    rules: list[OneOf[Rule]] = Field(
-        [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
-    )
-    """Rules that remove Gaussians.  `prune_useless` with `views_below: 2` also removes Gaussians that are useful in
-    only one view; `prune_wide` removes Gaussians that are large on the screen."""
-
-    @field_validator("rules")
-    @classmethod
-    def _must_remove(cls, rules: list[Rule]) -> list[Rule]:
-        for rule in rules:
-            name = getattr(rule, "type", "rule")
-            if rule.grows:
-                raise ValueError(f"the rule '{name}' grows; expected rules that remove, such as prune_faint")
-            if rule.rewrites:
-                raise ValueError(f"the rule '{name}' changes the Gaussians that it keeps; use it in densify")
-            if rule.start:
-                raise ValueError(f"the rule '{name}' has a 'start', but cleanup applies it once; remove 'start'")
-            if read := sorted(rule.statistics | rule.tables):
-                raise ValueError(f"the rule '{name}' reads {', '.join(read)} from training; use it in densify")
-        return rules
-
-    def run(self, run: Run) -> None:
-        gaussians = run.model.gaussians
-        run.stats = SplatStats(gaussians, ())  # sums over earlier steps would not fit the Gaussians after the cleanup
-        scale = SceneScale(run.scene.extent, run.texture_quantile)
-        step = max(run.step, 1)  # rules act after step 0
-        edit = Edit(gaussians, run.stats, scale, step, run.seed, run.survey())
-        edit.may_rewrite = False  # a refused cleanup leaves the model unchanged
-        change = mark(edit, self.rules)
-        if change.after == 0:
-            raise NumericError(
-                "cleanup: its rules would remove all Gaussians; weaken them, for example with a smaller "
-                "prune_faint.opacity_below, or remove the stage"
-            )
-        with run.editing_tables():
-            apply_marks(edit, run.rasterizer.tiler)
-            run.refresh_filter()
-        run.records.add(run.step, "densify", **asdict(change))
-        removed = ", ".join(f"{name} {number:,}" for name, number in change.causes.items())
-        LOG.info("%s Gaussians kept; removed: %s", f"{change.after:,} of {change.before:,}", removed)
 
 
 class Crop(Stage):
