@@ -211,4 +211,4 @@ def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
         try:
             file.write(chunk)
         except OSError as error:
-            raise OutputError(f"{file.name}: cannot be written ({error.strerror}); check the space") from error
+            raise OutputError(f"{file.name}: cannot be written ({error.strerror}); check the free space") from error

@@ -28,9 +28,10 @@ INTRODUCTIONS = {
     "rules": "`densify.rules` is a list. All rules act at once, in one rearrangement of the Gaussians.",
     "statistics": "A [growing rule](rules.md#grow) acts on Gaussians with a large mean `statistic`. Only statistics "
     "that a rule names are computed.",
-    "modules": "`optimize.modules` lists what takes part in a training step besides the Gaussians, in the order of the "
-    "forward pass; each type at most once. `--set` addresses a module by its type: `optimize.modules.TYPE.KEY=…` "
-    "changes a key, `optimize.modules.TYPE={}` adds the module, `optimize.modules.TYPE=null` removes it.",
+    "modules": "`optimize.modules` lists what takes part in a training step in addition to the Gaussians, in the order "
+    "of the forward pass; each type at most once. `--set` addresses a module by its type: "
+    "`optimize.modules.TYPE.KEY=…` changes a key, `optimize.modules.TYPE={}` adds the module, "
+    "`optimize.modules.TYPE=null` removes it.",
     "views": "How a training step picks and changes its photo: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "Keys of `model`: the two low-pass filters, in the scene and on the screen, and the background.",
     "adaptations": "`adapt` names a class that derives "

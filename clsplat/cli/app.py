@@ -134,7 +134,7 @@ def common(
         ),
     ] = None,
     attended: Annotated[
-        bool, typer.Option("--attended", hidden=True, help="Stop when standard input ends, as by SIGTERM.")
+        bool, typer.Option("--attended", hidden=True, help="Stop when standard input closes, as on SIGTERM.")
     ] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")

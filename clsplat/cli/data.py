@@ -12,7 +12,7 @@ from clsplat.prepare.matching import Matching
 from clsplat.prepare.undistort import UndefinedPixels
 from clsplat.scene.detect import format_names
 
-DATASET = f"The folder of a dataset: {format_names()}."
+DATASET = f"Dataset folder: {format_names()}."
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -57,7 +57,7 @@ def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
     frames: Annotated[
-        int, typer.Option(min=1, help="Number of frames: the sharpest of each part; all parts have equal motion.")
+        int, typer.Option(min=1, help="Number of frames: the sharpest of each part, of equal motion.")
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     times: Annotated[
@@ -99,7 +99,7 @@ def undistort(
 
 @app.command()
 def cameras(
-    scene: Annotated[Path, typer.Argument(help=f"{DATASET[:-1]}, or of a run.")],
+    scene: Annotated[Path, typer.Argument(help=f"{DATASET[:-1]}; or a run folder.")],
     out: Annotated[Path, typer.Argument(help="Folder for the files.")],
     format_: Annotated[
         Literal["colmap", "nerfstudio", "inria"],

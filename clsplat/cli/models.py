@@ -182,7 +182,7 @@ def compress(
     model: ModelArgument,
     scene: SceneOption = None,
     target: Annotated[
-        str, typer.Option(metavar="SIZE|LOSS", help="Size of the file, or loss of PSNR: 5MB, or -0.1dB.")
+        str, typer.Option(metavar="SIZE|LOSS", help="Maximum file size or PSNR loss, such as 5MB or -0.1dB.")
     ] = "-0.1dB",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the file, the page and all trials.")] = Path(
         "runs/compress"
@@ -195,7 +195,7 @@ def compress(
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Training steps per pruning, and a fifth of them per palette; default: 1000."
+            min=1, metavar="N", help="Training steps after each pruning, a fifth after each palette; default: 1000."
         ),
     ] = None,
     device: DeviceOption = None,

@@ -38,7 +38,7 @@ def run(
     restart: Annotated[
         bool, typer.Option("--restart", help="Start over in the folder of an earlier run; removes its checkpoints.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and list what would run.")] = False,
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
@@ -83,7 +83,7 @@ def resume(
         ),
     ] = None,
     set_: SetOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and list what would run.")] = False,
     live: LiveOption = None,
     on: OnOption = None,
 ) -> None:
@@ -255,7 +255,7 @@ def blocks(
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
-        typer.Option(metavar="FRACTION", help="A block gets the views of which it covers more."),
+        typer.Option(metavar="FRACTION", help="A block gets the views of which it covers a larger fraction."),
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
@@ -265,7 +265,7 @@ def blocks(
     set_: SetOption = None,
     set_coarse: Annotated[
         list[str] | None,
-        typer.Option("--set-coarse", metavar="KEY=VALUE", help="As --set, for the coarse model; may be repeated."),
+        typer.Option("--set-coarse", metavar="KEY=VALUE", help="Like --set, for the coarse model; may be repeated."),
     ] = None,
     on: OnOption = None,
     as_json: JsonOption = False,
@@ -348,7 +348,7 @@ def worker(
     tls_cert: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of this machine, PEM.")] = None,
     tls_key: Annotated[str | None, typer.Option(metavar="FILE", help="Its private key, PEM.")] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Without TLS.  Anyone who reaches the scheduler's port can run code.")
+        bool, typer.Option("--insecure", help="Without TLS: anyone who can reach the scheduler's port can run code.")
     ] = False,
 ) -> None:
     """Offer this machine's devices to a Dask scheduler, one process per device, until the scheduler ends."""

@@ -178,8 +178,8 @@ def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
     for offset, count in runs:
         if offset < end or offset + count > len(part):
             raise DataError(
-                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(part)} and of which "
-                f"the first {end} are in other leaves; export it again"
+                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(part)}, the first "
+                f"{end} in other leaves; export it again"
             )
         end = offset + count
         rows.append(np.arange(offset, end))

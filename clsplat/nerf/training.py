@@ -256,16 +256,15 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
     unit = shape.with_unit(scene).scene_units
     corner, side = np.array(cube.corner), cube.side
     if not any(_intersect(corner + side * CORNERS, _corners(view, shape.near, shape.far, unit)) for view in views):
-        fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
+        fault = f"no training view sees its cube at depths from {shape.near:g} to {shape.far:g}"
     elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64) / unit).any():
-        fault = f"none of the scene's {len(points):,} points is in it"
+        fault = f"none of the scene's {len(points):,} points is in its cube"
     else:
         return
     low, high, center = (_point_text(point) for point in (corner, corner + side, scene_center(views) / unit))
     raise ConfigError(
-        f"train_field.field.grid: its cube is from {low} to {high}, units of {unit:g} scene units, and {fault} "
-        f"({scene.path}); the cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and "
-        "`far`"
+        f"train_field.field.grid: {fault}, {low} to {high} in units of {unit:g} scene units ({scene.path}); the "
+        f"cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and `far`"
     )
 
 

@@ -284,7 +284,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
     if device is None or isinstance(device, str):
         return Device(device, schedule)
     if not isinstance(device, Device):
-        raise ConfigError(f"device: expected a part of a device's name or a Device, got {type(device).__name__}")
+        raise ConfigError(f"device: expected part of a device name, or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
         raise ConfigError(f"device: {device.text}; the settings need the {schedule} schedule: open the device with it")
     return device

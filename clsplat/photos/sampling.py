@@ -111,7 +111,7 @@ class ViewSettings(Settings):
     def divisor(self, step: int) -> float:
         """Return the downscale factor at a global step.  Raises ConfigError if `resolve` was not called."""
         if isinstance(self.resolution, DetailDivisor):
-            raise ConfigError("a resolution that follows detail needs photographs; call `resolve` first")
+            raise ConfigError("`resolution: {follows: detail}` needs photographs; call `resolve` first")
         return at_step(self.resolution, step)
 
     @property

@@ -251,7 +251,7 @@ def write_pictures(
     files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
     paths = [path for layer_files in files for path in layer_files.values()]
     if len(set(paths)) < len(paths):
-        raise ConfigError(f"{out}: two images would have one name; rename the view that ends in _depth or _alpha")
+        raise ConfigError(f"{out}: two images would have the same name; rename the view that ends in _depth or _alpha")
     _check_folder(out, paths, photographs)
     names = [path.relative_to(out).as_posix() for path in paths]
     rendered = {**_read_record(out), **dict.fromkeys(names, is_video)}

@@ -45,7 +45,7 @@ from clsplat.training.status import parse_status
 
 def require_sum(expected: str | None, path: Path) -> None:
     if expected is not None and sha256(path) != expected:
-        raise DataError("differs from its checksum")
+        raise DataError("does not match its checksum")
 
 
 def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:

@@ -241,7 +241,7 @@ def _warn_of_different_scenes(models: Sequence[Path], source: ModelSource | None
                 scenes[name] = Path(path).resolve()
     if source and len(set(scenes.values())) > 1:
         names_and_scenes = [part for item in scenes.items() for part in item]
-        LOG.warning("%s is of %s, but %s of %s; the page has the cameras of %s", *names_and_scenes, source.scene_name)
+        LOG.warning("%s shows %s, %s shows %s; the page has the cameras of %s", *names_and_scenes, source.scene_name)
 
 
 def names(models: Sequence[Path]) -> list[str]:

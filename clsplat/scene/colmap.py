@@ -444,8 +444,8 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
     if not is_valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
             f"{camera.source}: camera {number} is {camera.width}x{camera.height} with parameters "
-            f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
-            f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
+            f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths of "
+            f"at least {MIN_FOCAL:g}, and finite numbers: {REMEDY}"
         )
     if camera.model != "EQUIRECTANGULAR":
         return Lens(camera.width, camera.height, camera.model, camera.params)

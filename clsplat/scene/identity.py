@@ -42,7 +42,7 @@ class ImageFile:
     orientation: int = 1  # from EXIF; 1: upright
     cut: bool = False  # its end is missing
     fault: str = ""  # the error that training would report
-    blank: bool = False  # as a photograph: black, of one color, or transparent
+    blank: bool = False  # as a photograph: black, of a single color, or transparent
     excluded: bool = False  # as a mask: it excludes every pixel
     transparent: bool = False
 
@@ -95,8 +95,8 @@ def require_content(path: Path, views: Sequence[View], files: Mapping[Path, Imag
     blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
     if blank and len(blank) == len(views):
         raise DataError(
-            f"{path}: no photograph shows anything: {first_few(blank)} are black, of one color, or transparent; export "
-            "them again"
+            f"{path}: no photograph shows anything: {first_few(blank)} are black, of a single color, or transparent; "
+            "export them again"
         )
     return blank
 

@@ -88,7 +88,7 @@ def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
     if abs(header.height - height * scale) > 1.5:  # a resized image is rounded to whole pixels
         raise DataError(
             f"{path}: {image.name} is {header.width} x {header.height} px, its camera {width:g} x {height:g}; "
-            "expected the same aspect ratio: use the images that the poses were made from"
+            "expected the same aspect ratio: use the images that the cameras were calibrated on"
         )
     rotation = matrix[:, :3] @ LLFF_TO_OPENCV
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:

@@ -414,7 +414,7 @@ def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
     table = splits.get(name) if isinstance(splits, dict) else None
     columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
-        raise DataError(f"{path}: '{name}' lacks lists of one length called {', '.join(COLUMNS)}; make it again")
+        raise DataError(f"{path}: '{name}' needs lists of equal length called {', '.join(COLUMNS)}; make it again")
     if len(columns[0]) > MAX_FRAMES:
         raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
     frames = []
@@ -424,7 +424,7 @@ def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.source}: label is {quote(label)}; expected the number of its halvings, 0 to 8: make it again"
+                f"{frame.source}: label is {quote(label)}; expected how often it was halved, 0 to 8: make it again"
             )
         frames.append(frame)
     return frames

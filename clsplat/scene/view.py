@@ -325,8 +325,8 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
     camera = view.lens or view.camera
     raise DataError(
         f"{path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; expected the "
-        f"same size{'' if view.lens else ', or a larger image of the same shape'}: use the images the cameras were "
-        "made from"
+        f"same size{'' if view.lens else ', or a larger one with the same aspect ratio'}: use the images that the "
+        "cameras were calibrated on"
     )
 
 

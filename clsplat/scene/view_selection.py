@@ -65,7 +65,7 @@ class ViewSelection(Settings):
         if isinstance(offset, int) and offset < 0:
             raise ValueError(f"expected an offset of 0 or more, not {quote(offset)}")
         if "offset" in value and len(value) == 1:
-            raise ValueError("expected every next to offset, as in {every: 8, offset: 4}")
+            raise ValueError("'offset' needs 'every', as in {every: 8, offset: 4}")
         return value
 
     @model_validator(mode="after")
@@ -74,7 +74,7 @@ class ViewSelection(Settings):
         if sum(value is not None for value in kinds) != 1 or (self.offset and self.every is None):
             raise ValueError(NOTATIONS)
         if self.every is not None and self.offset >= self.every:
-            raise ValueError(f"expected an offset less than every, {self.every}")
+            raise ValueError(f"'offset' must be less than 'every', {self.every}")
         return self
 
     def input_path(self, key: str, scene: str | None) -> Path | None:

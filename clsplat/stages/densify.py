@@ -121,7 +121,7 @@ class Densify(Scheduled):
             return False
         if best.growth_ended is None and best.since_best >= self.patience:
             best = run.best = best.model_copy(update={"growth_ended": run.step, "since_best": 0})
-            LOG.info("step %d: growth ends, since the model was best at step %d", run.step, best.measured.step)
+            LOG.info("step %d: growth ends; the model was best at step %d", run.step, best.measured.step)
         return best.growth_ended is not None
 
     def _box(self, run: Run) -> Box | None:

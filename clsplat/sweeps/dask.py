@@ -210,7 +210,7 @@ class Cluster:
         elif now - self._last_worker > NO_DEVICE_TIMEOUT_S:
             hint = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker of this version for {NO_DEVICE_TIMEOUT_S:.0f} s{hint}; start some with "
+                f"no worker of this version connected for {NO_DEVICE_TIMEOUT_S:.0f} s{hint}; start some with "
                 "`clsplat worker --scheduler ADDRESS`; the store keeps all progress"
             )
 
@@ -274,7 +274,7 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
         require_certificates(execution.tls)  # before the devices are tested, which takes a while
     slots = find_slots(Owner.current().host, list(devices) if devices is not None else None)
     for slot in slots:
-        LOG.info("offering %s, bits:%s", slot.text, slot.bits)
+        LOG.info("offering %s, bits class %s", slot.text, slot.bits)
     warn_of_open_port(execution)
     stop = threading.Event()
     with dask.config.set(SETTINGS), stopping_on_signals(stop.set):

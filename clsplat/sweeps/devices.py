@@ -1,6 +1,6 @@
 """Find devices and their bits classes: a class is the hash of the result of a fixed run.
 
-Names of devices are not enough: different runtimes may give the same bits, and one runtime may give other bits on
+Names of devices are not enough: different runtimes may give the same bits, and one runtime may give different bits on
 another processor.  Devices of one class can continue each other's cells.
 """
 

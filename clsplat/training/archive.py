@@ -63,7 +63,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         )
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"the disk cannot read it: {error.strerror}") from error
-        raise DataError("is empty" if empty else f"differs from its checksum ({reason})") from error
+        raise DataError("is empty" if empty else f"does not match its checksum ({reason})") from error
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
@@ -97,7 +97,7 @@ def _notes(archive: zipfile.ZipFile) -> Notes:
     """Check and return the notes."""
     data = archive.read(f"{META}.npy")
     if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
-        raise DataError("its notes differ from their checksum")
+        raise DataError("its notes do not match their checksum")
     notes = json.loads(str(_array(data)))
     if not isinstance(notes, dict) or DIGESTS not in notes:
         raise DataError("its checksums are missing")
@@ -107,7 +107,7 @@ def _notes(archive: zipfile.ZipFile) -> Notes:
 def _member(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
     data = archive.read(f"{name}.npy")
     if hashlib.sha256(data).hexdigest() != digest:
-        raise DataError(f"{name} differs from its checksum")
+        raise DataError(f"{name} does not match its checksum")
     return data
 
 

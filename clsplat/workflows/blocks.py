@@ -124,9 +124,7 @@ class Blocks:
     ) -> None:
         """execution: where blocks are trained; by default one after another in this process."""
         if execution is not None and not execution.has_store:
-            raise ConfigError(
-                "--on: blocks are trained as cells of a store; add the key `store`, or use another engine"
-            )
+            raise ConfigError("--on: blocks need a store; add the key `store`, or use another engine")
         self.out, self.plan, self.execution = out, plan, execution
         self._device_name = device if isinstance(device, str) else None
         overrides = [f"scene.path={path_setting(photo_folder(scene))}"]
@@ -211,7 +209,7 @@ class Blocks:
             coarse = shell_quote(self.out / COARSE)
             other = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
             summary = failures.summary(len(pipelines))
-            error = ClsplatError(f"{summary};  {remedy if self.coarse_file else f'{remedy}; {other}'}")
+            error = ClsplatError(f"{summary}; {remedy if self.coarse_file else f'{remedy}; {other}'}")
             error.exit_code = summary.exit_code
             raise error
         if not files:

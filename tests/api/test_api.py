@@ -177,7 +177,7 @@ def test_device_is_a_name_or_an_open_device(device, rng, tiny_scene, tmp_path):
     model_of(case).save(tmp_path / "m.ply")
     assert clsplat.render_views(tmp_path / "m.ply", tiny_scene, tmp_path / "views", device=device) == 2
     assert clsplat.Trainer(tiny_scene, "smoke", device=name, set=schedule).evaluate("train")["views"] == 8
-    with pytest.raises(ConfigError, match="device: expected a part of a device's name or a Device, got int"):
+    with pytest.raises(ConfigError, match="device: expected part of a device name, or a Device, got int"):
         Renderer(model_of(case), 0)
 
 

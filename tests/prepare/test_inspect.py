@@ -405,10 +405,10 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
     inspection = Inspection.from_folder(scene)
     if kind != "mask":
         assert any(
-            "1 photograph is black, of one color, or transparent (01.png)" in f.text for f in inspection.findings
+            "1 photograph is black, of a single color, or transparent (01.png)" in f.text for f in inspection.findings
         )
         RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
-        assert "1 photograph: black, of one color, or transparent: 01.png" in caplog.text
+        assert "1 photograph: black, of a single color, or transparent: 01.png" in caplog.text
         make_blank(files, kind)
         inspection = Inspection.from_folder(scene)
     with pytest.raises(DataError) as error:

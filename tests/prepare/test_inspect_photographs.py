@@ -85,7 +85,7 @@ def test_blank_photographs_are_refused_as_in_preparation(tmp_path, level):
     with pytest.raises(DataError, match="no photograph shows anything"):
         gather(photos, tmp_path / "linked", list_photographs(photos))
     photograph(photos / "9.png")
-    assert "9 photographs are black or of one color" in Inspection.from_folder(photos).verdict
+    assert "9 photographs are black or of a single color" in Inspection.from_folder(photos).verdict
 
 
 def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):

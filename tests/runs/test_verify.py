@@ -125,7 +125,7 @@ def test_damage_ends_with_exit_code_7_and_one_line(copy):
     (copy / "point_cloud.ply").write_bytes((copy / "point_cloud.ply").read_bytes()[:-4])
     (copy / "checkpoints" / "step_000020.npz").write_bytes(b"")
     done = command("check", copy, expect=7)
-    assert "DAMAGED  point_cloud.ply, differs from its checksum" in done.stdout
+    assert "DAMAGED  point_cloud.ply, does not match its checksum" in done.stdout
     assert "files are damaged or missing: checkpoints/step_000020.npz, point_cloud.ply; " in done.stderr
     data = json.loads(command("check", copy, "--json", expect=7).stdout)
     assert data["whole"] is False
@@ -250,7 +250,7 @@ def test_damaged_checkpoint_is_described_plainly(copy):
     assert damaged(copy)["checkpoints/step_000020.npz"] == "is empty"
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("differs from its checksum (")
+    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("does not match its checksum (")
     said = command("check", copy, expect=7).stderr
     assert "all outputs are intact" in said
     assert "resume" not in said, "it would leave the run as it is"
@@ -283,7 +283,7 @@ def test_check_of_a_matrix_includes_its_cells(tiny_scene, tmp_path):
     assert damaged(out) == {}
     cell = next(path for path in sorted(out.iterdir()) if path.is_dir())
     (cell / "point_cloud.ply").write_bytes(b"ply")
-    assert damaged(out) == {f"{cell.name}/point_cloud.ply": "differs from its checksum"}
+    assert damaged(out) == {f"{cell.name}/point_cloud.ply": "does not match its checksum"}
     assert "cells" in clsplat.check(tmp_path / "two.yaml")
     assert f"`clsplat resume {cell}`" in command("check", out, expect=7).stderr
     shutil.rmtree(cell)

@@ -87,7 +87,7 @@ def test_damaged_metadata_is_refused(folders, tmp_path):
     label = {**metadata, "test": {**metadata["test"], "label": [0.5] * 8}}
     for content, words in (
         (text[:-20], "not a JSON file"),
-        ("[]", "'train' lacks lists of one length called file_path"),
+        ("[]", "'train' needs lists of equal length called file_path"),
         (json.dumps({"train": metadata["train"]}), "'test' lacks"),
         (json.dumps(short), "'train' lacks"),
         (json.dumps(label), r"test\[0\]: label is 0.5"),

@@ -230,10 +230,10 @@ def test_dataset_without_images_is_refused(folder):
     ("setting", "fault"),
     [
         ("holdout=-1", "expected a number, {every, offset}, {names: […]} or {file: …}, got -1"),
-        ("holdout={every: 8, offset: 8}", "expected an offset less than every, 8"),
+        ("holdout={every: 8, offset: 8}", "'offset' must be less than 'every', 8"),
         ("holdout={every:8,offset:4}", "or {file: …} (YAML needs a space after each colon)"),
         ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, not -1"),
-        ("holdout={offset: 4}", "expected every next to offset, as in {every: 8, offset: 4}"),
+        ("holdout={offset: 4}", "'offset' needs 'every', as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
         ("holdout={names: [a, '']}", "expected names of photographs that are not empty"),

@@ -158,7 +158,7 @@ def test_models_of_different_scenes_are_reported(run, tiny_scene, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
     done = CliRunner().invoke(app, [str(word) for word in ("view", run, other, *for_all)])
     warning = (
-        f"run is of {tiny_scene}, but other of {tmp_path / 'kitchen'}; the page has the cameras of {tiny_scene.name}"
+        f"run shows {tiny_scene}, other shows {tmp_path / 'kitchen'}; the page has the cameras of {tiny_scene.name}"
     )
     assert warning in done.output.replace("\n", ""), done.output
     for models in ([run, same], [run]):

@@ -69,9 +69,8 @@ def _capture(facts: Facts, readable: int) -> Iterator[Finding]:
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
         all_blank = len(blank) == readable
-        fault = (
-            "no photograph shows anything" if all_blank else f"{_are(len(blank), 'photograph')} black or of one color"
-        )
+        some = f"{_are(len(blank), 'photograph')} black or of a single color"
+        fault = "no photograph shows anything" if all_blank else some
         yield Finding("error" if all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
 
@@ -124,7 +123,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         fault, _, remedy = photographs.no_content.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
     if photographs.blank:
-        fault = f"{_are(len(photographs.blank), 'photograph')} black, of one color, or transparent"
+        fault = f"{_are(len(photographs.blank), 'photograph')} black, of a single color, or transparent"
         yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "remove or export them again")
     if photographs.cut:
         fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_join(photographs.cut)})"

@@ -300,9 +300,8 @@ class CameraState(ModuleState):
         )
         if cameras:
             factors = [self.factor(camera) for camera in cameras]
-            LOG.info(
-                "focal lengths of %s: times %s", pluralize(len(cameras), "camera"), _range(min(factors), max(factors))
-            )
+            scale = _range(min(factors), max(factors))
+            LOG.info("scaled focal lengths of %s by %s", pluralize(len(cameras), "camera"), scale)
 
 
 def require_zoom(scene: Scene) -> None:

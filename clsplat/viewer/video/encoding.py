@@ -147,8 +147,8 @@ def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
     try:
         if not writer.isOpened():
             raise OutputError(
-                f"{path.parent}: OpenCV cannot write WebM (VP8); check the folder, and that OpenCV is from "
-                f"pip, with FFmpeg; or write .mp4 with the extra clsplat[video], {ALTERNATIVE}"
+                f"{path.parent}: OpenCV cannot write WebM (VP8); check the folder, install OpenCV from pip, "
+                f"which includes FFmpeg, or write .mp4 with the extra clsplat[video], {ALTERNATIVE}"
             )
 
         def write(image: Image) -> None:
