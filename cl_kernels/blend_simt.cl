@@ -53,7 +53,7 @@ void blend_forward(
     __global const float *restrict splats,      // [N,RECORD]
     __constant float *restrict background,      // [3]
     __constant camera_t *restrict camera,       // [1]
-    __global float *restrict image,             // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict image,             // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
@@ -106,9 +106,7 @@ void blend_forward(
     image[plane + at] = inside ? p.green + t * background[1] : 0.0f;
     image[2 * plane + at] = inside ? p.blue + t * background[2] : 0.0f;
     transmittance[at] = inside ? t : 0.0f;
-#if WEIGHT_ENTROPY
-    image[3 * plane + at] = inside ? p.entropy - t * log_weight(t) : 0.0f;
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     image[3 * plane + at] = inside ? p.inverse_depth : 0.0f;
 #endif
 }
@@ -130,8 +128,8 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
 /* One item owns one splat of a batch of PIXELS and adds up the tile's pixels one after another: at step s, item i
  * computes pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to
  * back.  After the last pixel, an item writes its sums and continues with its splat of the next batch, without
- * waiting.  No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture or the
- * entropy, 80 with both, 92 with inverse depths, 96 with a texture too.  Deterministic. */
+ * waiting.  No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture, 92 with
+ * inverse depths, 96 with both.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -139,8 +137,8 @@ void blend_backward(
     __global const uint *restrict pair_splat,   // [P]
     __global const float *restrict splats,      // [N,RECORD]
     __constant camera_t *restrict camera,       // [1]
-    __global const float *restrict image,       // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict grad_image,  // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict image,       // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
@@ -166,10 +164,7 @@ void blend_backward(
 #if PIXEL_SUMS > SUM_WEIGHT
     own.texture = texture[at];
 #endif
-#if WEIGHT_ENTROPY
-    own.entropy = grad_image[3 * plane + at];
-    own.rest = own.rest - own.entropy * (1.0f - image[3 * plane + at]);
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     own.inverse_depth = grad_image[3 * plane + at];
     own.rest = own.rest + own.inverse_depth * image[3 * plane + at];
 #endif

@@ -22,7 +22,7 @@ void blend_forward(
     __global const float *restrict splats,      // [N,RECORD]
     __constant float *restrict background,      // [3]
     __constant camera_t *restrict camera,       // [1]
-    __global float *restrict image,             // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict image,             // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
@@ -90,9 +90,7 @@ void blend_forward(
             VSTORE((p.green + t * background[1]) * inside, image + plane + at);
             VSTORE((p.blue + t * background[2]) * inside, image + 2 * plane + at);
             VSTORE(t * inside, transmittance + at);
-#if WEIGHT_ENTROPY
-            VSTORE((p.entropy - t * log_weight(t)) * inside, image + 3 * plane + at);
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
             VSTORE(p.inverse_depth * inside, image + 3 * plane + at);
 #endif
         }
@@ -181,8 +179,8 @@ void blend_backward(
     __global const uint *restrict pair_splat,   // [P]
     __global const float *restrict splats,      // [N,RECORD]
     __constant camera_t *restrict camera,       // [1]
-    __global const float *restrict image,       // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict grad_image,  // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict image,       // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
@@ -213,10 +211,7 @@ void blend_backward(
 #if PIXEL_SUMS > SUM_WEIGHT
             p.texture = VLOAD(texture + at);
 #endif
-#if WEIGHT_ENTROPY
-            p.entropy = VLOAD(grad_image + 3 * plane + at);
-            p.rest = p.rest - p.entropy * (1.0f - VLOAD(image + 3 * plane + at));
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
             p.inverse_depth = VLOAD(grad_image + 3 * plane + at);
             p.rest = p.rest + p.inverse_depth * VLOAD(image + 3 * plane + at);
 #endif

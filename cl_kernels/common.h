@@ -39,11 +39,8 @@
 #ifndef SH_SLOTS
 #define SH_SLOTS 0  // 1: harmonics are in slots that the host fills for each view (slots.h)
 #endif
-#ifndef WEIGHT_ENTROPY
-#define WEIGHT_ENTROPY 0  // 1: the image has a fourth plane, the entropy of the blend weights (splat.h)
-#endif
 #ifndef INVERSE_DEPTH
-#define INVERSE_DEPTH 0  // 1: the fourth plane of the image is the blended inverse depth (splat.h)
+#define INVERSE_DEPTH 0  // 1: the image has a fourth plane, the blended inverse depth (splat.h)
 #endif
 #ifndef GRAD_BEHIND
 #define GRAD_BEHIND 0  // 1: the loss depends on the transmittance of a pixel in addition to its color (splat.h)

@@ -272,29 +272,3 @@ void sum_errors(
         total += row_errors[i];
     error[0] = total;
 }
-
-/* gradient += scale, in the fourth plane: the mean entropy of the blend weights (splat.h).  Local memory: TEAM * 4. */
-__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void weight_entropy(
-    __global const float *restrict image,  // [4,H',stride]
-    __global float *restrict gradient,     // [4,H',stride]
-    __global float *restrict row_sums,     // [H'] sums of the entropy
-    const float scale,                     // weight / pixels in the image
-    const uint width,
-    const uint height,
-    const uint rows,                       // H'
-    const uint stride)
-{
-    __local float sums[TEAM];
-    const uint item = get_local_id(0), y = get_group_id(1);
-    const uint row = (3 * rows + y) * stride, columns = y < height ? width : 0;
-    VF total = (VF)(0.0f);
-    for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
-        VSTORE(VLOAD(gradient + row + x) + scale * inside_row(x, columns), gradient + row + x);
-        total += VLOAD(image + row + x);
-    }
-    sums[item] = sum_lanes(total);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0)
-        row_sums[y] = sum_items(sums);
-}

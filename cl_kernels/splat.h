@@ -9,9 +9,8 @@
  *
  * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and must be >= 1/255.
  *
- * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
- * and the final T: how far a pixel is from showing a single splat.  With INVERSE_DEPTH, which excludes the former, it
- * is D = sum_i w_i / z_i with the depths of the means, and 0 behind the splats. */
+ * With INVERSE_DEPTH the image and its gradient have a fourth plane, D = sum_i w_i / z_i with w = alpha T and the depths
+ * of the means; it is 0 behind the splats. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -161,17 +160,10 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
 /* State of LANES pixels going front to back: transmittance and color. */
 typedef struct {
     VF t, red, green, blue;
-#if WEIGHT_ENTROPY
-    VF entropy;
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     VF inverse_depth;
 #endif
 } pixels_t;
-
-#define FOURTH_PLANE (WEIGHT_ENTROPY || INVERSE_DEPTH)
-
-/* ln w; finite for a weight of 0. */
-static inline VF log_weight(const VF w) { return log_positive(larger(w, (VF)(1.0e-30f))); }
 
 static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *color)
 {
@@ -179,9 +171,7 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
     p->red += k.weight * color[0];
     p->green += k.weight * color[1];
     p->blue += k.weight * color[2];
-#if WEIGHT_ENTROPY
-    p->entropy -= k.weight * log_weight(k.weight);
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     p->inverse_depth += k.weight * color[SPLAT_INVERSE_DEPTH - SPLAT_RED];
 #endif
     p->t = k.next;
@@ -191,9 +181,6 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
  * splat, background included), which starts as g . final color.  Then dL/dalpha = t (c . g) - rest_after / (1 -
  * alpha): front to back, without dividing the transmittance.
  *
- * The entropy adds -(ln w + 1) dL/dH to what a splat of weight w shows of g, c . g: the sum over all splats and the
- * background starts as -(1 - H) dL/dH, since their weights have the sum 1.
- *
  * A loss of the final transmittance T adds -T / (1 - alpha) dL/dT, the same for all splats: rest starts larger by
  * T dL/dT, the plane `behind`. */
 typedef struct {
@@ -201,9 +188,7 @@ typedef struct {
 #if PIXEL_SUMS > SUM_WEIGHT
     VF texture;
 #endif
-#if WEIGHT_ENTROPY
-    VF entropy;  // dL/dH
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     VF inverse_depth;  // dL/dD
 #endif
 } grad_pixels_t;
@@ -214,9 +199,7 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     const VF zero = (VF)(0.0f);
     const contribution_t k = contribution_of(s, pixel, p->t);
     VF shade = color[0] * p->red + color[1] * p->green + color[2] * p->blue;
-#if WEIGHT_ENTROPY
-    shade = shade - p->entropy * (log_weight(k.weight) + 1.0f);
-#elif INVERSE_DEPTH
+#if INVERSE_DEPTH
     shade = shade + color[SPLAT_INVERSE_DEPTH - SPLAT_RED] * p->inverse_depth;
 #endif
     p->rest = p->rest - k.weight * shade;

@@ -21,7 +21,7 @@ from clsplat.render.workspace import Workspace
 class Comparison:
     """A render and its photograph, float planes [3, rows, stride], and the gradient that losses add to.
 
-    Image and gradient have a fourth plane, such as the entropy of blend weights, if a loss reads it.  Losses are means
+    Image and gradient have a fourth plane, the inverse depth, if a loss reads it.  Losses are means
     over the whole image, masked or not, so that thresholds mean the same with and without a mask.
     """
 
@@ -157,14 +157,10 @@ class Penalty(Loss):
 def required_content(losses: Sequence[Loss], step: int) -> Content:
     """Return the planes of the rendered image that the losses need at a global step.
 
-    Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for two different fourth planes.
+    Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty.
     """
     for loss in losses:
         if not isinstance(loss, ImageLoss | Penalty):
             raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
-    planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"color"}
-    if len(planes) > 1:
-        raise ConfigError(
-            f"the losses need {' and '.join(sorted(planes))} of an image, but only one can be rendered; remove a loss"
-        )
-    return planes.pop() if planes else "color"
+    has_depth = any(loss.reads(step) == "inverse_depth" for loss in losses if isinstance(loss, ImageLoss))
+    return "inverse_depth" if has_depth else "color"

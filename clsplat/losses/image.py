@@ -1,15 +1,14 @@
-"""Define the photometric losses L1, L2, and D-SSIM, and the entropy of blend weights."""
+"""Define the photometric losses L1, L2, and D-SSIM."""
 
 import math
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.errors import DataError
 from clsplat.core.schedule import at_step
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.opencl.device import Array, constants
-from clsplat.render.rasterizer import Content
 
 SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
 SSIM_PIXELS_MAX = 2**32 // 9  # the kernels index nine planes in 32 bits
@@ -131,38 +130,3 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
         **comparison.camera.plane_arguments(),
     )
     return maps, sums
-
-
-# The entropy of blend weights, which encourages few Gaussians per pixel.
-
-
-class WeightEntropy(ImageLoss):
-    """Mean over pixels of -Σ w ln w - T ln T, with the blend weights w of a pixel and the final transmittance T.
-
-    It shortens the lists of splats per tile (Liu and Han 2026, with a weight of 0.015) and sharpens opacities.  Masked
-    pixels do not count.
-    """
-
-    type: Literal["weight_entropy"] = "weight_entropy"
-    reads_photograph: ClassVar[bool] = False
-
-    def reads(self, step: int) -> Content:
-        return "entropy"
-
-    def add(self, comparison: Comparison) -> LossValue:
-        camera, weight = comparison.camera, at_step(self.weight, comparison.step)
-        if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
-            raise ConfigError(
-                "the loss weight_entropy needs a frame with the content 'entropy'; render it with that content"
-            )
-        scale = weight / (camera.width * camera.height)
-        sums = comparison.workspace.array("entropy_sums", camera.rows)
-        comparison.workspace.device.program("loss.cl").weight_entropy(
-            groups=(1, camera.rows),
-            image=comparison.image,
-            gradient=comparison.gradient,
-            row_sums=sums,
-            scale=scale,
-            **camera.plane_arguments(),
-        )
-        return LossValue("weight_entropy", lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))

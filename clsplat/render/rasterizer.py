@@ -147,10 +147,9 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
-Content = Literal["color", "depth", "entropy", "inverse_depth"]
-# The planes are the color; or (depth of the mean in scene units, 1, 0); or the color and a fourth plane: the entropy of
-# blend weights, or the blended inverse depth of the means.
-FOURTH_PLANE: dict[Content, str] = {"entropy": "WEIGHT_ENTROPY", "inverse_depth": "INVERSE_DEPTH"}
+Content = Literal["color", "depth", "inverse_depth"]
+# The planes are the color; or (depth of the mean in scene units, 1, 0); or the color and a fourth plane, the blended
+# inverse depth of the means.
 
 
 @dataclass(frozen=True)
@@ -248,7 +247,7 @@ class Rasterizer:
         array = self.workspace.array
         splats = array("splats", (model.gaussians.count, RECORD))
         radius = array("radius", model.gaussians.capacity)
-        image = array("image", (4 if content in FOURTH_PLANE else 3, camera.rows, camera.stride))
+        image = array("image", (4 if content == "inverse_depth" else 3, camera.rows, camera.stride))
         transmittance = array("transmittance", (camera.rows, camera.stride))
         tile_last = array("tile_last", camera.tiles, np.uint32)
         bands = self._split(camera)
@@ -273,7 +272,7 @@ class Rasterizer:
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """Return the blending kernels, with a fourth plane only if the content needs it."""
-        defines |= {FOURTH_PLANE[content]: 1} if content in FOURTH_PLANE else {}
+        defines |= {"INVERSE_DEPTH": 1} if content == "inverse_depth" else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:

@@ -21,8 +21,8 @@ FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; s
 MOVED_GAUSSIAN = 4 * (3 + 4 + 1)  # means, quaternions, and logits at the time of a view
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
 FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
-# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur; the
-# entropy of weights and its gradient
+# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur;
+# inverse depths and their gradient
 
 Location = Literal["device", "host"]
 Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; auto: the host if the device is full

@@ -142,7 +142,7 @@ KERNELS = {
     "sort": "scan_blocks scan_offsets radix_count radix_scatter count_pairs fill_tiles sort_tiles",
     "blend": "blend_forward lay_over sky_forward",
     "loss": (
-        "unpack_pixels pixel_loss ssim_maps ssim_gradient weight_entropy sky_matches sky_cover apply_mask "
+        "unpack_pixels pixel_loss ssim_maps ssim_gradient sky_matches sky_cover apply_mask "
         "change_background measure_residuals mask_transients covariance_trace anisotropy"
     ),
     "blend backward": "look_behind sky_backward blend_backward",

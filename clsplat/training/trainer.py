@@ -91,8 +91,8 @@ class StepTrainer:
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
         """Render one view and compare it with its photograph, without an update.
 
-        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two losses that read different
-        fourth planes, and for a loss that a module does not support.
+        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for a loss that a module does not
+        support.
         """
         content = required_content(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings

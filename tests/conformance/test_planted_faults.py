@@ -75,7 +75,6 @@ FAULTS = {  # kernel -> file, text, wrong text
     "inverse_depth_backward": ("inverse_depth.cl", "-sums[i] * inverse * inverse", "-sums[i] * inverse"),
     "view_error": ("loss.cl", "fabs(VLOAD(gradient + row + x) * difference)", "VLOAD(gradient + row + x) * difference"),
     "sum_errors": ("loss.cl", "total += row_errors[i]", "total = row_errors[i]"),
-    "weight_entropy": ("loss.cl", "row = (3 * rows + y)", "row = (2 * rows + y)"),
     "unpack_pixels": ("loss.cl", "pixels + (channel * height + y)", "pixels + (channel * height)"),
     "change_background": ("loss.cl", "(behind[channel] - background[channel])", "(behind[channel] - background[0])"),
     "apply_mask": ("loss.cl", "mask[pixel] == 0.0f", "mask[pixel] != 0.0f"),
@@ -224,11 +223,6 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
         "* 2.0f * p->inverse_depth;\n#endif\n    p->rest",
     ),
     "project_forward, inverse depth": ("project.cl", "power_min, s.inverse_z", "power_min, s.z"),
-    "blend_forward wide, entropy": ("blend_wide.cl", "(p.entropy - t * log", "(p.entropy + t * log"),
-    "blend_forward simt, entropy": ("blend_simt.cl", "? p.entropy - t * log", "? p.entropy + t * log"),
-    "blend_forward, weights in the entropy": ("splat.h", "p->entropy -= k.weight *", "p->entropy -= p->t *"),
-    "blend_backward wide, entropy": ("blend_wide.cl", "(1.0f - VLOAD(image + 3", "(1.0f + VLOAD(image + 3"),
-    "blend_backward simt, entropy": ("blend_simt.cl", "(1.0f - image[3", "(1.0f + image[3"),
     **{
         f"{kernel} {schedule}, {what} of the pixel's box": (file, text, wrong)
         for schedule, (kernel, what, file, text, wrong) in zip(
@@ -274,7 +268,6 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
         "-(a * ga + b * gb + c",
         "-(a * ga + 0.999f * b * gb + c",
     ),
-    "blend_backward, entropy": ("splat.h", "(log_weight(k.weight) + 1.0f)", "log_weight(k.weight)"),
 }
 
 

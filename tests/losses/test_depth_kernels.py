@@ -9,9 +9,8 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import relative_error
 from clsplat.conformance.checks.blending import check_depth, differentiate, inverse_depths, losses_of_depths
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.core.errors import ConfigError
 from clsplat.losses.depth import InverseDepth
-from clsplat.losses.image import L1, WeightEntropy
+from clsplat.losses.image import L1
 from clsplat.opencl.device import Device
 from clsplat.photos.depths import PointDepths, nearest_in_pixels
 from clsplat.scene.scene import Tracks
@@ -139,15 +138,6 @@ def test_training_with_the_loss_approaches_known_depths(device, rng):
             trainer.step(photograph, step)
         values.append(measured.compare(photograph, 60).losses[1].value())
     assert values[1] < 0.7 * values[0]
-
-
-@on_one_setting
-def test_second_fourth_plane_is_refused(device, rng):
-    trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
-    with pytest.raises(ConfigError, match="need entropy and inverse_depth of an image, but only one can be"):
-        trainer.step(photograph, 1)
-    trainer.losses = [L1(), InverseDepth(weight=[[0, 1.0], [5, 0.0]]), WeightEntropy()]
-    assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"
 
 
 def test_training_also_needs_a_loss_on_colors():

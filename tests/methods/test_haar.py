@@ -11,7 +11,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.host import HostLoss
-from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
+from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.methods.opti3dgs import NAMES, Haar, HaarState, apply_filter
 from clsplat.photos.photographs import Photograph, apply_mask
@@ -182,24 +182,6 @@ def test_differentiating_records_no_scalars(device, rng):
     assert haar.scalars == {}
     trainer.step(photograph, 1)
     assert haar.scalars.keys() > {*NAMES["filter"]}
-
-
-@on_devices("masked", [False, True])
-def test_loss_without_an_image_combines_with_the_filter(device, rng, masked):
-    """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
-    of_colors, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
-    for losses in (of_colors, [WeightEntropy(weight=0.3), *of_colors]):
-        trainer, haar, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
-        view = trainer.step(photograph, 1)
-        moments.append({name: value for name, value in haar.scalars.items() if name.endswith("moment1")})
-    assert moments[0] == pytest.approx(moments[1], rel=1e-6)
-    assert all(moments[0].values())
-    entropy = next(loss.value() for loss in view.losses if loss.name == "weight_entropy")
-    sums = view.comparison.image.get()[3].sum(dtype=np.float64)
-    assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
-    trainer.losses, haar.scalars = [WeightEntropy()], {}
-    trainer.step(photograph, 2)
-    assert haar.scalars["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 
 
 @on_one_setting

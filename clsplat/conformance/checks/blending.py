@@ -144,24 +144,6 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     yield from check_sum(case, sum_pixels(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
-@CHECKS.add("blend_forward", "blend_backward")
-def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
-    for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
-        case, label = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
-        rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
-        frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
-        planes = frame.image.get()
-        yield equal(
-            "blend_forward", f"colors next to the entropy, {label}", planes[:3], render(device, case).image.get()
-        )
-        expected = ref.weight_entropy(case.project(), width, height)
-        yield from check_image("blend_forward", f"entropy, {label}", planes[3:, :height, :width], expected[None])
-        weights = np.zeros((4, camera.rows, camera.stride), np.float32)
-        weights[:, :height, :width] = rng.normal(size=(4, height, width))
-        m = rasterizer.pixel_sums(model, frame, device.upload(weights)).get()[:, :count].T.astype(np.float64)
-        yield from check_sum(case, m, weights[:, :height, :width], f"with the entropy, {label}")
-
-
 @CHECKS.add("blend_backward")
 def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
     """Compare a loss of the transmittance with one of an image of black splats in front of a white channel."""

@@ -9,7 +9,7 @@ from scipy import ndimage
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
-from clsplat.losses.image import L1, L2, Dssim, WeightEntropy, view_error
+from clsplat.losses.image import L1, L2, Dssim, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.photographs import apply_mask, change_background, unmasked_gradient, unpack
@@ -108,20 +108,6 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
         yield by_element("view_error", f"errors of rows, {label}", rows[:, :height], expected, SUM, floor=1e-2)
         yield equal("view_error", f"errors of rows outside the image, {label}", rows[:, height:], 0.0)
         yield by_element("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), SUM)
-
-
-@CHECKS.add("weight_entropy")
-def entropies(device: Device, rng: np.random.Generator) -> Results:
-    for width, height in SIZES:
-        x, label = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
-        comparison = make_comparison(device, x, x[:3])
-        comparison.gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
-        value = WeightEntropy(weight=0.7).add(comparison).value()
-        expected = np.array([0.7 * x[3].mean(dtype=np.float64)])
-        yield by_element("weight_entropy", f"value, {label}", np.array([value]), expected, SUM)
-        actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
-        truth[3, :height, :width] = 0.7 / (width * height)
-        yield by_element("weight_entropy", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")

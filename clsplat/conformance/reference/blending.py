@@ -157,24 +157,6 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
     return weights
 
 
-def weight_entropy(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
-    """Return -Σ w ln w over the weights of all splats and of the background, [H,W]."""
-    weights = blend_weights(splats, width, height, thresholds)
-    weights = np.concatenate([weights, 1 - weights.sum(axis=0, keepdims=True)])
-    return -np.sum(weights * np.log(np.where(weights > 0, weights, 1)), axis=0)
-
-
-def entropy_gradients(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[NDArray[Any]]:
-    """Yield d(entropy)/d(alpha), [H,W], front to back: -(ln w + 1) T + Σ_behind (ln w + 1) w / (1 - alpha)."""
-    steps = list(blend_steps(splats, width, height, thresholds))
-    weights = [np.where(step.blended, step.alpha * step.before, 0) for step in steps]
-    weights.append(1 - np.sum(weights, axis=0))
-    terms = [(np.log(np.where(weight > 0, weight, 1)) + 1) * weight for weight in weights]
-    for n, step in enumerate(steps):
-        direct = (np.log(np.where(weights[n] > 0, weights[n], 1)) + 1) * step.before
-        yield -direct + np.sum(terms[n + 1 :], axis=0) / (1 - step.alpha)
-
-
 def contribution(
     splats: Splats, width: int, height: int, mask: NDArray[Any] | None = None, thresholds: Thresholds = Thresholds()
 ) -> NDArray[Any]:
@@ -193,10 +175,8 @@ def alpha_gradients(
 ) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
     """Yield each splat front to back with dL/dalpha, [H,W], in the prefix form; it is zero where alpha is capped.
 
-    grad_image: [3,H,W], or [4,H,W] with the gradient of the entropy of weights.
+    grad_image: [3,H,W].
     """
-    grad_image, grad_entropy = grad_image[:3], grad_image[3:]
-    entropy = entropy_gradients(splats, width, height, thresholds) if len(grad_entropy) else iter(())
     image, final, _ = blend(splats, width, height, background, thresholds)
     through_background = (background_planes(background) * grad_image).sum(axis=0)
     behind = image - background_planes(background) * final  # S_N - S_i, after subtracting splat i
@@ -206,8 +186,6 @@ def alpha_gradients(
         behind = behind - color * np.where(step.blended, alpha * before, 0)
         grad_alpha = np.sum((color * before - behind / (1 - alpha)) * grad_image, axis=0)
         grad_alpha -= final / (1 - alpha) * through_background
-        if len(grad_entropy):
-            grad_alpha += grad_entropy[0] * next(entropy)
         capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
         yield step, np.where(step.blended & ~capped, grad_alpha, 0)
 
@@ -225,7 +203,7 @@ def blend_backward(
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         i = step.splat
-        grad.color[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
+        grad.color[i] = np.sum(grad_image * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         if splats.pixel_box:
             grads = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
