@@ -18,7 +18,7 @@ from clsplat.core.files import CHECKSUMS, END_STATES
 from clsplat.core.schedule import Schedule
 from clsplat.core.signals import stopping_on_signals
 from clsplat.gaussians.model import Model
-from clsplat.losses.base import ViewLosses
+from clsplat.losses.base import ViewGradients
 from clsplat.losses.host import HostFunction, HostLoss
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
@@ -46,7 +46,7 @@ class Report:
 
     step: int  # global, from 1
     gaussians: int
-    view: ViewLosses  # of this step, ViewGradients unless it was skipped; valid until the next step
+    view: ViewGradients  # of this step; valid until the next step
 
     @property
     def loss(self) -> float:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from itertools import takewhile
 
-from clsplat.losses.base import ViewLosses
+from clsplat.losses.base import ViewGradients
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.runner import is_refit_due, start_refit_if_due, with_refit_steps
 from clsplat.stages.optimize import Optimize
@@ -20,7 +20,7 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
             stage.act(run)
 
 
-def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
+def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
     """Run all stages from the first training to the last, and the edits that follow it; yield the losses of each step.
 
     A refit runs the stages from the start.

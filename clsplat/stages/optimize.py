@@ -14,7 +14,7 @@ from clsplat.core.progress import Progress
 from clsplat.core.schedule import fire_step
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
 from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.stages.densify import Densify
@@ -292,8 +292,8 @@ class Optimize(ValidatedTraining):
         for stage in self.during:
             stage.finish(run)
 
-    def iterate(self, run: Run) -> Iterator[ViewLosses]:
-        """Train step by step; yields ViewGradients unless a step is skipped, valid until the next step."""
+    def iterate(self, run: Run) -> Iterator[ViewGradients]:
+        """Train step by step; yields losses and gradients, valid until the next step."""
         self.reset_best(run)
         views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps
@@ -367,7 +367,7 @@ class Optimize(ValidatedTraining):
                 stage.act(run)
             run.edited = True
 
-    def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewLosses:
+    def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewGradients:
         """Do one step; a failure before its update leaves the run at the previous step."""
         run.step += 1
         run.stage_step += 1
@@ -384,8 +384,8 @@ class Optimize(ValidatedTraining):
         run.status.note(step=run.step)
         return view
 
-    def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
-        """Return the losses of a view, with gradients unless it is skipped, and the parameters not to update."""
+    def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
+        """Return the losses of a view with gradients, and the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
         photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)

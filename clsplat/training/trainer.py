@@ -69,10 +69,10 @@ class StepTrainer:
         step: int,
         transforms: Sequence[PhotographTransform] = (),
         stale: Collection[str] = (),
-    ) -> ViewLosses:
+    ) -> ViewGradients:
         """Train on one view at a global step.  stale: parameters that are not updated.
 
-        Returns the losses and, unless a module skips the step, the gradients; both are valid until the next step.
+        Returns the losses and the gradients, which are valid until the next step.
         """
         view = self.differentiate(photograph, step, transforms)
         self.update(view, stale)
@@ -80,13 +80,12 @@ class StepTrainer:
 
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
-    ) -> ViewLosses:
+    ) -> ViewGradients:
         """Return the losses at one view and their gradient, as sums over pixels, without an update.
 
         Raises ConfigError like `compare`.
         """
-        view = self.compare(photograph, step, transforms)
-        return view if view.step.skipped else self.backward(view)
+        return self.backward(self.compare(photograph, step, transforms))
 
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
         """Render one view and compare it with its photograph, without an update.
@@ -122,8 +121,6 @@ class StepTrainer:
             checked_value(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)
         ]
         data.losses += data.module_losses
-        for module in data.modules:
-            module.after_losses(data)
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
@@ -143,12 +140,8 @@ class StepTrainer:
             module.after_backward(data)
         return ViewGradients(data.frame, data.comparison, data.losses, data.pixel_sums, step=data)
 
-    def update(self, view: ViewLosses, stale: Collection[str] = ()) -> None:
+    def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
         """Apply the result of `differentiate`: update parameters, moments, statistics, and modules."""
-        if not isinstance(view, ViewGradients):
-            for module in view.step.modules:
-                module.update_skipped(view.step)
-            return
         grad_mean2d = self._update(view, stale)
         for module in reversed(view.step.modules):  # in the order in which the device finished their gradients
             module.update(view.step)

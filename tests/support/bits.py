@@ -154,7 +154,6 @@ NAMED = {
     "resolution": sets("optimize.views.resolution=[[0, 2], [20, 1]]"),
     "schedule_simt": sets("rasterizer.schedule=simt"),
     "seen": sets("optimize.update=seen"),
-    "skip": sets("optimize.modules.skip_backward={start: 8, warm_up: 1, min_fraction: 0}"),
     "sky": sets("model.background=envmap"),
     "sky_as_splats": sets("model.background={type: envmap, side: 8}", "export.sky=splats"),
     "sweep": sets("init.source=points+sweep", scene="lens"),

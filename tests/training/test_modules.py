@@ -3,7 +3,6 @@
 import json
 from typing import Any
 
-import numpy as np
 import pytest
 
 from clsplat.core.errors import ConfigError
@@ -71,25 +70,19 @@ def test_incompatible_modules_are_refused(settings, fault):
 class Order(ModuleState):
     """Notes the hooks of a step, and adds a loss."""
 
-    def __init__(self, name: str, notes: list[str], skips: bool = False) -> None:
+    def __init__(self, name: str, notes: list[str]) -> None:
         super().__init__()
-        self.name, self.notes, self.skips = name, notes, skips
+        self.name, self.notes = name, notes
 
     def after_render(self, step) -> None:
         step.module_losses.append(LossValue(self.name, lambda: 2.0))
         self.notes.append(f"forward {self.name}")
-
-    def after_losses(self, step) -> None:
-        step.skipped |= self.skips
 
     def backward(self, step) -> None:
         self.notes.append(f"backward {self.name}")
 
     def update(self, step) -> None:
         self.notes.append(f"update {self.name}")
-
-    def update_skipped(self, step) -> None:
-        self.notes.append(f"skipped {self.name}")
 
 
 def test_modules_run_in_order_and_backward_in_reverse(device, rng):
@@ -100,12 +93,6 @@ def test_modules_run_in_order_and_backward_in_reverse(device, rng):
     assert notes == ["forward a", "forward b", "backward b", "backward a", "update b", "update a"]
     assert view.loss == pytest.approx(alone.loss + 2 * 2.0), "each loss once"
     assert [one.name for one in view.losses[-2:]] == ["a", "b"]
-    means = trainer.model.gaussians.get("means")
-    notes.clear()
-    trainer.modules = [Order("a", notes), Order("b", notes, skips=True)]
-    trainer.step(photograph, 2)
-    assert sorted(notes) == ["forward a", "forward b", "skipped a", "skipped b"]
-    np.testing.assert_array_equal(trainer.model.gaussians.get("means"), means)
 
 
 def test_unknown_module_is_named():
@@ -117,7 +104,6 @@ NEEDED = {  # so that each acts within seven steps
     "camera_optimizer": {"start": 2, "focal": "auto"},
     "distractors": {"count": 30, "start": 2},
     "dropout": {"probability": 0.1},
-    "skip_backward": {"start": 3, "warm_up": 1, "min_fraction": 0},
     "transients": {"start": 2, "outlier_ratio": 1, "tail_ratio": 0},
 }
 

@@ -49,7 +49,6 @@ class TrainingStep:
     losses: list[LossValue] = field(default_factory=list)
     module_losses: list[LossValue] = field(default_factory=list)
     pixel_sums: Array = field(init=False)
-    skipped: bool = False  # no backward pass and no update
     modules: "Sequence[ModuleState]" = ()  # forward in this order, backward in reverse
     _saved: dict[int, Any] = field(default_factory=dict)
 
@@ -83,7 +82,7 @@ class TrainingStep:
 class ModuleState:
     """The state of a module during training.
 
-    Only `update` and `update_skipped` change scalars and tables; other hooks change only the step.  A step that
+    Only `update` changes scalars and tables; other hooks change only the step.  A step that
     fails before its update therefore leaves the run unchanged.
     """
 
@@ -117,11 +116,9 @@ class ModuleState:
     def before_render(self, step: TrainingStep) -> None: ...
     def after_render(self, step: TrainingStep) -> None: ...
     def before_losses(self, step: TrainingStep) -> None: ...
-    def after_losses(self, step: TrainingStep) -> None: ...
     def backward(self, step: TrainingStep) -> None: ...
     def after_backward(self, step: TrainingStep) -> None: ...
     def update(self, step: TrainingStep) -> None: ...
-    def update_skipped(self, step: TrainingStep) -> None: ...
 
     # outside steps
     def attach_to(self, model: DeviceModel) -> None:
