@@ -3,7 +3,7 @@
 The columns of the table are defined in clsplat/formats/splats.py, and the formulas in cl_kernels/motion.cl.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,21 +81,3 @@ def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Para
         {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *widths))} if widths else table
         for table in tables
     ]
-
-
-def shift_time_center(
-    tables: Mapping[str, NDArray[np.float64]], shift: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
-    """Shift time centers by `shift`, [N]; return means, quaternions, and motion of the same paths."""
-    motion, dt = tables[MOTION].copy(), shift[:, None]
-    fields, zeros = motion_fields(motion.shape[1]), np.zeros((len(shift), 3))
-    velocity, acceleration, jerk = (
-        motion[:, fields[name]].copy() if name in fields else zeros for name in ("velocity", "acceleration", "jerk")
-    )
-    means = tables["means"] + velocity * dt + acceleration * dt**2 + jerk * dt**3
-    motion[:, fields["time_center"]] += dt
-    motion[:, fields["velocity"]] = velocity + 2 * acceleration * dt + 3 * jerk * dt**2
-    if "acceleration" in fields:
-        motion[:, fields["acceleration"]] = acceleration + 3 * jerk * dt
-    quats = tables["quats"] + (motion[:, fields["turn"]] * dt if "turn" in fields else 0)
-    return {"means": means, "quats": quats, MOTION: motion}

@@ -117,8 +117,6 @@ FAULTS = {  # kernel -> file, text, wrong text
     "move_backward": ("motion.cl", "(power * (float)order)", "power"),
     "turn_backward": ("motion.cl", "grad_center - grad_quat * VLOAD", "grad_center + grad_quat * VLOAD"),
     "motion_step": ("motion.cl", "smaller(larger(value, (VF)(lowest))", "smaller(larger(value, (VF)(-FLT_MAX))"),
-    "motion_l2": ("motion_penalty.cl", "weight * time / speed", "weight * time"),
-    "short_duration": ("motion_penalty.cl", "? (VF)(weight)", "? (VF)(2.0f * weight)"),
     "pose_gradient": ("poses.cl", "- (d[m] * gd[n] - d[n] * gd[m])", "+ (d[m] * gd[n] - d[n] * gd[m])"),
     "project_backward": ("backward.h", "energy2 = larger(1.0f + compensate", "energy2 = larger(1.0f - compensate"),
     "accumulate_splitting": ("saddle.cl", "c * c * yy - power * c", "c * c * yy - power * a"),

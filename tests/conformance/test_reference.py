@@ -775,18 +775,3 @@ def test_gradients_of_a_motion(rng, degree, turns):
     assert grad_motion.all()
     assert relative_error(grad_motion, five_point(value, motion)) < FD_TOLERANCE
     assert relative_error(grad_logit, five_point(value, logit)) < FD_TOLERANCE
-
-
-@pytest.mark.parametrize("penalty", [lambda m: ref.motion_l2(m, 2.5), lambda m: ref.short_duration(m, 0.4)])
-def test_gradients_of_penalties_on_the_motion(rng, penalty):
-    motion = rng.normal(0, 0.4, (7, 8))
-    motion[:, 4] = rng.normal(-1, 0.5, 7)
-    gradient, columns = penalty(motion)[1], np.flatnonzero(penalty(motion)[1].any(axis=0))
-    part = motion[:, columns].copy()
-
-    def value() -> float:
-        changed = motion.copy()
-        changed[:, columns] = part
-        return penalty(changed)[0]
-
-    assert relative_error(gradient[:, columns], five_point(value, part)) < FD_TOLERANCE

@@ -135,11 +135,6 @@ NAMED = {
     "many": sets(*MANY),
     "masks": sets("scene.masks='{masks}'", scene="lens"),
     "motion_of_degree_3": sets("model.time={degree: 3, rotation: true}", recipe="dynamic_7k", scene="moving"),
-    "motion_penalties": sets(
-        "optimize.losses=[l1, {type: motion_l2, weight: 0.1}, {type: short_duration, weight: 0.1, below: 9}]",
-        recipe="dynamic_7k",
-        scene="moving",
-    ),
     "multiscale": sets("scene.levels=2", scene="multiscale"),
     "shuffle_order": sets("optimize.views.order=shuffle"),
     "pair_budget": sets("rasterizer.pair_budget=1", same_as="splat_7k"),

@@ -8,10 +8,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, SUM, Checks, Results, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, WIDTHS, motion_fields, motion_width
-from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
-from clsplat.losses.base import PenaltyInputs
-from clsplat.methods.dynamic import MotionL2, ShortDuration
 from clsplat.opencl.device import Device
 from clsplat.render.motion import backpropagate_motion, evaluate_motion
 from clsplat.render.rasterizer import Rasterizer
@@ -124,23 +121,3 @@ def motion(device: Device, rng: np.random.Generator) -> Results:
     for width in WIDTHS:
         yield from check_motion_at_time(device, rng, 65, width)
     yield from check_zero_motion(device, rng)
-
-
-@CHECKS.add("motion_l2", "short_duration")
-def penalties_of_motion(device: Device, rng: np.random.Generator) -> Results:
-    for count in COUNTS:
-        table = moving_case(rng, count, 8).parameters[MOTION]
-        table[1::7, :3] = 0
-        for penalty, (value, gradient) in (
-            (MotionL2(weight=3.0), ref.motion_l2(table.astype(np.float64), EXTENT)),
-            (ShortDuration(weight=3.0, below=0.4), ref.short_duration(table.astype(np.float64), 0.4)),
-        ):
-            gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
-            gradients, label = GaussianGradients(gaussians), f"{count} Gaussians"
-            gradients[MOTION].fill(0.25)
-            inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
-            actual = np.array([penalty.add(inputs).value()])
-            yield by_element(penalty.type, f"value, {label}", actual, np.array([3 * value]), SUM, floor=1e-7)
-            added = gradients[MOTION].get()[:, :count].T.astype(np.float64) - 0.25
-            floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
-            yield by_element(penalty.type, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)

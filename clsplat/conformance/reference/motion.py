@@ -82,20 +82,3 @@ def move_gaussians_backward(
         grad_motion[n, 3] += grad_factor * factor * dt / duration**2
         grad_motion[n, 4] = grad_factor * factor * (dt / duration) ** 2
     return grad_motion, grad_center
-
-
-def motion_l2(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of min(s, 1) |v| / extent, and its gradient with respect to the motion; s is a constant."""
-    time = np.minimum(np.exp(motion[:, 4]), 1)
-    speed = np.linalg.norm(motion[:, :3], axis=1)
-    gradient = np.zeros_like(motion)
-    gradient[:, :3] = (time / np.where(speed > 0, speed, 1) / len(motion) / extent)[:, None] * motion[:, :3]
-    return float((time * speed).mean()) / extent, gradient
-
-
-def short_duration(motion: NDArray[Any], below: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(log(below / s), 0), and its gradient with respect to the motion."""
-    shorter = np.log(below) - motion[:, 4]
-    gradient = np.zeros_like(motion)
-    gradient[:, 4] = -1.0 * (shorter > 0) / len(motion)
-    return float(np.maximum(shorter, 0).mean()), gradient
