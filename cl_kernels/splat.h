@@ -9,8 +9,8 @@
  *
  * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and must be >= 1/255.
  *
- * With INVERSE_DEPTH the image and its gradient have a fourth plane, D = sum_i w_i / z_i with w = alpha T and the depths
- * of the means; it is 0 behind the splats. */
+ * With INVERSE_DEPTH the image and its gradient have a fourth plane, D = sum_i w_i / z_i with w = alpha T and the
+ * depths of the means; it is 0 behind the splats. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
