@@ -147,9 +147,10 @@ def pluralize(count: int, word: str) -> str:
     return f"{count:,} {word}{'s' if count != 1 else ''}"
 
 
-def size_text(gaussians: int | None, parameters: int | None) -> str:
-    """Format the size of a trained model: the number of Gaussians, or of the parameters of a field."""
-    return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
+def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
+    """Format the size of a trained model: the Gaussians, without and of the `sky`, or the parameters of a field."""
+    text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
+    return f"{text} and {sky:,} of the sky" if sky else text
 
 
 def shell_quote(path: object) -> str:

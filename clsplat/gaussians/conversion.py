@@ -31,7 +31,7 @@ from clsplat.formats.splats import (
     with_degree,
 )
 from clsplat.formats.table import format_of_name, model_bytes, writing_format
-from clsplat.gaussians.model import Model, load, model_path
+from clsplat.gaussians.model import Model, exported_model, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
@@ -137,7 +137,7 @@ def convert(
 
 def read(sources: Sequence[Path]) -> Model:
     """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError."""
-    models = [load(source, Reading(not_finite="drop")) for source in sources]
+    models = [load(exported_model(source), Reading(not_finite="drop")) for source in sources]
     return merge_models(models, [str(source) for source in sources])
 
 
@@ -361,18 +361,21 @@ def _split_name(out: Path) -> tuple[Path, str, str]:
 COUNT = 10_000  # Gaussians, 2 degrees apart
 RADIUS = 10.0  # of the sphere, relative to the QUANTILE of distances from the center (WildGaussians, 2024)
 QUANTILE = 0.97
-WIDTH = 0.65  # standard deviation, relative to the distance of neighbors; gaps let 2 % of the light through
+WIDTH = 0.8  # standard deviation, relative to the distance of neighbors; gaps let 0.2 % of the light through
 FLAT = 0.1  # standard deviation along the ray, relative to that across
 LOGIT = 6.0  # of the opacity of sky Gaussians
 
 
-def with_sky_splats(model: Model, count: int = COUNT) -> Model:
-    """Replace the sky of a model by Gaussians; a model without a sky is returned unchanged."""
+def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floating] | None = None) -> Model:
+    """Replace the sky of a model by Gaussians; a model without a sky is returned unchanged.
+
+    center: of the sphere, [3], from which the sky is exact; default: the median of the means.
+    """
     if (sky := model.sky) is None:
         return model
     model = model.baked()
     means = model.means.astype(np.float64)
-    center = np.median(means, axis=0)
+    center = np.median(means, axis=0) if center is None else center
     radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), QUANTILE))
     directions = fibonacci(count)
     across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)

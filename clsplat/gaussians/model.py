@@ -14,6 +14,7 @@ from clsplat.core.files import METRICS, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
+from clsplat.formats.sog_quantize import before_gap
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_EXPONENT,
@@ -37,7 +38,7 @@ from clsplat.formats.splats import (
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.motion import evaluate_at, transform_motion
-from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
+from clsplat.gaussians.sky import WITHOUT_SKY, Sky, read_sky_file, without_sky_path, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.quality import near_plane
 from clsplat.scene.scene import Scene, far_origin, position_text
@@ -92,8 +93,14 @@ def model_path(path: Path) -> Path:
 
 
 def run_model(folder: Path) -> Path:
-    """Return the model file of a run folder: the last export, as its metrics.json names it."""
-    return run_output(folder, "export", MODEL)
+    """Return the model file of a run folder: the last export, or the one next to it without Gaussians of the sky."""
+    file = exported_model(folder)
+    return without if (without := without_sky_path(file)).is_file() else file
+
+
+def exported_model(path: Path) -> Path:
+    """Return the model file that a run folder exports last, as its metrics.json names it; other paths are unchanged."""
+    return run_output(path, "export", MODEL) if model_file(path).is_dir() else path
 
 
 def run_output(folder: Path, stage: str, default: str) -> Path:
@@ -107,7 +114,7 @@ def run_output(folder: Path, stage: str, default: str) -> Path:
 
 def raw_model(file: Path) -> Path:
     """Return the PLY with the separate world filter next to a run's model if it exists, else the model."""
-    raw = file.with_name(f"{file.stem}_raw.ply")
+    raw = file.with_name(f"{file.stem.removesuffix(WITHOUT_SKY)}_raw.ply")
     return raw if raw.is_file() else file
 
 
@@ -188,6 +195,14 @@ class Model:
     def sh_degree(self) -> int:
         """The SH degree."""
         return columns_to_sh_degree(self.sh_rest.shape[1])
+
+    @property
+    def scene_means(self) -> Floats:
+        """The means without those of Gaussians of a sky."""
+        if self.rendering.notes.get("sky") != "splats":
+            return self.means
+        means = self.means.astype(np.float64)
+        return self.means[before_gap(np.linalg.norm(means - np.median(means, axis=0), axis=1))]
 
     @property
     def near(self) -> float:

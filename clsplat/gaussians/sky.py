@@ -135,9 +135,17 @@ class Sky:
         write_text(path, json.dumps(data) + "\n")
 
 
+WITHOUT_SKY = "_without_sky"  # in the name of a model file next to one with Gaussians of the sky
+
+
 def sky_path(model: Path) -> Path:
-    """Return the path of the sky of a model file, also of a `_raw` model."""
-    return model.with_name(f"{model.stem.removesuffix('_raw')}_sky.json")
+    """Return the path of the sky of a model file, also of a `_raw` or `_without_sky` model."""
+    return model.with_name(f"{model.stem.removesuffix('_raw').removesuffix(WITHOUT_SKY)}_sky.json")
+
+
+def without_sky_path(model: Path) -> Path:
+    """Return the path of the model without the sky, next to a model file with Gaussians of the sky."""
+    return model.with_name(f"{model.stem}{WITHOUT_SKY}{model.suffix}")
 
 
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
@@ -176,6 +184,8 @@ def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
     sky, models = _read(path)
     if sha256(model) in models.values():
         return sky
+    if without_sky_path(model).name in models:  # Gaussians of `model` show the sky
+        return None
     LOG.warning(
         "%s: the sky does not belong to %s, or the model has changed, so the sky is not rendered; copy or export the "
         "model and its sky again",

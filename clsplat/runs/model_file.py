@@ -68,7 +68,7 @@ def make_painter(loaded: Loaded, device: Device, background: Background) -> Pain
 def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
     """Return points of the content, [M, 3]: the means of Gaussians, or the points of the scene, if any, for a field."""
     if isinstance(loaded, Model):
-        return loaded.means
+        return loaded.scene_means
     points = scene.points if scene else None
     return np.zeros((0, 3), np.float32) if points is None else points.positions
 

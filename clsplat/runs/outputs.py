@@ -22,6 +22,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, sha256
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.state import Phase, RunState, damaged_files, is_below, read_sums
+from clsplat.stages.export import sky_gaussians
 from clsplat.stages.report import is_overfit
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
@@ -42,6 +43,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         **({"kept": run.best.figures()} if run.best else {}),
         **({"overfit": True} if is_overfit(run) else {}),
         "gaussians": run.gaussians,
+        **({"sky_gaussians": sky} if (sky := sky_gaussians(run)) else {}),
         **({"parameters": run.learned_field.parameters} if run.learned_field else {}),
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),

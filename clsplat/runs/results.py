@@ -55,6 +55,7 @@ class RunMetrics(BaseModel):
     test: AveragesByDownscale
     train: AveragesByDownscale
     gaussians: int | None  # None for a field
+    sky_gaussians: int = 0  # in addition, in exported files
     parameters: int | None = None  # of a field
     steps: int
     train_seconds: float

@@ -154,7 +154,7 @@ def summary(folder: Path) -> list[str]:
 def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-    size = size_text(metrics["gaussians"], metrics.get("parameters"))
+    size = size_text(metrics["gaussians"], metrics.get("parameters"), metrics.get("sky_gaussians", 0))
     yield f"{quality}{size}; {metrics['train_seconds']:.0f} s of training"
     placed = summarize_placement(metrics.get("preparation", {}))
     if best := metrics.get("kept"):

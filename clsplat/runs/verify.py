@@ -97,7 +97,7 @@ def output(expected: str | None, path: Path) -> str:
     require_sum(expected, path)
     if path.name == METRICS:
         metrics = read_metrics(path)
-        return size_text(metrics.gaussians, metrics.parameters)
+        return size_text(metrics.gaussians, metrics.parameters, metrics.sky_gaussians)
     if path.name == RECORDS:
         return f"{len(Records(path.parent).read())} lines"
     if path.name.lower().endswith(tuple(endings(reads=True))):

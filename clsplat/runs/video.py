@@ -211,7 +211,9 @@ def view(
 
     views = view_entries(used_scene, read_photo, photographs, photograph_budget) if used_scene else []
     start = (used_scene.split("test") or used_scene.views)[0] if used_scene else None
-    viewpoint = Viewpoint.from_points(next(iter(loaded.values())).means, used_scene.views if used_scene else (), start)
+    viewpoint = Viewpoint.from_points(
+        next(iter(loaded.values())).scene_means, used_scene.views if used_scene else (), start
+    )
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if used_scene is None:
         LOG.info("without a scene, up is -y; add --scene if the model is upside down")

@@ -7,17 +7,17 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from clsplat.core.errors import DataError, OutputError
+from clsplat.core.errors import DataError, OutputError, size_text
 from clsplat.core.reading import sha256
 from clsplat.formats.splats import Quality, Reading, Writing
 from clsplat.formats.table import endings, writing_format
-from clsplat.gaussians.conversion import with_sky_splats
+from clsplat.gaussians.conversion import COUNT, with_sky_splats
 from clsplat.gaussians.model import load
-from clsplat.gaussians.sky import sky_path
+from clsplat.gaussians.sky import sky_path, without_sky_path
 from clsplat.scene.camera_files import check_cameras, write_cameras
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
-from clsplat.training.run import Run, host_model
+from clsplat.training.run import Run, host_model, sky_center
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 
 ENDINGS = tuple(ending for ending in endings() if ending.startswith("."))  # files only; SOG may be a folder too
@@ -29,7 +29,8 @@ class Export(Scheduled):
 
     A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
     in its name, holds the model as trained, with the filter as property `filter_3D`.  A learned sky is written as
-    Gaussians of the model, or to a file next to it, with `_sky.json` in its name, which only clsplat reads.
+    distant Gaussians of the model; a file with `_without_sky` in its name holds the model without them, and clsplat
+    renders that with the map of the sky, in a file with `_sky.json` in its name.
     """
 
     stage: Literal["export"] = "export"
@@ -40,9 +41,9 @@ class Export(Scheduled):
     """Path inside the run folder; its ending selects the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""
-    sky: Literal["sidecar", "splats"] = "sidecar"
-    """A learned sky (`model.background`): `sidecar`, a file next to the model, or `splats`, 10,000 Gaussians on a
-    distant sphere, which every viewer shows."""
+    sky: Literal["splats", "sidecar"] = "splats"
+    """A learned sky (`model.background`): `splats`, 10,000 Gaussians on a distant sphere, which every viewer shows, or
+    `sidecar`, only a file next to the model, which clsplat reads."""
 
     @model_validator(mode="after")
     def _quality_of_its_format(self) -> "Export":
@@ -54,19 +55,18 @@ class Export(Scheduled):
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
-        return [path, path.with_name(f"{path.stem}_raw.ply"), sky_path(path)]
+        return [path, path.with_name(f"{path.stem}_raw.ply"), sky_path(path), without_sky_path(path)]
 
     def run(self, run: Run) -> None:
         model = host_model(run)
-        if self.sky == "splats":
-            if model.sky is None:
-                LOG.warning("export.sky: splats has no effect: the model has no sky; set model.background to learn one")
-            model = with_sky_splats(model)
-        sky = len(model) - run.model.gaussians.count
-        path, raw, sky_path = self.outputs(run.out)
+        path, raw, sky_path, without_sky = self.outputs(run.out)
         if _name(sky_path, run) not in run.model_hashes:
             sky_path.unlink(missing_ok=True)
+        without_sky.unlink(missing_ok=True)
+        run.model_hashes.pop(_name(without_sky, run), None)
         files = {path: model.baked()}
+        if model.sky and self.sky == "splats":
+            files = {path: with_sky_splats(model, center=sky_center(run)), without_sky: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
         options = Writing(quality=self.quality)
@@ -77,13 +77,21 @@ class Export(Scheduled):
                     load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
-            sky_text = f" and {sky:,} of the sky" if sky else ""
-            LOG.debug("%s Gaussians%s written to %s", f"{len(written) - sky:,}", sky_text, file)
+            LOG.debug("%s written to %s", size_text(len(model), None, len(written) - len(model)), file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)
-        if model.sky:
-            LOG.info("sky written to %s; `export: {sky: splats}` writes it as Gaussians", sky_path)
+        if without_sky in files:
+            LOG.info("%s holds the sky as %s distant Gaussians; %s does not", path, f"{COUNT:,}", without_sky.name)
+        elif model.sky:
+            LOG.info("sky written to %s, which only clsplat reads", sky_path)
+
+
+def sky_gaussians(run: Run) -> int:
+    """Return the number of Gaussians that show the sky in files that a run exports, in addition to the model's."""
+    stages = run.pipeline["stages"]
+    has_splats = any("export" in stage and stage["export"].get("sky") == "splats" for stage in stages)
+    return COUNT if has_splats and run.gaussians is not None and run.model.sky else 0
 
 
 def _name(file: Path, run: Run) -> str:

@@ -17,7 +17,7 @@ from clsplat.scene.images import is_image, write_image
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.training.modules.base import learned_scene
-from clsplat.training.run import Run, host_model
+from clsplat.training.run import Run, host_model, sky_center
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, MAX_SIZE, Page, Which, view_entries
@@ -93,7 +93,7 @@ class Viewer(Stage):
 
         views = view_entries(scene, read, self.photographs, self.photograph_budget, through)
         viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
-        packed = pack(model)
+        packed = pack(model, None, sky_center(run))
         page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views, scene.origin)
         if page.size > MAX_SIZE and (number := page.max_splats):  # without room for any, `write` blames the photos
             LOG.warning(
@@ -101,6 +101,8 @@ class Viewer(Stage):
                 "`clsplat compress` makes smaller models",
                 *(path, f"{number:,}", packed.count_text),
             )
-            page = Page(page.title, {run.name: pack(model, number)}, viewpoint, name, views, scene.origin)
+            page = Page(
+                page.title, {run.name: pack(model, number, sky_center(run))}, viewpoint, name, views, scene.origin
+            )
         page.write(path)
         LOG.debug("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

@@ -23,6 +23,7 @@ from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS, position_text
 from clsplat.scene.view import View, sample_views
 from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
+from clsplat.stages.export import sky_gaussians
 from clsplat.training.best_model import Scores
 from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.modules.sky_choice import sky_advice
@@ -398,7 +399,7 @@ def _headline(run: Run) -> str:
 
 
 def _size(run: Run) -> str:
-    return size_text(run.gaussians, run.learned_field.parameters if run.learned_field else None)
+    return size_text(run.gaussians, run.learned_field.parameters if run.learned_field else None, sky_gaussians(run))
 
 
 def _figures(run: Run) -> dict[str, str]:
@@ -418,8 +419,9 @@ def _figures(run: Run) -> dict[str, str]:
         measured = run.best.measured
         values["validation PSNR before the refit"] = f"{measured.validation:.2f} dB"
         values["training PSNR before the refit"] = f"{measured.train:.2f} dB"
-    number, _, unit = _size(run).partition(" ")
-    values[unit] = number
+    text, _, sky = _size(run).partition(" and ")
+    number, _, unit = text.partition(" ")
+    values[unit] = number + (f" and {sky}" if sky else "")
     values["steps"] = f"{run.step:,}"
     values["training"] = duration_text(run.train_seconds)
     if run.scene.origin.any():

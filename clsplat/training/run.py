@@ -262,6 +262,11 @@ def host_model(run: Run) -> Model:
     return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None, origin=run.scene.origin)
 
 
+def sky_center(run: Run) -> NDArray[np.float64]:
+    """Return the point, [3], from which Gaussians of the sky agree with its map: the middle of the cameras."""
+    return np.median([view.position for view in run.scene.views], axis=0)
+
+
 def _rendering(run: Run) -> dict[str, Any]:
     """Return the settings with which viewers render the model file as in training."""
     model = run.model

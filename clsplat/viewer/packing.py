@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import size_text
 from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.splats import MAX_LOG, motion_degree, motion_fields
 from clsplat.gaussians.conversion import with_sky_splats
@@ -58,17 +59,17 @@ class Packed:
     def count_text(self) -> str:
         """The number of splats as text: "8,389 Gaussians and 10,000 of the sky"."""
         faint, sky = self.header["faint"], self.header.get("sky", 0)
-        text = f"{self.count - sky:,} Gaussians" + (f" and {sky:,} of the sky" if sky else "")
+        text = size_text(self.count - sky, None, sky)
         return text + (f" + {faint:,} too faint to draw" if faint else "")
 
 
-def pack(model: Model, limit: int | None = None) -> Packed:
+def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> Packed:
     """Pack a model, with the Gaussians of its sky; the same model gives the same bytes.
 
-    limit: number of splats to keep, the most important ones; None: all.
+    limit: number of splats to keep, the most important ones; None: all; sky_center: see with_sky_splats.
     """
     without_sky = len(model)
-    model = with_sky_splats(model).baked()
+    model = with_sky_splats(model, center=sky_center).baked()
     faint = int((model.opacities <= MIN_OPACITY).sum()) if limit is None or limit >= len(model) else 0
     order = _order(model, limit)
     sky = int((order >= without_sky).sum())

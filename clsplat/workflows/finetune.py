@@ -57,7 +57,7 @@ class Tuning:
         """Return a pipeline of these stages of the recipe and an export.  values: settings by key path."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        chosen = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, **export}}]
+        chosen = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
         document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
         pipeline = checked(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])

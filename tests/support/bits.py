@@ -150,7 +150,7 @@ NAMED = {
     "schedule_simt": sets("rasterizer.schedule=simt"),
     "seen": sets("optimize.update=seen"),
     "sky": sets("model.background=envmap"),
-    "sky_as_splats": sets("model.background={type: envmap, side: 8}", "export.sky=splats"),
+    "sky_as_sidecar": sets("model.background={type: envmap, side: 8}", "export.sky=sidecar"),
     "sweep": sets("init.source=points+sweep", scene="lens"),
     "threads_1": Case(environment=ONE_THREAD, same_as="splat_7k"),
     "threads_1_with_many": sets(*MANY, environment=ONE_THREAD, same_as="many"),

@@ -12,7 +12,7 @@ import pytest
 import clsplat
 from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
-from clsplat.gaussians.conversion import with_sky_splats
+from clsplat.gaussians.conversion import convert, with_sky_splats
 from clsplat.gaussians.sky import Sky, read_sky_file, sample_texels, texel_directions, write_sky_file
 from clsplat.metrics.images import psnr
 from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
@@ -20,6 +20,7 @@ from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import RunState
+from clsplat.runs.status import summary
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
@@ -201,7 +202,7 @@ def test_best_model_has_the_sky_of_its_step(tiny_scene, tmp_path):
     assert run.best.measured.step == 8, "the last steps ruin it"
     _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     np.testing.assert_array_equal(
-        read_sky_file(tmp_path / "run" / "point_cloud.ply").texels, then["modules/sky/texels"]
+        read_sky_file(tmp_path / "run" / "point_cloud_without_sky.ply").texels, then["modules/sky/texels"]
     )
 
 
@@ -215,7 +216,7 @@ def test_run_folder_is_rendered_and_measured_with_its_sky(sky_run):
 
 
 def test_model_file_without_its_sky_is_reported(sky_run, tmp_path, caplog):
-    shutil.copy(sky_run / "point_cloud.ply", tmp_path / "alone.ply")
+    shutil.copy(sky_run / "point_cloud_without_sky.ply", tmp_path / "alone.ply")
     assert clsplat.load(tmp_path / "alone.ply").sky is None
     assert "was trained with a sky; put alone_sky.json next to it" in caplog.text
     model = clsplat.load(sky_run)
@@ -238,17 +239,45 @@ def test_other_model_of_the_same_name_ignores_the_sky(sky_run, tmp_path, caplog)
     assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
 
 
-def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path):
+def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path, caplog):
+    """At training views as the map, in the run folder and elsewhere; all counts have both."""
+    moved = tmp_path / "moved.ply"
+    shutil.copy(sky_run / "point_cloud.ply", moved)
+    trained = clsplat.load(sky_run)
+    for file in (sky_run / "point_cloud.ply", moved):
+        model = clsplat.load(file)
+        assert (len(model), model.sky) == (len(trained) + 10_000, None)
+        np.testing.assert_array_equal(model.scene_means, trained.means)
+    assert not caplog.text
+    scores = []
+    for view in yard[0].views:
+        splats, pixels = (clsplat.Renderer(one).render(view) for one in (model, trained))
+        above = pixels.alpha < 0.05
+        images = (np.clip(one.image[above], 0, 1) for one in (splats, pixels))
+        scores.append(-10 * np.log10(np.mean(np.subtract(*images) ** 2)))
+    assert np.mean(scores) > 36
+    count = f"{len(trained):,} Gaussians and 10,000 of the sky"
+    assert json.loads((sky_run / "metrics.json").read_text())["sky_gaussians"] == 10_000
+    assert count in summary(sky_run)[0]
+    assert count in (sky_run / "report.html").read_text()
+    convert([sky_run], tmp_path / "other.ply")
+    assert len(clsplat.load(tmp_path / "other.ply")) == len(trained) + 10_000
+
+
+def test_finished_run_exports_its_sky_again(sky_run, tmp_path):
+    """As a file next to the model, and as Gaussians again, with equal bits and without training."""
     out = tmp_path / "run"
     shutil.copytree(sky_run, out)
-    run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), RunState.read(out), None, "resume")
-    assert not (out / "point_cloud_sky.json").exists()
-    model, before = clsplat.load(out), clsplat.load(sky_run)
-    assert len(model) == len(before) + 10_000
-    assert model.sky is None
-    view = yard[0].views[4]
-    found, expected = (clsplat.Renderer(one).render(view).image for one in (model, before))
-    assert np.abs(found - expected).mean() < 0.02
+    for sky in ("sidecar", "splats"):
+        run_pipeline(load(str(out / "pipeline.yaml"), [f"export.sky={sky}"]), RunState.read(out), None, "resume")
+        assert sorted(path.name for path in out.glob("*.ply")) == [
+            "point_cloud.ply",
+            *(["point_cloud_without_sky.ply"] if sky == "splats" else []),
+        ]
+        assert ("of the sky" in summary(out)[0]) == (sky == "splats")
+        np.testing.assert_array_equal(clsplat.load(out).sky.texels, clsplat.load(sky_run).sky.texels)
+    for name in ("point_cloud.ply", "point_cloud_without_sky.ply", "point_cloud_sky.json"):
+        assert sha256(out / name) == sha256(sky_run / name)
 
 
 def test_sky_gaussians_match_its_colors_in_all_directions(rng, sky_run):
@@ -261,19 +290,13 @@ def test_sky_gaussians_match_its_colors_in_all_directions(rng, sky_run):
     assert with_sky_splats(baked) is baked
 
 
-def test_invalid_sky_is_refused(tiny_scene, yard, tmp_path, caplog):
-    """Of transparent photographs, and as splats of a model that has none."""
+def test_sky_of_transparent_photographs_is_warned_of(tiny_scene, yard, tmp_path, caplog):
     transparent = "the photographs are transparent, so the sky would learn the color that clsplat puts behind them"
-    nothing = "export.sky: splats has no effect: the model has no sky"
-    few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
-    for scene, key, said in (
-        (tiny_scene, "model.background={type: envmap, side: 8}", [True, False]),
-        (yard[1], "model.background={type: envmap, side: 8}", [False, False]),
-        (yard[1], "model.background=null", [False, True]),
-    ):
+    few = ("optimize.steps=2", "init.count=60", "optimize.during=[]", "model.background={type: envmap, side: 8}")
+    for scene, is_warned in ((tiny_scene, True), (yard[1], False)):
         caplog.clear()
-        train(scene, tmp_path / f"run{said}", *few, key, "export.sky=splats")
-        assert [text in caplog.text for text in (transparent, nothing)] == said
+        train(scene, tmp_path / f"run{is_warned}", *few)
+        assert (transparent in caplog.text) == is_warned
 
 
 def test_rotated_model_has_a_rotated_sky(rng, sky_run):
