@@ -286,15 +286,3 @@ void cap_opacity(
     const float logit = unfiltered < 1.0f ? log(unfiltered / (1.0f - unfiltered)) : logit_opacity[i];
     logit_opacity[i] = logit_opacity[i] < logit ? logit_opacity[i] : logit;
 }
-
-/* Multiply opacities by 1 - fall: with o = 1 / (1 + e^-l) the odds become (1 - fall) / (e^-l + fall). */
-__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void decay_opacity(
-    __global float *restrict logit_opacity,  // [S]
-    const float fall,                        // in (0, 1)
-    const uint count)
-{
-    const uint i = get_global_id(0);
-    if (i < count)
-        logit_opacity[i] = log((1.0f - fall) / (exp(-fmax(logit_opacity[i], -80.0f)) + fall));
-}

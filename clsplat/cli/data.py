@@ -71,18 +71,6 @@ def video(
 
 
 @app.command()
-def sync_frames(
-    scene: Annotated[Path, typer.Argument(help="Folder with videos/NAME.mp4 for each camera.")],
-    frames: Annotated[int, typer.Option(min=2, help="Frames of each video, evenly spaced.")] = 60,
-    long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
-) -> None:
-    """Extract synchronized frames from the videos of several cameras."""
-    from clsplat.data_tools.sync_frames import write_sync_frames
-
-    print(f"{frames} frames from each of {write_sync_frames(scene, frames, long_side)} cameras in {scene / 'videos'}")
-
-
-@app.command()
 def undistort(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
     out: Annotated[Path, typer.Argument(help="Folder for the scene with pinhole cameras.")],

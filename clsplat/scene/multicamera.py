@@ -87,9 +87,10 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     frames = {name: files for name, files in frames.items() if files}
     videos = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
     if videos:
+        folder = videos[0].with_suffix("")
         raise DataError(
-            f"{videos[0]}: is a video without a folder {videos[0].with_suffix('')} of its frames; "
-            f"`clsplat data sync-frames {shell_quote(path)}` writes the frames of all cameras"
+            f"{videos[0]}: is a video without a folder {folder} of its frames; make the folder, and write them, for "
+            f"example with `ffmpeg -i {shell_quote(videos[0])} -r 10 {shell_quote(folder / '%04d.png')}`"
         )
     if not frames:
         raise DataError(f"{path / VIDEOS}: has no folders of frames; expected {VIDEOS}/NAME/0000.png … for each camera")

@@ -58,7 +58,6 @@ FAULTS = {  # kernel -> file, text, wrong text
     "spawn_children": ("density.cl", "2.0f * (y * z - w * x) * ez", "2.0f * (y * z + w * x) * ez"),
     "share_opacity": ("density.cl", "/ (float)copies[source[i]]", "/ (float)(copies[source[i]] + 1)"),
     "cap_opacity": ("density.cl", "limit / sqrt(energy2)", "limit / energy2"),
-    "decay_opacity": ("density.cl", "+ fall));", "+ 1.0f));"),
     "draw_left_out": ("dropout.cl", "(uint4)(i, step, 2, 0)", "(uint4)(i, step, 1, 0)"),
     "paint_depth": ("depth.cl", "row[2] * means[2 * stride + i]", "row[2] * means[stride + i]"),
     "fill_words": ("fill.cl", "(uint16)(word)", "(uint16)(word & 0xfffffffeu | 2u)"),

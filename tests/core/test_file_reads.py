@@ -46,7 +46,6 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/core/machine.py:available_memory": "reads what the kernel tells, which has no size",
     "clsplat/scene/llff.py:read_poses": "NumPy reads its own format, of a file whose size was checked",
     "data_tools/video.py:decoded": "decodes what was hashed before",
-    "data_tools/sync_frames.py:_length": "OpenCV opens videos by their names",
     "data_tools/lpips.py:write_lpips": "unpacks a package whose hash was checked",
     "data_tools/fetch.py:_members": "unpacks what it has downloaded",
 }

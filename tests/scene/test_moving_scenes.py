@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.data_tools.sync_frames import write_sync_frames
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.prepare.inspect.findings import Inspection, summarize
 from clsplat.prepare.undistort import undistort_scene
@@ -255,28 +254,8 @@ def test_video_without_a_matching_camera_is_ignored(tmp_path):
             (tmp_path / "videos" / clip).write_bytes(b"a video")
         assert [view.time for view in read_scene(tmp_path, 0).views] == [None, None]
     (tmp_path / "videos" / "0002.mp4").write_bytes(b"a video")
-    assert "a video without a folder" in refusal(read_scene, tmp_path)
-
-
-def test_video_frames_are_extracted_at_equal_times(tmp_path, caplog):
-    folder = several_cameras(tmp_path, {"a": 8, "b": 9})
-    for name, count in {"a": 8, "b": 9}.items():
-        video = cv2.VideoWriter(str(folder / "videos" / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
-        for i in range(count):
-            video.write(np.full((48, 64, 3), 20 * i, np.uint8))
-        video.release()
-        for file in (folder / "videos" / name).iterdir():
-            file.unlink()
-        (folder / "videos" / name).rmdir()
-    assert f"`clsplat data sync-frames {folder}`" in refusal(read_scene, folder)
-    assert write_sync_frames(folder, 3) == 2
-    assert "the end of b.avi is ignored" in caplog.text
-    views = read_scene(folder, 0).views
-    assert [view.time for view in views] == [0, 0.5, 1] * 2
-    levels = [cv2.imread(str(view.image_path)).mean() for view in views]
-    assert levels == pytest.approx([0, 80, 140] * 2, abs=4)
-    assert write_sync_frames(folder, 3) == 2
-    assert "use 2 to 8" in refusal(write_sync_frames, folder, 9)
+    frames = tmp_path / "videos" / "0002"
+    assert f"`ffmpeg -i {frames}.mp4 -r 10 {frames}/%04d.png`" in refusal(read_scene, tmp_path)
 
 
 def test_colmap_folder_with_times_is_dynamic(tiny_colmap, tmp_path):

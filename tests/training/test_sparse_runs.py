@@ -1,4 +1,4 @@
-"""Whole runs with regularization for few photographs: dropout and opacity decay."""
+"""Whole runs with dropout, the regularization for few photographs."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ import pytest
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
@@ -28,7 +27,6 @@ stages:
       log_every: 5
       during:
         - densify: {every: 4, start: 3, rules: [{type: clone, gradient_above: 1.0e-9, size_below: 1}]}
-        - decay_opacity: {every: 2, per_pass: 0.9}
         - checkpoint: {every: 4, keep: 9}
   - export: {file: point_cloud.ply}
 """
@@ -51,20 +49,6 @@ def test_dropout_changes_the_bits(tiny_scene, tmp_path, pipeline):
     ]
     assert len(set(without)) == 1
     assert without[0] != whole
-
-
-def test_opacities_decay_by_the_same_factor_in_each_pass(tiny_scene, tmp_path, pipeline):
-    """Where nothing else changes them: eleven steps, of which five are followed by a decay, of eight photographs."""
-    still = "optimize.rates.logit_opacity=0", "densify.start=100"
-    found = {}
-    for factor in (1.0, 0.9):
-        out = train(
-            tiny_scene, tmp_path / str(factor), *still, f"decay_opacity.per_pass={factor}", pipeline=pipeline
-        ).out
-        logits = read_ply(out / "point_cloud.ply").parameters["logit_opacity"].astype(float)
-        found[factor] = 1 / (1 + np.exp(-logits))
-    np.testing.assert_allclose(found[1.0], 0.3, rtol=1e-5)
-    np.testing.assert_allclose(found[0.9], 0.3 * 0.9 ** (5 * 2 / 8), rtol=1e-5)
 
 
 def test_dropped_gaussian_counts_as_invisible(rng):

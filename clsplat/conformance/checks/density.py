@@ -20,7 +20,6 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, SplitLarge
-from clsplat.methods.binocular import decay_opacity
 from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
 from clsplat.photos.photographs import Mask, Photograph
@@ -184,19 +183,6 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
             actual = gaussians.get("logit_opacity")[:, 0]
             yield by_element("cap_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
-
-
-@CHECKS.add("decay_opacity")
-def opacity_decay(device: Device, rng: np.random.Generator) -> Results:
-    for count in COUNTS:
-        for factor in (0.995, 0.5):
-            case = random_case(rng, count)
-            case.parameters["logit_opacity"][:] = rng.uniform(-8, 6, (count, 1))
-            gaussians, before = case.model(device).gaussians, case.gaussians().logit_opacity
-            expected = ref.decayed_logit(before, factor)
-            decay_opacity(gaussians, factor)
-            actual = gaussians.get("logit_opacity")[:, 0]
-            yield by_element("decay_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("add_noise")

@@ -152,12 +152,6 @@ def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
     return np.log(-np.expm1(log_transmittance)) - log_transmittance
 
 
-def decayed_logit(logit: NDArray[Any], factor: float) -> NDArray[Any]:
-    """Return the logit of `factor` times the opacity."""
-    opacity = factor / (1 + np.exp(-logit))
-    return np.log(opacity / (1 - opacity))
-
-
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
     """Return logits, [N], whose opacities after the 3D filter, a factor of `filter_ratio`, are at most `ceiling`."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
