@@ -201,8 +201,8 @@ class Trainer:
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Add a loss in NumPy: `function(image, photograph) -> (value, gradient with respect to the image)`.
 
-        Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
-        host and the gradient back; a plug-in with a kernel avoids these copies.
+        Arrays are [height, width, 3] float32 in [0, 1]; weight: a number or schedule.  Each step copies both images to
+        the host and the gradient back; a plug-in with a kernel avoids these copies.
         Raises ConfigError for a negative weight.  A step raises ValueError if the function returns anything else, and
         NumericError for values that are not finite.
         """

@@ -107,9 +107,9 @@ class SampledPruning(Rule):
     share: Share = 0.5
     """Fraction of the faint and large Gaussians that is removed."""
     opacity_below: Positive = 0.005
-    """Opacity below which a Gaussian is faint; by step."""
+    """Opacity below which a Gaussian is faint; may be scheduled."""
     size_above: Positive = 0.1
-    """Size above which a Gaussian is large: largest standard deviation relative to the extent; by step."""
+    """Size above which a Gaussian is large: largest standard deviation relative to the extent; may be scheduled."""
 
     @abstractmethod
     def weights(self, edit: Edit) -> NDArray[np.float64]:

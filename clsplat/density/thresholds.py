@@ -1,4 +1,4 @@
-"""Define thresholds of density rules (numbers by step, or quantiles of the scene's values) and their units."""
+"""Define thresholds of density rules (scheduled values, or quantiles of the scene's values) and their units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -91,7 +91,7 @@ class Loss(Settings):
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
     weight: Schedule = 1.0
-    """Weight of the loss; by step."""
+    """Weight of the loss; may be scheduled."""
 
 
 class ImageLoss(Loss):

@@ -157,7 +157,7 @@ def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     name, number = numbered.groups() if numbered else (device_name, "0")
     matching = [info for info in devices if info.matches(name)]
     if int(number) >= len(matching):
-        raise DeviceError(f"no device matches {quote(device_name)}; there are: {'; '.join(i.text for i in devices)}")
+        raise DeviceError(f"no device matches {quote(device_name)}; available: {'; '.join(i.text for i in devices)}")
     info = matching[int(number)]
     fault = info.fault()
     if fault is not None:

@@ -96,7 +96,7 @@ class ViewSettings(Settings):
     order: OneOf[Order] = Uniform()
     """Which view a step trains on."""
     resolution: Annotated[DetailDivisor | AtLeastOne, explain_schedule(", or {follows: detail, until, …}")] = 1.0
-    """Downscale factor, at least 1, in addition to `scene.downscale`; by step, or from the photographs' detail."""
+    """Downscale factor on top of `scene.downscale`, at least 1; may be scheduled, or follow the photographs' detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""
 

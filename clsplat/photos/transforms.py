@@ -37,7 +37,7 @@ class Blur(PhotographTransform):
 
     type: Literal["blur"] = "blur"
     sigma: NonNegative
-    """Standard deviation, px at training size; by step."""
+    """Standard deviation, px at training size; may be scheduled."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         sigma = at_step(self.sigma, step)
@@ -49,7 +49,7 @@ class MeanFilter(PhotographTransform):
 
     type: Literal["mean_filter"] = "mean_filter"
     width: NonNegative
-    """Side of the square as a fraction of the photograph's width, rounded to an odd number of px; by step."""
+    """Side of the square as a fraction of the photograph's width, rounded to an odd number of px; may be scheduled."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         return _average(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)

@@ -34,11 +34,11 @@ class EnvironmentMap(Backdrop):
     side: Annotated[int, Field(ge=SIDES[0], le=SIDES[1])] = 64
     """Number of texels along a side of the square map; with 64, they are 3 degrees apart."""
     rate: NonNegative = 5.0e-3
-    """Learning rate of the colors; by step."""
+    """Learning rate of the colors; may be scheduled."""
     cover: NonNegative = 0.05
-    """Weight of the loss on Gaussians in front of the sky: mean over the image of the alpha of sky pixels; by step."""
+    """Weight of the loss on Gaussians in front of the sky, the mean alpha of sky pixels; may be scheduled."""
     difference: NonNegative = 0.05
-    """Difference between pixel and map, averaged over channels, below which a pixel shows the sky; by step."""
+    """Difference between pixel and map, averaged over channels, below which a pixel shows the sky; may be scheduled."""
 
     @property
     def sky(self) -> "EnvironmentMap":

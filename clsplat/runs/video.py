@@ -189,7 +189,7 @@ def view(
     if photographs not in ("none", "test", "all"):
         raise ConfigError(f"--photographs: expected none, test, or all, got '{photographs}'")
     if not 0 <= photograph_budget < math.inf:
-        raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
+        raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected a finite number of MB, 0 or more")
     for path in models:
         require_model(path)
     source = next((ModelSource.of(path, scene) for path in models if scene is not None or find_run(path)), None)

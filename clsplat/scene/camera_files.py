@@ -52,7 +52,7 @@ def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
             raise DataError(f"the view {quote(posed.name)} has no photograph to copy; write only the cameras")
         if posed.view.lens is not None and posed.view.lens.is_wide:
             raise DataError(
-                f"the view {quote(posed.name)} is a part of a wide photograph; run `clsplat data undistort` first, "
+                f"the view {quote(posed.name)} is part of a wide photograph; run `clsplat data undistort` first, "
                 "or write only the cameras"
             )
     return {folder / posed.name: posed.view.image_path for posed in views}

@@ -28,8 +28,8 @@ class Clock:
         low, high = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
         if low < self.first - slack or high > self.last + slack:
             raise DataError(
-                f"{path}: its points have times from {low:.9g} to {high:.9g}; expected the unit of the frames, whose "
-                f"times are {self.first:.9g} to {self.last:.9g}: write the points again, or without the property `time`"
+                f"{path}: its points have times from {low:.9g} to {high:.9g}, but the frames {self.first:.9g} to "
+                f"{self.last:.9g}; use the unit of the frames, or remove the property `time` of the points"
             )
         return self(values)
 

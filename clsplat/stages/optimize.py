@@ -129,8 +129,8 @@ class ValidatedTraining(Training):
         stages = [stage for stage in self.order_stages(self.during) if _validates(stage)]
         if not any(stage.is_due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
             raise ConfigError(
-                "optimize.keep: best needs a measurement of the validation views until the last step; lower "
-                "the `every` of `evaluate` in `during`, or remove it to get a default one"
+                "optimize.keep: best needs an evaluation of the validation views before the end; lower the "
+                "`every` of `evaluate` in `during`, or remove that stage to use the default one"
             )
 
     def after_stage(self, run: Run, stage: Scheduled) -> None:

@@ -94,7 +94,7 @@ class AverageParameters(Scheduled):
     def finish(self, run: Run) -> None:
         if adam.has_average(run.model.gaussians):  # a resumed run may have replaced the parameters before
             if not any(map(self.is_due, range(run.step - run.stage_step + 1, run.step))):  # no edit after the last step
-                LOG.info("average: the training ended before its first step; the model is that of the last step")
+                LOG.info("average: training ended before averaging started; the model is that of the last step")
             with run.editing_tables():
                 adam.take_average(run.model.gaussians)
                 run.refresh_filter()

@@ -47,7 +47,7 @@ def _scale_rate(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay 
 
 
 class Rates(Settings):
-    """Learning rates of the parameters, each by step."""
+    """Learning rates of the parameters; may be scheduled."""
 
     means: Annotated[
         FullSizeDecay | NonNegative, explain_schedule(", or {initial, final, until, start: full_size}")

@@ -20,7 +20,7 @@ Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=100.0))]
 
 
 class MotionRates(Settings):
-    """Learning rates of the motion, each by step, and the bound on durations.
+    """Learning rates of the motion, which may be scheduled, and the bound on durations.
 
     Time is normalized to 0 at the first and 1 at the last timestamp of the scene.
     """

@@ -156,7 +156,7 @@ def test_bad_settings(tiny_scene, tmp_path):
 
 def test_unknown_device_error_lists_devices(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "x", "--device", "no such chip", expect=4)
-    assert "no device matches 'no such chip'; there are: " in done.stderr
+    assert "no device matches 'no such chip'; available: " in done.stderr
 
 
 def test_output_that_cannot_be_written(tiny_scene, tmp_path):

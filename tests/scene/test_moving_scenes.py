@@ -175,7 +175,7 @@ def test_times_of_points_in_another_unit_are_refused(tmp_path):
     assert read_scene(path).points.times.tolist() == [0, 0.5, 1]
     write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([0, 0.5, 1])))
     fault = refusal(read_scene, path)
-    assert "points3d.ply: its points have times from 0 to 1; expected the unit of the frames" in fault
+    assert "points3d.ply: its points have times from 0 to 1, but the frames" in fault
     assert "10 to 30" in fault
     assert fault in [finding.text for finding in Inspection.from_folder(path).findings]
 

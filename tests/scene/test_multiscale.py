@@ -88,8 +88,8 @@ def test_damaged_metadata_is_refused(folders, tmp_path):
     for content, words in (
         (text[:-20], "not a JSON file"),
         ("[]", "'train' needs lists of equal length called file_path"),
-        (json.dumps({"train": metadata["train"]}), "'test' lacks"),
-        (json.dumps(short), "'train' lacks"),
+        (json.dumps({"train": metadata["train"]}), "'test' needs lists"),
+        (json.dumps(short), "'train' needs lists"),
         (json.dumps(label), r"test\[0\]: label is 0.5"),
         (text, "image files are missing"),
     ):

@@ -89,7 +89,7 @@ def test_training_without_an_average_keeps_the_last_step(tiny_scene, tmp_path, p
     run = train(tiny_scene, tmp_path / "run", "optimize.average.start=30", pipeline=pipeline)
     last = checkpoint.load(checkpoint.list_files(run.out)[-1])[1]["gaussians/means"]
     np.testing.assert_array_equal(read_ply(run.out / "point_cloud.ply").parameters["means"], last)
-    assert "average: the training ended before its first step" in caplog.text
+    assert "average: training ended before averaging started" in caplog.text
 
 
 def test_trainer_averages_after_its_last_step(tiny_scene, tmp_path, pipeline, averaged):

@@ -207,7 +207,7 @@ def test_training_continues_from_the_last_step(tiny_scene, tmp_path, pipeline, b
 )
 def test_measurement_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
     during = f"optimize.during=[evaluate: {own}]"
-    with pytest.raises(ConfigError, match="needs a measurement of the validation views until the last step"):
+    with pytest.raises(ConfigError, match="needs an evaluation of the validation views before the end"):
         train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
 
 
@@ -218,7 +218,7 @@ def test_measurements_of_a_later_training_count_from_its_start(tmp_path):
         (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 4, during))
         assert load(str(tmp_path / "x.yaml")).settings.training
         (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 3, during))
-        with pytest.raises(ConfigError, match="needs a measurement of the validation views until the last step"):
+        with pytest.raises(ConfigError, match="needs an evaluation of the validation views before the end"):
             load(str(tmp_path / "x.yaml"))
 
 

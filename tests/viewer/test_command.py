@@ -220,7 +220,7 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="--photographs: expected none, test, or all, got 'some'"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
     for budget in (float("inf"), float("nan"), -1.0):
-        with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):
+        with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected a finite number of MB"):
             clsplat.view(run, out=tmp_path / "a.html", photograph_budget=budget)
     alone = shutil.copy(run / "point_cloud.ply", tmp_path)
     with pytest.raises(ConfigError, match="--photographs all needs the photos of a scene; add --scene"):

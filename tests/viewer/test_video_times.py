@@ -43,7 +43,7 @@ def test_times_are_one_or_two_timestamps(given, expected):
 
 @pytest.mark.parametrize("given", ["", "a", "0..2", "-1", "nan", [0.1, 0.2, 0.3], "0.."])
 def test_other_times_are_refused(given):
-    with pytest.raises(ConfigError, match="expected a time from 0 to 1, or two such as 0"):
+    with pytest.raises(ConfigError, match="expected a time from 0 to 1, or a range such as 0"):
         parse_times(given)
 
 

@@ -55,8 +55,8 @@ class BilateralGrid(Appearance):
     """Number of matrices along width, height, and luminance, 1 to 16 each, interpolated trilinearly; the outer ones are
     on the edges, at black and white.  The paper uses [16, 16, 8]."""
     rate: RateOrAuto = "auto"
-    """Learning rate; by step.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown, with a
-    warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
+    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown,
+    with a warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
     """Weight of the total variation loss of the step's grid: the mean squared difference of neighbors, summed over the
     axes."""

@@ -70,13 +70,13 @@ class CameraOptimizer(TrainingModule):
 
     type: Literal["camera_optimizer"] = "camera_optimizer"
     rotation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
-    """Learning rate of rotations, rad; by step.  auto: 0.3 times the automatic rate of translations."""
+    """Learning rate of rotations, rad; may be scheduled.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
-    """Learning rate of translations, relative to that depth; by step.  auto: 2e-4 to 2e-6; with few visits per
+    """Learning rate of translations, relative to that depth; may be scheduled.  auto: 2e-4 to 2e-6; with few visits per
     photograph, large enough for a translation of 0.01, up to 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
-    """Learning rate of the logarithms of focal lengths; by step; 0: fixed.  auto: 1e-4 to 1e-6; with few visits per
-    camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
+    """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: 1e-4 to 1e-6; with few
+    visits per camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are optimized; before it, the model is too blurry to align cameras."""
 

@@ -46,9 +46,9 @@ class CameraResponse(TrainingModule):
 
     type: Literal["camera_response"] = "camera_response"
     rate: NonNegative = 1e-3
-    """Learning rate (Adam) of the parameters; number by step. Trainings of a few hundred steps need 5e-3."""
+    """Learning rate (Adam) of the parameters; may be scheduled. Trainings of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; number by step. It makes the Gaussians learn
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It makes the Gaussians learn
     what all photos have in common."""
 
     def create_state(self, run: Run) -> ModuleState:

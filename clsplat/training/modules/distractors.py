@@ -54,7 +54,7 @@ class Distractors(TrainingModule):
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which they are rendered."""
     cover: NonNegative = 0.1
-    """Weight of the loss on their mean alpha over the photograph; by step."""
+    """Weight of the loss on their mean alpha over the photograph; may be scheduled."""
 
     def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget

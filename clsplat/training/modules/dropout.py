@@ -21,7 +21,7 @@ class Dropout(TrainingModule):
 
     type: Literal["dropout"] = "dropout"
     probability: Probability
-    """Probability of dropping a Gaussian; by step, at most 0.9."""
+    """Probability of dropping a Gaussian, at most 0.9; may be scheduled."""
 
     def create_state(self, run: Run) -> ModuleState:
         return DropoutState(self, run.seed)

@@ -75,8 +75,8 @@ class Appearance(TrainingModule):
     device_planes: ClassVar[int] = 6  # the transformed image, and its gradient
 
     rate: RateOrAuto = "auto"
-    """Learning rate; by step.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photograph; if
-    exposures are unknown, large enough for a gain of 2.7, up to 5e-2.  At most 0.5."""
+    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photograph;
+    if exposures are unknown, large enough for a gain of 2.7, up to 5e-2.  At most 0.5."""
 
     when: Literal["always", "auto"] = "always"
     """`auto`: only if exposures differ.

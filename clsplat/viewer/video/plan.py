@@ -46,7 +46,7 @@ def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
     except (ValueError, TypeError):
         times = []
     if len(times) not in (1, 2) or not all(map(is_timestamp, times)):
-        raise ConfigError(f"time {quote(value)}: expected a time from 0 to 1, or two such as 0..1")
+        raise ConfigError(f"time {quote(value)}: expected a time from 0 to 1, or a range such as 0..1")
     return times[0], times[-1]
 
 
