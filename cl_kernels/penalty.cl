@@ -106,3 +106,23 @@ void mean_opacity(
     VSTORE(VLOAD(grad_logit_opacity + i) + weight * opacity * (1.0f - opacity), grad_logit_opacity + i);
     sums[get_global_id(0)] = sum_lanes(opacity);
 }
+
+/* grad_logit_opacity += weight where the logit is above `low`; the sum is that of max(logit - low, 0). */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void opacity_pressure(
+    __global const float *restrict logit_opacity,  // [S]
+    __global float *restrict grad_logit_opacity,   // [S]
+    __global float *restrict sums,                 // [items]
+    const float low,                               // logit
+    const float weight,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    const VF zero = (VF)(0.0f);
+    const VF excess = VLOAD(logit_opacity + i) - low;
+    const VI above = ((LANE_INDEX + (int)i) < (int)count) & (excess > zero);
+    VSTORE(VLOAD(grad_logit_opacity + i) + (above ? (VF)(weight) : zero), grad_logit_opacity + i);
+    sums[get_global_id(0)] = sum_lanes(above ? excess : zero);
+}

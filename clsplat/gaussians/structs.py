@@ -78,6 +78,12 @@ class GaussianGradients:
         gradients._withheld = ("sh_rest",)
         return gradients
 
+    def replace(self, arrays: dict[str, Array]) -> "GaussianGradients":
+        """Return a copy with other arrays, by name of the parameter."""
+        gradients = copy.copy(self)
+        gradients.arrays = arrays
+        return gradients
+
     def fits(self, gaussians: Struct) -> bool:
         """Return whether the shapes match the parameters of these Gaussians."""
         return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.progress import Progress
-from clsplat.core.schedule import fire_step
+from clsplat.core.schedule import AtLeastOne, fire_step
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
@@ -19,14 +19,14 @@ from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
-from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.adam import Adam, Rates, Rows, attach_gradients
 from clsplat.training.best_model import Best, Scores
 from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import offload_advice, offload_harmonics
-from clsplat.training.stage import Scheduled, Training
+from clsplat.training.stage import ALL_HARMONICS, Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
 LOG = logging.getLogger("clsplat")
@@ -236,13 +236,16 @@ class Optimize(ValidatedTraining):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "views_per_update"})
 
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
     """Gaussians that a step updates: `all`; `seen`, where culled Gaussians keep their parameters and moments; or
     `deferred`, with the same bits as `all`, where `sh_rest` of culled Gaussians is updated when a view sees them."""
+    views_per_update: AtLeastOne = 1
+    """Number of views whose gradients are averaged for an update; by step, where it is a multiple of this number.  It
+    needs `update: all`."""
     views: ViewSettings = ViewSettings()
     """View, image size and transforms of each step."""
     losses: list[OneOf[Loss]]
@@ -268,6 +271,15 @@ class Optimize(ValidatedTraining):
     def _in_order(cls, modules: list[TrainingModule]) -> list[TrainingModule]:
         check_list(modules)
         return modules
+
+    @model_validator(mode="after")
+    def _with_all_rows(self) -> "Optimize":
+        if self.views_per_update != 1 and self.update != "all":
+            raise ValueError("'views_per_update' needs 'update: all'; set one of them to its default")
+        return self
+
+    def active_conflicts(self) -> Mapping[str, str]:
+        return ALL_HARMONICS if self.views_per_update != 1 else {}
 
     def check(self) -> None:
         for module in self.modules:
@@ -354,7 +366,9 @@ class Optimize(ValidatedTraining):
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.resolve(views.full_size(last_step))
         states: list[ModuleState] = attach_modules(self.modules, run, last_step)
-        trained = self.losses, rates, run.scene.extent, self.update
+        if self.views_per_update != 1:
+            attach_gradients(gaussians)
+        trained = self.losses, rates, run.scene.extent, self.update, self.views_per_update
         return StepTrainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:

@@ -1,6 +1,6 @@
 """Optimize the tables of Gaussians with Adam, one learning rate per table, and average them over steps."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -239,6 +239,24 @@ class Adam:
         self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
 
 
+# The mean of the gradients of several views, in tables next to the parameters.
+
+GRADIENT = "gradient/"  # prefix of parameter names
+VIEWS = f"{GRADIENT}views"  # number of views in the mean of a row
+
+
+def attach_gradients(gaussians: Gaussians) -> None:
+    """Add empty tables for the gradients of several views, if missing."""
+    if VIEWS not in gaussians.tables:
+        _add_tables(gaussians, GRADIENT, VIEWS)
+
+
+def add_gradients(gaussians: Gaussians, gradients: GaussianGradients) -> GaussianGradients:
+    """Add the gradients of a view to the mean; return the mean, which changes with the next view."""
+    _add_to_mean(gaussians, {name: gradients[name] for name in gaussians.trained}, GRADIENT, VIEWS)
+    return gradients.replace({name: gaussians[GRADIENT + name] for name in gaussians.trained})
+
+
 # The average of the parameters over steps, in tables next to them (Polyak and Juditsky 1992).
 
 FOLDER = "average/"  # prefix of parameter names
@@ -253,24 +271,33 @@ def has_average(gaussians: Gaussians) -> bool:
 def attach_average(gaussians: Gaussians) -> None:
     """Add empty tables for averages, if missing.  Rows of new Gaussians start empty."""
     if not has_average(gaussians):
-        for name in gaussians.trained:
-            gaussians.add(FOLDER + name, gaussians.tables[name].components, zero_fresh=True)
-        gaussians.add(NUMBER, 1, zero_fresh=True)
+        _add_tables(gaussians, FOLDER, NUMBER)
+
+
+def _add_tables(gaussians: Gaussians, folder: str, number: str) -> None:
+    for name in gaussians.trained:
+        gaussians.add(folder + name, gaussians.tables[name].components, zero_fresh=True)
+    gaussians.add(number, 1, zero_fresh=True)
 
 
 def add_to_average(gaussians: Gaussians) -> None:
     """Add the current parameters to their averages."""
+    _add_to_mean(gaussians, {name: gaussians[name] for name in gaussians.trained}, FOLDER, NUMBER)
+
+
+def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], folder: str, number: str) -> None:
+    """Add values, by parameter, to the means in the tables of a folder; `number` counts them for each row."""
     program, count = gaussians.device.program("average.cl"), gaussians.count
-    for name in gaussians.trained:
+    for name, array in values.items():
         program.add_to_average(
             items=(count, gaussians.tables[name].components),
-            values=gaussians[name],
-            average=gaussians[FOLDER + name],
-            number=gaussians[NUMBER],
+            values=array,
+            average=gaussians[folder + name],
+            number=gaussians[number],
             stride=gaussians.capacity,
             count=count,
         )
-    program.count_step(items=count, number=gaussians[NUMBER], count=count)
+    program.count_step(items=count, number=gaussians[number], count=count)
 
 
 def take_average(gaussians: Gaussians) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
+from clsplat.core.schedule import Schedule, at_step
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.losses.base import (
@@ -20,7 +21,7 @@ from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, apply_mask, unmasked_gradient
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.adam import VIEWS, Adam, Rates, Rows, add_gradients, attach_gradients
 from clsplat.training.modules.base import ModuleState, TrainingStep
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
@@ -61,6 +62,7 @@ class StepTrainer:
     rates: Rates
     extent: float = 1.0  # scene units
     rows: Rows = "all"  # Gaussians that a step changes
+    views_per_update: Schedule = 1  # Adam updates with the mean of their gradients
     modules: Sequence[ModuleState] = ()  # forward in this order, backward in reverse
 
     def step(
@@ -152,18 +154,26 @@ class StepTrainer:
         """Update the parameters and add the penalties to the view's losses.
 
         Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion,
-        and depths, a fused kernel is used, which writes no gradients to memory.
+        depths, and gradients of several views, a fused kernel is used, which writes no gradients to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
-        if not (penalties or stale or self.model.gaussians.is_moving or view.frame.content == "inverse_depth"):
+        gaussians, has_depth = self.model.gaussians, view.frame.content == "inverse_depth"
+        has_views = self.views_per_update != 1
+        if not (penalties or stale or gaussians.is_moving or has_depth or has_views):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
-        is_deferred = self.rows == "deferred" or self.model.gaussians.on_host
+        is_deferred = self.rows == "deferred" or gaussians.on_host
         current = gradients.without_deferred() if is_deferred else gradients
-        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, current, self.extent, step)
+        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, current, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(checked_value(penalty, penalty.add(inputs)) for penalty in penalties)
+        if has_views:
+            attach_gradients(gaussians)
+            gradients = add_gradients(gaussians, gradients)
+            if step % int(at_step(self.views_per_update, step)):
+                return gradients.mean2d
+            gaussians[VIEWS].fill(0)
         self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)
         return gradients.mean2d

@@ -91,6 +91,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
     "mean_scale": ("penalty.cl", "total += scale;", "total += 2.0f * scale;"),
     "mean_opacity": ("penalty.cl", "opacity * (1.0f - opacity)", "opacity * (1.0f + opacity)"),
+    "opacity_pressure": ("penalty.cl", "(above ? (VF)(weight) : zero)", "(VF)(weight)"),
     "draw_pixels": ("rays.cl", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).x", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).y"),
     "cast_rays": ("rays.cl", "cone[6] = CONE_RADIUS / camera", "cone[6] = 0.5f / camera"),
     "spread_edges": ("rays.cl", "ray_edges[k] = near + width * position", "ray_edges[k] = near - width * position"),

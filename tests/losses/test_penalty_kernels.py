@@ -9,6 +9,7 @@ from clsplat.gaussians.gaussians import INTERVAL2
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.losses.base import LossValue, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
+from clsplat.methods.natural_selection import OpacityPressure
 from clsplat.render.workspace import Workspace
 from tests.support.devices import on_devices, on_one_setting
 
@@ -88,6 +89,16 @@ def test_mean_scale(device, rng, count):
 
 
 @on_devices("count", COUNTS)
+def test_opacity_pressure_acts_above_its_floor_and_number(device, rng, count):
+    inputs, _ = inputs_of(device, rng, count)
+    logits = rng.normal(0, 3, (count, 1))
+    inputs.gaussians.set("logit_opacity", logits)
+    value, gradient = ref.opacity_pressure(np.float32(logits).astype(np.float64), -1.0)
+    check(inputs, OpacityPressure(weight=2.0, floor=-1.0).add(inputs), 2 * value, 2 * gradient, "logit_opacity")
+    assert OpacityPressure(weight=2.0, gaussians=count).add(inputs).value() == 0
+
+
+@on_devices("count", COUNTS)
 def test_mean_opacity(device, rng, count):
     inputs, _ = inputs_of(device, rng, count)
     logits = rng.choice([-90.0, -6.0, 0.0, 3.0, 90.0], (count, 1)) + rng.normal(0, 1, (count, 1))
@@ -103,6 +114,7 @@ def test_mean_opacity(device, rng, count):
         lambda x: ref.anisotropy(x, 5.0),
         lambda x: ref.mean_scale(x, EXTENT),
         ref.mean_opacity,
+        lambda x: ref.opacity_pressure(x, -1.0),
     ],
 )
 def test_oracle_against_finite_differences(rng, penalty):

@@ -1,5 +1,6 @@
 """One training step from its parts, as in pipelines, benchmarks, and notebooks; also with NumPy losses."""
 
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Gaussians
+from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ImageLoss, Loss, checked_value
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
@@ -90,6 +92,28 @@ def test_differentiating_updates_nothing(device, rng):
     for name, table in before.items():
         np.testing.assert_array_equal(trainer.model.gaussians.get(name), table)
     assert trainer.adam.updates["means"] == 0
+
+
+def test_update_uses_the_mean_gradient_of_several_views(device, rng):
+    """The first moment is 0.1 times the mean; no parameter changes before, and the next mean starts from zero."""
+    trainer, photograph = trainer_of(device, rng, [L1()])
+    trainer.views_per_update = 2
+    gaussians, noise = trainer.model.gaussians, rng.integers(0, 256, (3, 30, 40)).astype(np.uint8)
+    views = [photograph, replace(photograph, colors=device.upload(noise))]
+    gradients = []
+    for view in views:
+        result = trainer.differentiate(view, 1)
+        arrays = trainer.rasterizer.gradients(trainer.model, result.frame, result.pixel_sums)
+        gradients.append(arrays["means"].get()[:, :60].T)
+    before = gaussians.get("means")
+    trainer.step(views[0], 1)
+    np.testing.assert_array_equal(gaussians.get("means"), before)
+    trainer.step(views[1], 2)
+    moment = gaussians.get(moment_tables("means")[0])
+    np.testing.assert_allclose(moment, 0.1 * np.mean(gradients, axis=0), rtol=1e-5, atol=1e-9)
+    assert (gaussians.get("means") != before).any()
+    assert trainer.adam.updates["means"] == 1
+    assert not gaussians.get("gradient/views").any()
 
 
 @pytest.mark.parametrize("loss", [Loss(), print])

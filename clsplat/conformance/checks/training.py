@@ -18,6 +18,7 @@ from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gau
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
+from clsplat.methods.natural_selection import OpacityPressure
 from clsplat.opencl.device import Array, Device, constants
 from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.render.workspace import Workspace
@@ -181,7 +182,7 @@ def check_penalty(
     yield by_element(kernel, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)
 
 
-@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
+@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity", "opacity_pressure")
 def penalties(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
@@ -197,6 +198,10 @@ def penalties(device: Device, rng: np.random.Generator) -> Results:
         yield from check_penalty(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
         opacity = MeanOpacity(weight=3.0)
         yield from check_penalty(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
+        pressure = OpacityPressure(weight=3.0, floor=-0.5)
+        yield from check_penalty(
+            device, rng, count, pressure, lambda logits: ref.opacity_pressure(logits, -0.5), parameter="logit_opacity"
+        )
 
 
 def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:

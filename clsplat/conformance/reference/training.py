@@ -74,6 +74,12 @@ def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     return opacities.mean(), opacities * (1 - opacities) / opacities.size
 
 
+def opacity_pressure(logit_opacity: NDArray[Any], floor: float) -> tuple[float, NDArray[Any]]:
+    """Return the mean of max(logit - floor, 0).  logit_opacity: [N, 1]."""
+    excess = np.maximum(logit_opacity - floor, 0)
+    return excess.mean(), (excess > 0) / excess.size
+
+
 # Density control: which Gaussians are cloned, split and pruned, and their children.
 
 KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows afterwards: itself; itself twice; two children; none

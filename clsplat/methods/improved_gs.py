@@ -1,0 +1,120 @@
+"""Split along the longest axis by an edge-aware score, and prune what does not recover (Improved-GS, Deng et al. 2025).
+
+The third part of the method, several views per update, is `optimize.views_per_update`.
+"""
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.core.quaternions import rotation_matrix
+from clsplat.core.schedule import Positive
+from clsplat.density.budget import Budget, BudgetContext
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import largest, sampling_order
+from clsplat.density.statistics import TEXTURE
+from clsplat.density.survey import RenderedView, Survey, normalize
+from clsplat.density.thresholds import Share
+
+Floats = NDArray[np.float64]
+
+
+def edge_map(render: RenderedView) -> Floats:
+    """Return the magnitude of the gradient of the photograph's luminance (Sobel), from 0 to 1, [height, width]."""
+    gray = render.photograph.image().mean(axis=2, dtype=np.float64)
+    edges = np.hypot(*(scipy.ndimage.sobel(gray, axis, mode="nearest") for axis in (0, 1)))
+    return normalize(edges, render.counted())
+
+
+def edge_scores(survey: Survey, views: int) -> Floats:
+    """Return the blend weight of each Gaussian times the edges of the photographs, over pixels and views, [N]."""
+    sampled, total = survey.sample_views(views), np.zeros(survey.count)
+    for render in survey.render(sampled):
+        total += render.sum(TEXTURE, edge_map(render))
+    return total
+
+
+class SplitLongAxis(Rule):
+    """Replace a Gaussian by two along its longest axis.
+
+    If the edit has a limit (`max_gaussians`, `budget`, memory), Gaussians are sampled by their edge-aware score.
+    """
+
+    type: Literal["split_long_axis"] = "split_long_axis"
+    training_keys: ClassVar[frozenset[str]] = frozenset(
+        {"gradient_above", "views", "distance", "opacity", "long_axis", "other_axes"}
+    )
+
+    gradient_above: Positive = 3.0e-4
+    """Smallest mean of `screen_grad_abs` of a Gaussian that is split."""
+    views: Annotated[int, Field(ge=1)] = 10
+    """Number of training views of the score, sampled by seed and step; all if there are fewer."""
+    distance: Positive = 0.45
+    """Offset of each child, in standard deviations of the parent along its longest axis."""
+    opacity: Annotated[float, Field(gt=0, le=1)] = 0.6
+    """Opacity of each child, as a fraction of the parent's."""
+    long_axis: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Factor on the longest scale."""
+    other_axes: Annotated[float, Field(gt=0, le=1)] = 0.85
+    """Factor on the other scales."""
+
+    @property
+    def statistics(self) -> set[str]:
+        return {"screen_grad_abs"}
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        chosen = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.rows() == 1)
+        if edit.room is not None and edit.room < chosen.sum():
+            order = sampling_order(chosen, edit.survey.cached(edge_scores, self.views), edit.random())
+            chosen = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
+        rows = np.flatnonzero(chosen)
+        means, quats, log_scales, logits = (
+            gaussians.get(name)[rows].astype(np.float64) for name in ("means", "quats", "log_scales", "logit_opacity")
+        )
+        longest = log_scales.argmax(axis=1)
+        at = np.arange(len(rows)), longest
+        axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)[at[0], :, longest]
+        offset = edit.at(self.distance) * np.exp(log_scales[at])[:, None] * axes
+        log_scales += math.log(self.other_axes)
+        log_scales[at] += math.log(self.long_axis / self.other_axes)
+        logits = math.log(self.opacity) - np.log1p(np.exp(-logits) - self.opacity)  # logit of a fraction of the opacity
+        edit.choose(chosen, copies=2, kept=0)
+        edit.set_children("means", rows, np.stack([means + offset, means - offset], axis=1))
+        edit.set_children("log_scales", rows, np.stack([log_scales, log_scales], axis=1))
+        edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))
+
+
+class PruneLowestOpacity(Rule):
+    """Remove a fraction of the Gaussians, those with the lowest opacities.
+
+    Some steps after a reset of all opacities, these fit only a few views: Gaussians that many views need recover fast.
+    """
+
+    type: Literal["prune_lowest_opacity"] = "prune_lowest_opacity"
+    grows: ClassVar[bool] = False
+    training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
+
+    share: Share = 0.2
+    """Fraction of the Gaussians that is removed."""
+
+    def mark(self, edit: Edit) -> None:
+        logits, is_left = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
+        edit.choose(largest(-logits, int(self.share * is_left.sum()), is_left), copies=0, kept=0)
+
+
+class SquareRoot(Budget):
+    """Grow to a given number, with the square root of the progress of training: B √x."""
+
+    type: Literal["square_root"] = "square_root"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gaussians"})
+
+    gaussians: Annotated[int, Field(ge=1)]
+    """The number B that the last edit may reach."""
+
+    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+        return int(self.gaussians * math.sqrt(context.progress))
