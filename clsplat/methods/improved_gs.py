@@ -53,12 +53,12 @@ class SplitLongAxis(Rule):
     """Smallest mean of `screen_grad_abs` of a Gaussian that is split."""
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views of the score, sampled by seed and step; all if there are fewer."""
-    distance: Positive = 0.45
-    """Offset of each child, in standard deviations of the parent along its longest axis."""
+    distance: Positive = 1.35
+    """Offset of each child, in standard deviations of the parent along its longest axis: 0.45 of three."""
     opacity: Annotated[float, Field(gt=0, le=1)] = 0.6
     """Opacity of each child, as a fraction of the parent's."""
-    long_axis: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Factor on the longest scale."""
+    long_axis: Annotated[float, Field(gt=0, le=1)] = 0.55
+    """Factor on the longest scale; with `distance`, the children end where the parent ends."""
     other_axes: Annotated[float, Field(gt=0, le=1)] = 0.85
     """Factor on the other scales."""
 

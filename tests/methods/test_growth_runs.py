@@ -19,7 +19,12 @@ SPARE = "{type: prune_redundant, error_rise: 0.1, views: 3}"
 
 def test_run_resumes_and_repeats_bit_for_bit(tiny_scene, tmp_path):
     """With what no recipe has; test_recipes.py has the others."""
-    settings = (f"densify.rules=[{GAINFUL}, {SPARE}]", "optimize.checkpoint.keep=9", "optimize.log_every=5")
+    settings = (
+        "optimize.views_per_update=3",
+        f"densify.rules=[{GAINFUL}, {SPARE}]",
+        "optimize.checkpoint.keep=9",
+        "optimize.log_every=5",
+    )
     first = train(tiny_scene, tmp_path / "first", *settings)
     whole = (first.out / "point_cloud.ply").read_bytes()
     edits = first.records.read("densify")

@@ -21,14 +21,14 @@ from tests.support.recipes import ONE_THREAD, digest, short, train
 pytestmark = pytest.mark.slow
 
 RECIPES = (  # each has a rule, loss, filter or transform that no other one of them has; test_dynamic.py has motion
-    "auto_7k", "auto_opti3dgs_7k", "box_7k", "dash_7k", "fast", "fastgs_7k", "gdgs_7k", "mcmc_7k",
+    "auto_7k", "auto_opti3dgs_7k", "box_7k", "dash_7k", "fast", "fastgs_7k", "gdgs_7k", "improved_gs_7k", "mcmc_7k",
     "micro_splatting_v2_7k", "mini_7k", "mip_splatting_gof_7k", "opti3dgs_7k", "smoke", "speedy_7k", "splat_ewa_7k",
     "steep_7k", "taming_7k",
 )  # fmt: skip
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
     "auto": "clone split prune_redundant", "fast": "clone prune_useless",
-    "fastgs": "split prune_inaccurate", "gdgs": "clone_dense", "mcmc": "relocate",
+    "fastgs": "split prune_inaccurate", "gdgs": "clone_dense", "improved_gs": "split_long_axis", "mcmc": "relocate",
     "micro_splatting_v2": "split_textured merge_neighbors prune_unimportant",
     "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_steepest",
 }  # fmt: skip
