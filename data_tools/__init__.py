@@ -1,1 +1,1 @@
-"""Datasets: made scenes, downloads, and conversions; only the command line imports it."""
+"""Create, download, and convert datasets; only the command line imports this package."""

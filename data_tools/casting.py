@@ -1,4 +1,4 @@
-"""A ray caster for painted convex bodies; it renders the scenes with exact cameras.
+"""Render painted convex bodies with exact cameras, by ray casting.
 
     primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
 
@@ -55,10 +55,10 @@ class World:
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
         """Return the light that leaves surface points, from the `sample`-th shadow ray and sky ray, [3, R]."""
         count = self.grid * self.grid
-        lamp, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
+        key, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SURFACE_OFFSET * normal
-        to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * lamp[0], KEY_WIDTH * lamp[1], 1.0))
+        to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
         lit = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
         above = self if self.canopy is None else replace(self, shapes=self.canopy)
@@ -87,7 +87,7 @@ class World:
     def render_rows(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
         """Render some rows of a view, [rows, size, 4] RGBA."""
         y, x = (v.ravel() for v in np.meshgrid(np.array(rows, float), np.arange(float(size)), indexing="ij"))
-        color, cover = np.zeros((3, len(x))), np.zeros(len(x))
+        color, coverage = np.zeros((3, len(x))), np.zeros(len(x))
         for sample in range(self.grid * self.grid):
             down, right = divmod(sample, self.grid)
             origin, directions = self.camera_rays(
@@ -97,8 +97,8 @@ class World:
             hit = np.flatnonzero(np.isfinite(distance))
             light = self.shade(origin + distance[hit] * directions[:, hit], index[hit], sample)
             color[:, hit] += np.sqrt(np.minimum(light, 1))  # encode before averaging: readers average encoded values
-            cover[hit] += 1
-        rgba = np.vstack([color / np.maximum(cover, 1), cover / self.grid**2])
+            coverage[hit] += 1
+        rgba = np.vstack([color / np.maximum(coverage, 1), coverage / self.grid**2])
         return np.rint(255 * rgba).astype(np.uint8).T.reshape(len(rows), size, 4)
 
 

@@ -1,4 +1,4 @@
-"""Public data sets by name: download, continue an interrupted download, verify, unpack."""
+"""Download public data sets by name, verify and unpack them; continue interrupted downloads."""
 
 import shutil
 import tarfile
@@ -98,11 +98,11 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
     part = archive.with_name(f"{archive.name}.part")
     for attempt in range(1, MAX_TRIES + 1):
         try:
-            _continue(source.url, part, report)
+            _download_missing(source.url, part, report)
             break
         except urllib.error.HTTPError as error:
             raise DataError(f"{source.url}: the server sent {error.code} {error.reason}; check the address") from error
-        except (urllib.error.URLError, TimeoutError, ConnectionError, _BrokenError) as error:
+        except (urllib.error.URLError, TimeoutError, ConnectionError, _IncompleteError) as error:
             if attempt == MAX_TRIES:
                 raise DataError(
                     f"{source.url}: the connection broke {MAX_TRIES} times ({error}); run it again to continue from "
@@ -118,11 +118,11 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
     part.rename(archive)
 
 
-class _BrokenError(Exception):
+class _IncompleteError(Exception):
     """The server sent fewer bytes than it announced."""
 
 
-def _continue(url: str, part: Path, report: Report) -> None:
+def _download_missing(url: str, part: Path, report: Report) -> None:
     """Download the missing bytes; start again if the server does not support ranges."""
     size = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={size}-"} if size else {})
@@ -146,7 +146,7 @@ def _continue(url: str, part: Path, report: Report) -> None:
                     reported = tenth
                     report(f"{size / 1e6:,.0f} of {total_size / 1e6:,.0f} MB")
     if length and size < total_size:
-        raise _BrokenError(f"got {size} of {total_size} bytes")
+        raise _IncompleteError(f"got {size} of {total_size} bytes")
 
 
 def _unpack(archive: Path, out: Path, report: Report) -> None:

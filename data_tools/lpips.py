@@ -68,8 +68,8 @@ def read_weights(data: bytes) -> Weights:
         raise DataError(f"weights of LPIPS: cannot be read ({error}); download the package again") from error
 
 
-class _StandIn:
-    """What the unpickler makes of an array, and of its type."""
+class _UnpickledArray:
+    """Replaces arrays and their types while unpickling."""
 
     def __init__(self, *_: object) -> None: ...
 
@@ -79,9 +79,9 @@ class _StandIn:
 
 
 class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> type[_StandIn]:
+    def find_class(self, module: str, name: str) -> type[_UnpickledArray]:
         if f"{module}.{name}" in ("numpy.core.multiarray._reconstruct", "numpy.ndarray", "numpy.dtype"):
-            return _StandIn
+            return _UnpickledArray
         raise pickle.UnpicklingError(f"it refers to {module}.{name}")
 
 
@@ -180,5 +180,5 @@ def _message(*fields: Field) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    low, rest = value & 127, value >> 7
-    return bytes([low | 128]) + _varint(rest) if rest else bytes([low])
+    low, high = value & 127, value >> 7
+    return bytes([low | 128]) + _varint(high) if high else bytes([low])

@@ -1,4 +1,4 @@
-"""Ray intersections with spheres, boxes and cylinders, in closed form.
+"""Intersect rays with spheres, boxes and cylinders, in closed form.
 
 Arrays hold one row per axis: points and directions are [3, R] (or [3, 1], which broadcasts), one column per ray;
 lengths are scene units.  Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.

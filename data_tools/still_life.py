@@ -1,4 +1,4 @@
-"""The still life on its table: procedural paints in the local axes of their shapes, and the list of shapes."""
+"""Define the still life: the shapes on a table, and their procedural paints in local axes."""
 
 from functools import partial
 

@@ -68,9 +68,9 @@ class SyntheticOptions:
         """Return the image files of a finished dataset."""
         return [f"{split}/r_{i:03}.png" for split, poses in self.poses().items() for i in range(len(poses))]
 
-    def fill(self, out: Path, workers: int) -> str:
+    def write_files(self, out: Path, workers: int) -> str:
         """Write images, cameras and points into `out`; return a summary."""
-        count = fill(out, self, workers)
+        count = write_files(out, self, workers)
         return f"{self.train} training and {self.test} test views, {self.size} px, {count:,} points"
 
 
@@ -85,7 +85,7 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
             return f"{out} is already complete"
         raise DataError(f"{out}: already holds another dataset; remove it or choose another folder")
     with new_folder(out) as partial_out, raising_output_error(out):
-        text = options.fill(partial_out, workers or os.cpu_count() or 1)
+        text = options.write_files(partial_out, workers or os.cpu_count() or 1)
         (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")
         sync_below(partial_out)
     return f"wrote {out}: {text}"
@@ -100,7 +100,7 @@ def is_complete(out: Path, options: SyntheticOptions) -> bool:
     return all((out / name).is_file() for name in files)
 
 
-def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
+def write_files(out: Path, options: SyntheticOptions, workers: int) -> int:
     """Write images, cameras and points into `out`; return the number of points."""
     splits = options.poses()
     jobs = [(split, i, pose) for split, poses in splits.items() for i, pose in enumerate(poses)]
@@ -128,12 +128,12 @@ def photographs(
     if workers == 1:
         yield from map(render, views)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_exit_with_parent) as pool:
         yield from pool.map(render, views)
 
 
-def _end_with_parent() -> None:
-    """End this worker when its parent ends: one that waits for work would wait forever."""
+def _exit_with_parent() -> None:
+    """Exit this worker process when its parent does; else an idle worker would wait forever."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 

@@ -49,9 +49,9 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     files = {index: _file(out, i) for i, index in enumerate(chosen, 1)}
     count = Count("frames written", len(files))
     missing = {index for index, path in files.items() if not _is_readable(path)}
-    for index, image in enumerate(decoded(video) if missing else ()):
+    for index, image in enumerate(decode_frames(video) if missing else ()):
         if index in missing:
-            write_image(files[index], np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
+            write_image(files[index], np.ascontiguousarray(limit_size(image, long_side)[:, :, ::-1]))
             missing.remove(index)
             count.reach(count.done + 1)
     if missing:
@@ -127,10 +127,10 @@ def _measure_frames(video: Path) -> tuple[list[float], list[float]]:
     motions: list[float] = []
     empty = np.empty(0, np.float32)
     flow, previous = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
-    for image in decoded(video):
-        gray = np.asarray(cv2.cvtColor(limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
+    for image in decode_frames(video):
+        gray = np.asarray(cv2.cvtColor(limit_size(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
         sharpnesses.append(sharpness(gray))
-        small = limited(gray, FLOW_SIDE)
+        small = limit_size(gray, FLOW_SIDE)
         motion = np.zeros((*small.shape, 2), np.float32) if previous is None else flow.calc(previous, small, empty)
         motion = cv2.resize(motion, CELLS, interpolation=cv2.INTER_AREA)
         motions.append(float(np.median(np.linalg.norm(motion, axis=2))))
@@ -138,7 +138,7 @@ def _measure_frames(video: Path) -> tuple[list[float], list[float]]:
     return sharpnesses, motions
 
 
-def decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
+def decode_frames(video: Path) -> Iterator[NDArray[np.uint8]]:
     """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError if there are none."""
     reader = cv2.VideoCapture(str(video))
     try:
@@ -155,7 +155,7 @@ def decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
         raise DataError(f"{video}: not a video that OpenCV decodes; convert it to MP4 (H.264)")
 
 
-def limited(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
+def limit_size(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
     """Return the image with no side longer than `long_side` px."""
     height, width = image.shape[:2]
     factor = max(height, width) / (long_side or max(height, width))

@@ -75,12 +75,12 @@ class CameraResponseState(ModuleState):
             step.image = respond(step.workspace, step.camera, step.image, row)
 
     def backward(self, step: TrainingStep) -> None:
-        if saved := step.saved(self):
+        if saved := step.saved_value(self):
             step.gradient = respond(step.workspace, step.camera, saved[0], saved[1], step.gradient)
             saved[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view is not None:
             gradient, rate = row_gradient(saved[1], saved[3][0]()) + saved[2], at_step(self.settings.rate, step.number)
             TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 

@@ -19,7 +19,7 @@ class PruneAtRandom(Rule):
     def mark(self, edit: Edit) -> None:
         opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
         faint = opacity < edit.at(self.opacity_below)
-        edit.choose(faint & (edit.random().random(len(faint)) < edit.at(self.share)), copies=0, kept=0)
+        edit.choose(faint & (edit.random().random(len(faint)) < edit.at(self.share)), copies=0, old_rows=0)
 
 
 class CapSize(Scheduled):

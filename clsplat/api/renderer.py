@@ -20,7 +20,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import Schedule
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.render.camera import DeviceCamera, upload_camera
-from clsplat.render.painter import Layers, layers
+from clsplat.render.painter import Layers, render_layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer, pose_gradient
 from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, to_color
@@ -151,7 +151,7 @@ class Renderer:
         view.camera.check()
         camera, color = upload_camera(self.device, view), self._color(background)
         model = self._model if background is None else replace(self._model, sky=None)
-        rendered = layers(self.rasterizer, model, camera, self.device.upload(color), depth)
+        rendered = render_layers(self.rasterizer, model, camera, self.device.upload(color), depth)
         for values in rendered.arrays:
             require_finite(values, view)
         return RenderResult(rendered.image, rendered.alpha, rendered.depth, view, color, model, self)
@@ -172,28 +172,28 @@ class Renderer:
         count = model.gaussians.count
         if depth is not None and model.gaussians.is_moving:
             raise ValueError("gradient of depth: expected a model that does not move; use `model.at(time)`")
-        geometry, by_depth = None, np.zeros(count)  # by_depth: dL/d(depth of each mean), float64
+        geometry, grad_depth = None, np.zeros(count)  # grad_depth: dL/d(depth of each mean), float64
         if alpha is not None or depth is not None:
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
             geometry = self._pixel_sums(model, frame, _depth_planes(frame, alpha, depth)).get()
-            by_depth += geometry[GEOMETRY, :count]  # the first color of that frame is the depth
+            grad_depth += geometry[GEOMETRY, :count]  # the first color of that frame is the depth
         frame = self._forward(model, camera, result.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _check_shape("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)
         if geometry is not None:
-            both = pixel_sums.get()
-            both[:GEOMETRY] += geometry[:GEOMETRY]
-            pixel_sums.set(both)
+            total_sums = pixel_sums.get()
+            total_sums[:GEOMETRY] += geometry[:GEOMETRY]
+            pixel_sums.set(total_sums)
         pose_sums = pose_gradient(self.rasterizer.workspace, model, frame, pixel_sums)
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)
         arrays = {**{name: gradients[name] for name in model.gaussians.trained}, "mean2d": gradients.mean2d}
         tables = {name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()}
         shift, turn, focal = np.split(pose_sums() if count else np.zeros(7), [3, 6])  # of the Gaussians, in world axes
         if depth is not None:
-            by_mean = by_depth[:, None] * pose[2, :3]
-            tables["means"] += by_mean.astype(np.float32)
-            shift += by_mean.sum(axis=0)
-            turn += np.cross(model.gaussians.get("means") - result.view.position, by_mean).sum(axis=0)
+            grad_mean = grad_depth[:, None] * pose[2, :3]
+            tables["means"] += grad_mean.astype(np.float32)
+            shift += grad_mean.sum(axis=0)
+            turn += np.cross(model.gaussians.get("means") - result.view.position, grad_mean).sum(axis=0)
         rotation = pose[:, :3]
         return Gradients(**tables, rotation=rotation @ turn, translation=rotation @ shift, log_focal=float(focal[0]))
 
@@ -225,9 +225,9 @@ def _depth_planes(frame: Frame, alpha: Floats | None, depth: Floats | None) -> F
         planes[:, :, 1] = _check_shape("alpha", alpha, size)
     if depth is not None:
         weighted, weight = frame.image.get()[:2, : size[0], : size[1]]
-        shown = weight > 0
-        planes[shown, 0] = _check_shape("depth", depth, size)[shown] / weight[shown]
-        planes[shown, 1] -= planes[shown, 0] * weighted[shown] / weight[shown]
+        covered = weight > 0
+        planes[covered, 0] = _check_shape("depth", depth, size)[covered] / weight[covered]
+        planes[covered, 1] -= planes[covered, 0] * weighted[covered] / weight[covered]
     return planes
 
 
@@ -261,7 +261,7 @@ class FieldRenderer:
         Raises ValueError for an invalid camera, and NumericError if a value of the result is not finite.
         """
         view.camera.check()
-        rendered = self._field.layers(upload_camera(self.device, view), depth)
+        rendered = self._field.render_layers(upload_camera(self.device, view), depth)
         for values in rendered.arrays:
             require_finite(values, view)
         return rendered

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from clsplat.cli import models, runs, tools  # noqa: F401  register their commands
-from clsplat.cli.app import Passed, app
+from clsplat.cli.app import WrappedError, app
 from clsplat.core import signals, terminal
 from clsplat.core.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.core.signals import stop_at_once, stopping_on_signals
@@ -19,19 +19,19 @@ DEBUG, PLUGIN = "--debug", "--plugin"  # options that may come before or after t
 LIVE = "--live"  # its port is optional
 
 
-def main(*before: str) -> None:
+def main(*leading: str) -> None:
     """Run the command line.  An error prints one line, with --debug also its traceback.
 
-    before: arguments in front of those of the process.
+    leading: arguments to insert before those of the process.
     """
     signals.install()
-    arguments = _options_first(_with_port(_one_set_each([*before, *sys.argv[1:]])))
+    arguments = _options_first(_with_port(_one_set_each([*leading, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
-            shown = app(arguments, prog_name="clsplat", standalone_mode=False)
-            if shown:  # 130, which typer makes of a KeyboardInterrupt before the command starts
+            exit_code = app(arguments, prog_name="clsplat", standalone_mode=False)
+            if exit_code:  # 130: typer returns it for a KeyboardInterrupt before the command starts
                 raise KeyboardInterrupt
-            if shown is not None:  # the exit code of --help and --version; commands return None
+            if exit_code is not None:  # of --help and --version; commands return None
                 signals.check_output()
             code = 0
     except BaseException as error:
@@ -43,9 +43,9 @@ def main(*before: str) -> None:
 
 def _report(error: BaseException, debugging: bool) -> int:
     """Print the line for an error, or for an interruption by the user; return the exit code."""
-    if isinstance(error, Passed | typer.Abort):
+    if isinstance(error, WrappedError | typer.Abort):
         error = error.__cause__ or error
-    if isinstance(error, KeyboardInterrupt):  # not in a run, which says how to continue
+    if isinstance(error, KeyboardInterrupt):  # outside a run; a run says how to continue
         error = Interrupted("stopped")
     if debugging:
         traceback.print_exception(error)
@@ -67,8 +67,8 @@ def _usage(error: Any) -> str:
         return f"{command}: expected a command"
     if option := getattr(error, "option_name", None) if hasattr(error, "possibilities") else None:
         parameters = context.command.get_params(context) if context else []
-        known = [name for parameter in parameters for name in parameter.opts]
-        near = difflib.get_close_matches(option, [name for name in known if name.startswith("-")], n=1, cutoff=0.5)
+        names = [name for parameter in parameters for name in parameter.opts]
+        near = difflib.get_close_matches(option, [name for name in names if name.startswith("-")], n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else f"see `{command} --help`"
         return f"{command}: no option {option}; {hint}"
     message = " ".join(error.format_message().split()).rstrip(".")
@@ -77,11 +77,11 @@ def _usage(error: Any) -> str:
 
 def _one_set_each(arguments: list[str]) -> list[str]:
     """Expand `--set a=1 b=2` to `--set a=1 --set b=2`."""
-    spread: list[str] = []
+    expanded: list[str] = []
     for argument in arguments:
-        follows = len(spread) >= 2 and spread[-2] == "--set"
-        spread += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
-    return spread
+        follows = len(expanded) >= 2 and expanded[-2] == "--set"
+        expanded += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
+    return expanded
 
 
 def _with_port(arguments: list[str]) -> list[str]:
@@ -97,10 +97,10 @@ def _options_first(arguments: list[str]) -> list[str]:
     """Move `--debug` and `--plugin FILE` in front of the command."""
     others = [argument for argument in arguments if argument != DEBUG]
     first = [DEBUG] if len(others) < len(arguments) else []
-    rest: list[str] = []
+    remaining: list[str] = []
     while others:
         size = 1 if others[0].startswith(f"{PLUGIN}=") else 2 if others[0] == PLUGIN and len(others) > 1 else 0
         first += others[:size]
-        rest += others[size : size or 1]
+        remaining += others[size : size or 1]
         del others[: size or 1]
-    return first + rest
+    return first + remaining

@@ -46,21 +46,21 @@ ORDER = [
 ]
 
 
-class Passed(Exception):
-    """Wraps an exception, as its cause, that typer would handle itself."""
+class WrappedError(Exception):
+    """An error whose cause is an exception that typer would otherwise handle itself."""
 
 
 class Commands(TyperGroup):
-    """The commands.  Those of `data` are imported only when used."""
+    """The commands of clsplat; those of `data` are imported when first used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return sorted([*super().list_commands(ctx), "data"], key=ORDER.index)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name == "data" and cmd_name not in self.commands:
-            from clsplat.cli.data import app as tools
+            from clsplat.cli.data import app as data_app
 
-            self.commands[cmd_name] = data = typer.main.get_command(tools)
+            self.commands[cmd_name] = data = typer.main.get_command(data_app)
             data.name = cmd_name
             data.short_help = "Prepare datasets: photos, video, undistort, cameras, …"
         return super().get_command(ctx, cmd_name)
@@ -79,7 +79,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except (EOFError, KeyboardInterrupt, OSError) as error:
-            raise Passed from error
+            raise WrappedError from error
 
 
 def examples(*lines: str) -> str:

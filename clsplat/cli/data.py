@@ -1,4 +1,4 @@
-"""Commands that make, prepare and download datasets: `clsplat data COMMAND …`."""
+"""Define the commands that create, prepare and download datasets: `clsplat data COMMAND …`."""
 
 from pathlib import Path
 from typing import Annotated, Literal

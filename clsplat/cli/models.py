@@ -112,12 +112,12 @@ def view(
     ] = None,
 ) -> None:
     """Write an HTML page to walk through a model next to its photos; it opens offline."""
-    before = "replaced; " if path_exists(out) else ""
+    prefix = "replaced; " if path_exists(out) else ""
     with terminal.counts_on_terminal():
         page = commands.view(
             *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
         )
-    terminal.print_message(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    terminal.print_message(f"{page}: {prefix}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
 
 
 @command(
@@ -156,7 +156,7 @@ def convert(
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates instead of an origin.")] = False,
 ) -> None:
     """Convert models to another format: PLY, SPZ, SOG, glTF and others."""
-    done = commands.convert(
+    result = commands.convert(
         files[:-1],
         files[-1],
         sh_degree=sh_degree,
@@ -168,9 +168,9 @@ def convert(
         frames=frames,
         world=world,
     )
-    share = 100 * done["bytes"] / max(done["bytes_read"], 1)
-    size = f"{done['bytes'] / 1e6:.3g} MB, {share:,.1f} % of what was read"
-    terminal.print_message(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
+    percent = 100 * result["bytes"] / max(result["bytes_read"], 1)
+    size = f"{result['bytes'] / 1e6:.3g} MB, {percent:,.1f} % of the input"
+    terminal.print_message(f"{result['file']}: {result['format']}, {result['gaussians']:,} Gaussians, {size}")
 
 
 @command(
@@ -203,8 +203,8 @@ def compress(
     """Prune, train and quantize a model to meet a target size or quality; each file is measured as written."""
     from clsplat.workflows.compress import table
 
-    shares = _numbers("--keep", keep, "shares, separated by commas, such as 1,0.7,0.5")
-    result = commands.compress_model(model, scene, target, out, format=format_, keep=shares, steps=steps, device=device)
+    keeps = _numbers("--keep", keep, "fractions, separated by commas, such as 1,0.7,0.5")
+    result = commands.compress_model(model, scene, target, out, format=format_, keep=keeps, steps=steps, device=device)
     terminal.show(table(result))
     chosen, source = result["chosen"], result["source"]
     size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
@@ -325,7 +325,7 @@ def render(
         options["times"] = times if time is None else time
         options |= {"depth": depth, "alpha": alpha, "downscale": scale, "kind": format_}
         result = pictures.render_path(model, scene, file, out=out, device=device, **options)
-        terminal.print_message(_video_text(result, pictures_wide=1 if side is None else 2))
+        terminal.print_message(_video_text(result, columns=1 if side is None else 2))
         return
     video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
     if used := [name for name, value in video_options.items() if value is not None]:
@@ -345,12 +345,12 @@ def render(
     terminal.print_message(f"{pluralize(count, 'image')} written to {out}")
 
 
-def _video_text(result: dict[str, Any], pictures_wide: int) -> str:
+def _video_text(result: dict[str, Any], columns: int) -> str:
     """Return one line about a video."""
     first, *others = (Path(name) for name in result["files"])
     width, height = result["size"]
-    summary = f"{result['frames']} frames of {pictures_wide * width} x {height} px in {result['took']:.1f} s"
+    summary = f"{result['frames']} frames of {columns * width} x {height} px in {result['took']:.1f} s"
     if first.suffix in (".png", ".npy"):
         return f"{first.parent}: {summary}"
-    also = "".join(f", {path.name}" for path in others)
-    return f"{first}{also}: {first.stat().st_size / 1e6:.2f} MB, {result['seconds']:.1f} s long; {summary}"
+    extra_files = "".join(f", {path.name}" for path in others)
+    return f"{first}{extra_files}: {first.stat().st_size / 1e6:.2f} MB, {result['seconds']:.1f} s long; {summary}"

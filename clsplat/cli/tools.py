@@ -15,13 +15,13 @@ from clsplat.core.errors import ConfigError, DataError, DeviceError
 @command("devices", "clsplat devices", "clsplat devices --json")
 def devices(as_json: JsonOption = False) -> None:
     """List OpenCL devices, their limits, and whether each works; exit code 4 if none does."""
-    found = tools.devices()
+    infos = tools.devices()
     if as_json:
-        terminal.show_json(found)
+        terminal.show_json(infos)
     else:
-        for device in found:
+        for device in infos:
             terminal.show(terminal.device_text(device))
-    if all(device["fault"] for device in found):
+    if all(device["fault"] for device in infos):
         raise tools.no_device_error("no OpenCL device works", tools.no_device_advice())
 
 
@@ -51,9 +51,9 @@ def doctor(
         raise DeviceError(f"{report.info.text}: {report.verdict.text}")
 
 
-BY_POINTS = (
-    "a cut by the points of the dataset, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines and "
-    "settings, and cuts by a coarse model that it trains"
+POINTS_NOTE = (
+    "partitioned by the points of the dataset, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines "
+    "and settings, and partitions by a coarse model that it trains"
 )
 
 
@@ -92,12 +92,12 @@ def inspect(
     if as_json:
         terminal.keep_stdout_for_json()
     if count is not None:
-        found = plan_in_blocks(scene, blocks=count, device=device)
+        plan = plan_in_blocks(scene, blocks=count, device=device)
         if as_json:
-            terminal.show_json(found)
+            terminal.show_json(plan)
         else:
-            terminal.show(table(found))
-            terminal.print_message(BY_POINTS)
+            terminal.show(table(plan))
+            terminal.print_message(POINTS_NOTE)
         return
     inspection = tools.inspect_scene(scene, page)
     if as_json:
@@ -132,10 +132,10 @@ def bench(
         terminal.keep_stdout_for_json()
     earlier = tools.read_measurement(against, pipeline) if against else {}
     names = [name for name in scenes.split(",") if name]
-    found = tools.measure_speed(
+    measurement = tools.measure_speed(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device
     )
     if as_json:
-        terminal.show_json({**found.data(), **({"against": earlier} if earlier else {})})
+        terminal.show_json({**measurement.data(), **({"against": earlier} if earlier else {})})
     else:
-        terminal.show(found.text(earlier))
+        terminal.show(measurement.text(earlier))

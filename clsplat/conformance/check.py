@@ -47,12 +47,12 @@ def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
     return float(np.linalg.norm(value - expected)) / max(float(np.linalg.norm(expected)), 1e-30)
 
 
-def by_norm(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
+def compare(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
     """Compare by norm: for gradients, whose small components suffer from cancellation."""
     return Deviation(kernel, label, relative_error(value, expected), bound)
 
 
-def by_element(
+def compare_max(
     kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float, floor: float = 0.0
 ) -> Deviation:
     """Compare value by value: the largest |value - expected| / (|expected| + floor)."""
@@ -63,12 +63,12 @@ def by_element(
     return Deviation(kernel, label, float(error.max()), bound)
 
 
-def equal(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
+def match(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
     """Count the values that differ from `expected`."""
-    return wrong(kernel, label, value != expected)
+    return count_true(kernel, label, value != expected)
 
 
-def wrong(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
+def count_true(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
     """Count the True values of a mask."""
     return Deviation(kernel, label, float(np.count_nonzero(mask)), allowed, counts=True)
 

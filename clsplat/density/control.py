@@ -34,7 +34,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     program.list_rows(
         items=count,
         copies=edit.copies,
-        kept=edit.kept,
+        kept=edit.old_rows,
         row_offset=row_offset,
         source=source,
         fresh=fresh,
@@ -44,7 +44,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     program.spawn_children(
         items=rows,
         source=source,
-        kept=edit.kept,
+        kept=edit.old_rows,
         shrink=edit.shrink,
         quats=gaussians["quats"],
         means=gaussians["means"],

@@ -27,16 +27,16 @@ from clsplat.gaussians.structs import check_rows, moment_tables
 MAX_ROWS = 2**32 - 2  # cl_kernels/scan.cl saturates at 2**32 - 1, which marks an overflow
 
 
-def require_rows(copies: int, kept: int) -> None:
+def require_rows(copies: int, old_rows: int) -> None:
     """Raise ValueError for numbers of rows that are negative or too large."""
-    for name, number in (("copies", copies), ("kept", kept)):
+    for name, number in (("copies", copies), ("old_rows", old_rows)):
         if not 0 <= number <= MAX_ROWS:
             bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
             raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
 
 
 def encode_outcomes(
-    chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, count: int
+    chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, count: int
 ) -> NDArray[np.uint32]:
     """Return copies + 1 for the chosen Gaussians, 0 for the others, [N].  Raises ValueError like `Edit.choose`."""
     numbers = np.asarray(copies)
@@ -46,8 +46,8 @@ def encode_outcomes(
         raise ValueError(
             f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
         )
-    require_rows(int(numbers.min(initial=0)), kept)
-    require_rows(int(numbers.max(initial=0)), kept)
+    require_rows(int(numbers.min(initial=0)), old_rows)
+    require_rows(int(numbers.max(initial=0)), old_rows)
     return np.where(chosen, numbers.astype(np.int64) + 1, 0).astype(np.uint32)
 
 
@@ -77,7 +77,7 @@ class Edit:
         self.gaussians, self.stats, self.scene_scale = gaussians, stats, scene_scale
         self.step, self.seed, self._survey = step, seed, survey
         self.copies = device.empty(count, np.uint32)
-        self.kept = device.empty(count, np.uint32)
+        self.old_rows = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
         self.shared = device.empty(count, np.uint32)
         self.rule = 0  # index of the rule that is marking
@@ -88,7 +88,7 @@ class Edit:
 
     @property
     def _outcome(self) -> dict[str, Any]:
-        return {"copies": self.copies, "kept": self.kept, "shrink": self.shrink, "shared": self.shared}
+        return {"copies": self.copies, "kept": self.old_rows, "shrink": self.shrink, "shared": self.shared}
 
     @property
     def survey(self) -> Survey:
@@ -108,7 +108,7 @@ class Edit:
     def mark(
         self,
         copies: int,
-        kept: int,
+        old_rows: int,
         shrink: float = 1.0,
         statistic: str | None = None,
         gradient_above: float = 0.0,
@@ -119,10 +119,10 @@ class Edit:
     ) -> None:
         """Give an outcome to every Gaussian within the bounds; sizes are relative to the extent.
 
-        copies, kept, shrink: as for `choose`.  shared: the rows together are as opaque as the old Gaussian.  Raises
+        copies, old_rows, shrink: as for `choose`.  shared: the rows together are as opaque as the old Gaussian.  Raises
         ValueError for numbers of rows that are negative or too large.
         """
-        require_rows(copies, kept)
+        require_rows(copies, old_rows)
         gaussians = self.gaussians
         self._program.mark_rule(
             items=gaussians.count,
@@ -137,7 +137,7 @@ class Edit:
             opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
-            new_kept=kept,
+            new_kept=old_rows,
             new_shared=int(shared),
             stride=gaussians.capacity,
             count=gaussians.count,
@@ -160,23 +160,23 @@ class Edit:
         return max(float(np.quantile(mean, threshold.quantile)), MIN_BOUND) if len(mean) else MIN_BOUND
 
     def choose(
-        self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, shrink: float = 1.0
+        self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, shrink: float = 1.0
     ) -> None:
         """Give an outcome to the Gaussians of a mask, [N].
 
-        copies: number of rows that each becomes, one number or [N].  kept: how many of them are the old row, with its
-        moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.  Raises ValueError
-        for a wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
+        copies: number of rows that each becomes, one number or [N].  old_rows: how many of them are the old row, with
+        its moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
+        Raises ValueError for a wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count
         self._program.mark_chosen(
             items=count,
-            outcome=self.gaussians.device.upload(encode_outcomes(chosen, copies, kept, count)),
+            outcome=self.gaussians.device.upload(encode_outcomes(chosen, copies, old_rows, count)),
             copies=self.copies,
-            kept=self.kept,
+            kept=self.old_rows,
             shrink=self.shrink,
             new_shrink=shrink,
-            new_kept=kept,
+            new_kept=old_rows,
             count=count,
         )
 

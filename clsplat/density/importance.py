@@ -125,4 +125,4 @@ class SampledPruning(Rule):
         order = sampling_order(candidates, self.weights(edit), edit.random())
         chosen = np.zeros_like(candidates)
         chosen[order[: int(self.share * len(order))]] = True
-        edit.choose(chosen, copies=0, kept=0)
+        edit.choose(chosen, copies=0, old_rows=0)

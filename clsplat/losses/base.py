@@ -54,8 +54,8 @@ class LossValue:
     value: Callable[[], float]  # including the weight
 
 
-def checked_value(loss: "Loss", value: object) -> LossValue:
-    """Return `value`, the result of a loss's `add`.  Raises ConfigError if it is not a LossValue."""
+def require_loss_value(loss: "Loss", value: object) -> LossValue:
+    """Return the result of a loss's `add`.  Raises ConfigError if it is not a LossValue."""
     if not isinstance(value, LossValue):
         raise ConfigError(
             f"the loss {type(loss).__name__}: expected a LossValue from 'add', got {type(value).__name__}"

@@ -31,23 +31,23 @@ class InverseDepth(ImageLoss):
         return "inverse_depth" if at_step(self.weight, step) > 0 else "color"
 
     def add(self, comparison: Comparison) -> LossValue:
-        weight, known, camera = at_step(self.weight, comparison.step), comparison.depths, comparison.camera
-        if weight == 0 or known is None:
+        weight, depths, camera = at_step(self.weight, comparison.step), comparison.depths, comparison.camera
+        if weight == 0 or depths is None:
             return LossValue("inverse_depth", lambda: 0.0)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
             raise ConfigError(
                 "the loss inverse_depth needs a frame with the content 'inverse_depth'; render it with that content"
             )
-        count = known.pixels.shape[0]
-        scale = weight * known.extent / count
+        count = depths.pixels.shape[0]
+        scale = weight * depths.extent / count
         terms = comparison.workspace.array("inverse_depth_terms", count)
         comparison.workspace.device.program("inverse_depth.cl").inverse_depth_loss(
             items=count,
             image=comparison.image,
             gradient=comparison.gradient,
-            pixels=known.pixels,
-            targets=known.inverse,
-            weights=known.weights,
+            pixels=depths.pixels,
+            targets=depths.inverse,
+            weights=depths.weights,
             terms=terms,
             scale=scale,
             plane=camera.rows * camera.stride,

@@ -59,7 +59,7 @@ class Clone(Grow):
     """Largest size of a Gaussian that is cloned: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
+        edit.mark(copies=2, old_rows=1, size_below=edit.at(self.size_below), **self.condition(edit))
 
 
 class SplitLarge(Grow):
@@ -78,7 +78,7 @@ class SplitLarge(Grow):
     def mark(self, edit: Edit) -> None:
         edit.mark(
             copies=self.children,
-            kept=0,
+            old_rows=0,
             shrink=1.0 / self.shrink,
             size_above=edit.at(self.size_above),
             **self.condition(edit),
@@ -96,7 +96,7 @@ class PruneFaint(Rule):
     """Opacity below which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, kept=0, opacity_below=edit.at(self.opacity_below))
+        edit.mark(copies=0, old_rows=0, opacity_below=edit.at(self.opacity_below))
 
 
 class PruneLarge(Rule):
@@ -110,4 +110,4 @@ class PruneLarge(Rule):
     """Size above which a Gaussian is removed: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, kept=0, size_above=edit.at(self.size_above))
+        edit.mark(copies=0, old_rows=0, size_above=edit.at(self.size_above))

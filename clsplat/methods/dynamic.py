@@ -31,4 +31,4 @@ class PruneInvisible(Rule):
         after = np.searchsorted(timestamps, centers).clip(1, max(len(timestamps) - 1, 1))
         near = [presence(motion, timestamps[np.minimum(i, len(timestamps) - 1)]) for i in (after - 1, after)]
         opacity = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*near)
-        edit.choose(opacity < edit.at(self.opacity_below), copies=0, kept=0)
+        edit.choose(opacity < edit.at(self.opacity_below), copies=0, old_rows=0)

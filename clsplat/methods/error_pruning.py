@@ -80,7 +80,7 @@ class PruneRedundant(Rule):
 
         chosen = np.zeros(len(order), bool)
         chosen[order[: find_largest_allowed(is_allowed, len(order))]] = True
-        edit.choose(chosen, copies=0, kept=0)
+        edit.choose(chosen, copies=0, old_rows=0)
 
 
 class ErrorGain(Statistic):

@@ -89,4 +89,4 @@ class PruneInaccurate(ByWrongPixels):
     """Score above which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:
-        edit.choose(self.count_wrong_pixels(edit).score > self.score_above, copies=0, kept=0)
+        edit.choose(self.count_wrong_pixels(edit).score > self.score_above, copies=0, old_rows=0)

@@ -63,7 +63,7 @@ class CloneDense(Rule):
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
         offset = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
-        edit.choose(chosen, copies=3, kept=1)
+        edit.choose(chosen, copies=3, old_rows=1)
         edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + offset], axis=1))
 
 

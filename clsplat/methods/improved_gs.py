@@ -83,7 +83,7 @@ class SplitLongAxis(Rule):
         log_scales += math.log(self.other_axes)
         log_scales[at] += math.log(self.long_axis / self.other_axes)
         logits = math.log(self.opacity) - np.log1p(np.exp(-logits) - self.opacity)  # logit of a fraction of the opacity
-        edit.choose(chosen, copies=2, kept=0)
+        edit.choose(chosen, copies=2, old_rows=0)
         edit.set_children("means", rows, np.stack([means + offset, means - offset], axis=1))
         edit.set_children("log_scales", rows, np.stack([log_scales, log_scales], axis=1))
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))
@@ -104,7 +104,7 @@ class PruneLowestOpacity(Rule):
 
     def mark(self, edit: Edit) -> None:
         logits, is_left = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
-        edit.choose(largest(-logits, int(self.share * is_left.sum()), is_left), copies=0, kept=0)
+        edit.choose(largest(-logits, int(self.share * is_left.sum()), is_left), copies=0, old_rows=0)
 
 
 class SquareRoot(Budget):

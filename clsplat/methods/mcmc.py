@@ -51,7 +51,7 @@ class Relocate(Rule):
             for name, values in (("logit_opacity", logits), ("log_scales", log_scales)):
                 edit.set_children(name, sources[has_number], np.repeat(values[has_number, None], number, axis=1))
         edit.zero_moments(sources)
-        edit.choose(is_faint | (draws > 0), copies=np.where(is_faint, 0, draws + 1), kept=1)
+        edit.choose(is_faint | (draws > 0), copies=np.where(is_faint, 0, draws + 1), old_rows=1)
 
 
 def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:

@@ -72,7 +72,7 @@ class Subdivide(Rule):
         """
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
         chosen = largest(score, int(self.max_fraction * len(candidates)), candidates)
-        edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
+        edit.choose(chosen, copies=self.children, old_rows=0, shrink=self.beta**0.5)
 
 
 class SplitTextured(Subdivide):
@@ -158,7 +158,7 @@ class PruneUnimportant(Rule):
         score = opacity * np.exp(gaussians.get("log_scales").astype(np.float64).mean(axis=1))
         chosen = np.zeros(len(score), bool)
         chosen[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True
-        edit.choose(chosen, copies=0, kept=0)
+        edit.choose(chosen, copies=0, old_rows=0)
 
 
 class MergeNeighbors(Rule):
@@ -194,7 +194,7 @@ class MergeNeighbors(Rule):
         edit.zero_moments(first, ("log_scales", "quats"))  # the axes have changed
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
-        edit.choose(absorbed, copies=0, kept=0)
+        edit.choose(absorbed, copies=0, old_rows=0)
 
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rows of mutual nearest neighbors to merge, the heavier one of each pair first."""

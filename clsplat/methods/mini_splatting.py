@@ -65,7 +65,7 @@ class PruneUseless(Rule):
     def mark(self, edit: Edit) -> None:
         weights = edit.survey.cached(sampled_weights, self.weight_per_view, self.views)
         keep = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
-        edit.choose(~keep, copies=0, kept=0)
+        edit.choose(~keep, copies=0, old_rows=0)
 
 
 class HideUseless(Scheduled):

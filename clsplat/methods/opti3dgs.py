@@ -88,13 +88,13 @@ class HaarState(ModuleState):
         gradient = photograph_gradient(step.loss_settings, step.comparison)
         if step.planes.mask is not None:
             apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
-        image_gradients = filter_gradients(step.saved(self), self.filter, gradient)
+        image_gradients = filter_gradients(step.saved_value(self), self.filter, gradient)
         value, penalty_gradients = self.settings.penalty(self.filter, step.number)
         step.module_losses.append(LossValue(self.settings.type, lambda: value))
         step.save(self, (image_gradients, penalty_gradients))
 
     def update(self, step: TrainingStep) -> None:
-        wait_for_gradients, penalty_gradients = step.saved(self)
+        wait_for_gradients, penalty_gradients = step.saved_value(self)
         gradients = wait_for_gradients()
         self.learn({name: gradients[name] + value for name, value in penalty_gradients.items()}, step.number)
 

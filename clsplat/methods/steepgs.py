@@ -94,7 +94,7 @@ class SplitSteepest(Rule):
         offset = edit.at(self.distance) * deviation[:, None] * axes
         chosen = np.zeros(gaussians.count, bool)
         chosen[rows] = True
-        edit.choose(chosen, copies=2, kept=0, shrink=1 / self.shrink)
+        edit.choose(chosen, copies=2, old_rows=0, shrink=1 / self.shrink)
         edit.set_children("means", rows, np.stack([tables["means"] + offset, tables["means"] - offset], axis=1))
         logits = divide_logits(tables["logit_opacity"], self.opacity)
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))

@@ -82,7 +82,7 @@ class GrowScored(ByScore):
     def mark(self, edit: Edit) -> None:
         if edit.room is None or edit.room >= 0:
             return
-        rows, keep = edit.rows().astype(np.int64), edit.kept.get() > 0
+        rows, keep = edit.rows().astype(np.int64), edit.old_rows.get() > 0
         is_undone = rows > 1
         if not is_undone.any():
             return

@@ -27,11 +27,11 @@ from clsplat.scene.view import View, load_mask
 STILL = 3.0  # levels; a larger standard deviation is motion, not camera noise
 MAX_CAMERAS = 8  # with sums in memory, 48 bytes per pixel each
 MIN_TIMESTAMPS = 2
-FLICKER, OF_PHOTOGRAPHS, STATIC, SHARE = "flicker", "flicker_photographs", "psnr_static", "static_share"
+FLICKER, PHOTO_FLICKER, STATIC, STATIC_FRACTION = "flicker", "flicker_photographs", "psnr_static", "static_share"
 
 
 @dataclass
-class Spread:
+class ImageSums:
     """Sums over the timestamps of one camera, in integers, so that order does not matter."""
 
     count: int = 0
@@ -51,28 +51,28 @@ class Spread:
 
 
 @dataclass
-class Station:
-    """One camera: its renders, its photographs, and the pixels that may be static."""
+class CameraSums:
+    """Sums over the renders and photographs of one camera, and the pixels that may be static."""
 
     views: list[str] = field(default_factory=list)
-    renders: Spread = field(default_factory=Spread)
-    photographs: Spread = field(default_factory=Spread)
-    counted: Mask | None = None  # static according to the file, and unmasked at all timestamps
+    renders: ImageSums = field(default_factory=ImageSums)
+    photographs: ImageSums = field(default_factory=ImageSums)
+    counted: Mask | None = None  # marked as static by the file, if any, and unmasked at all timestamps
     has_static_file: bool = False
 
 
-class Stillness:
+class FlickerMeter:
     """Gathers views by camera to measure flicker; moving cameras and cameras with one timestamp are ignored."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""
         cameras = [group for group in group_by_camera(views) if len(distinct_times(group)) >= MIN_TIMESTAMPS]
-        self._stations = {camera_key(group[0]): Station() for group in cameras[:MAX_CAMERAS]}
+        self._cameras = {camera_key(group[0]): CameraSums() for group in cameras[:MAX_CAMERAS]}
 
     @property
     def camera_count(self) -> int:
         """The number of cameras whose sums are in memory."""
-        return len(self._stations)
+        return len(self._cameras)
 
     def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
         """Add a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels, if a file marks them."""
@@ -85,29 +85,29 @@ class Stillness:
         return {STATIC: psnr(rendered, photograph, mask)}
 
     def _gather(self, view: View, rendered: Image, photograph: Image, mask: Mask | None, has_file: bool) -> None:
-        if (station := self._stations.get(camera_key(view))) is None:
+        if (camera := self._cameras.get(camera_key(view))) is None:
             return
-        station.views.append(view.name)
-        station.renders.add(rendered)
-        station.photographs.add(photograph)
-        station.has_static_file |= has_file
+        camera.views.append(view.name)
+        camera.renders.add(rendered)
+        camera.photographs.add(photograph)
+        camera.has_static_file |= has_file
         if mask is not None:
-            station.counted = mask if station.counted is None else station.counted & mask
+            camera.counted = mask if camera.counted is None else camera.counted & mask
 
-    def figures(self) -> dict[str, dict[str, float]]:
+    def flicker(self) -> dict[str, dict[str, float]]:
         """Return the flicker of each view's camera, by view name; empty for cameras with one timestamp."""
-        figures = dict[str, dict[str, float]]()
-        for station in self._stations.values():
-            if station.renders.count < MIN_TIMESTAMPS:
+        flicker = dict[str, dict[str, float]]()
+        for camera in self._cameras.values():
+            if camera.renders.count < MIN_TIMESTAMPS:
                 continue
-            rendered, captured = station.renders.deviation(), station.photographs.deviation()
-            static = np.ones(rendered.shape[:2], bool) if station.counted is None else station.counted
-            if not station.has_static_file:
+            rendered, captured = camera.renders.deviation(), camera.photographs.deviation()
+            static = np.ones(rendered.shape[:2], bool) if camera.counted is None else camera.counted
+            if not camera.has_static_file:
                 static = static & (captured.max(axis=2) <= STILL)
             if static.any():
-                values = {FLICKER: float(rendered[static].mean()), OF_PHOTOGRAPHS: float(captured[static].mean())}
-                figures |= {name: {**values, SHARE: float(static.mean())} for name in station.views}
-        return figures
+                values = {FLICKER: float(rendered[static].mean()), PHOTO_FLICKER: float(captured[static].mean())}
+                flicker |= {name: {**values, STATIC_FRACTION: float(static.mean())} for name in camera.views}
+        return flicker
 
 
 def static_pixels(view: View) -> Mask | None:
@@ -126,16 +126,16 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 # PSNR of a render after a color transform fitted to its photograph.
 
 NOTABLE_GAIN = 1.0  # dB; if a color transform increases PSNR by more, the log explains it
-MIN_SLOPE = 1e-3  # of a regression, by which the image is divided
+MIN_SLOPE = 1e-3  # of a regression: the image is divided by its slope
 # Usable pixels per fitted parameter: p parameters fitted to n independent errors add p / n of their variance to the
 # error elsewhere, here 1 / 64, which is 0.07 dB.
-PIXELS = 64
+PIXELS_PER_PARAMETER = 64
 
 
-class Fitted(Protocol):
+class ColorFit(Protocol):
     """A color model that can be fitted to a photograph."""
 
-    numbers_per_channel: ClassVar[int]  # parameters per channel that `fit_matrix` fits
+    parameters_per_channel: ClassVar[int]  # that `fit_matrix` fits
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrix, [3, 4], that fits an image to a photograph.  Both: pixels, [M, 3]."""
@@ -144,7 +144,7 @@ class Fitted(Protocol):
 class Gains:
     """Gains of red, green, and blue."""
 
-    numbers_per_channel: ClassVar[int] = 1
+    parameters_per_channel: ClassVar[int] = 1
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares."""
@@ -153,8 +153,8 @@ class Gains:
         return np.column_stack([np.diag(gains), np.zeros(3)])
 
 
-def color_figures(
-    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: Fitted
+def color_metrics(
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: ColorFit
 ) -> dict[str, float]:
     """Return `psnr_color` and `psnr_affine`, dB, of a render and a photograph, [height, width, 3].
 
@@ -169,8 +169,8 @@ def color_figures(
     return {**color, "psnr_affine": psnr(corrected, photograph, counted)}
 
 
-def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Average the results of color_figures over views, with the keys of metrics.json.
+def mean_color_metrics(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Average the results of color_metrics over views, with the keys of metrics.json.
 
     If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` has the reason; if
     no view has it, `psnr_color` is None.
@@ -183,26 +183,27 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def fit_colors(
-    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: Fitted
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: ColorFit
 ) -> NDArray[np.float64] | None:
     """Transform the left and right halves of an image by the color model fitted to the other half.
 
-    The fit does not use pixels that are black or white in the photograph.  Returns None if a half has fewer than PIXELS
-    usable pixels per parameter; this depends only on the photograph and the mask, so that models are compared on the
-    same views.  Pixels brighter than white in the image are not used either, if enough others remain.
+    The fit does not use pixels that are black or white in the photograph.  Returns None if a half has fewer than
+    PIXELS_PER_PARAMETER usable pixels per parameter; this depends only on the photograph and the mask, so that models
+    are compared on the same views.  Pixels brighter than white in the image are not used either if enough others
+    remain.
     """
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
-    middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
+    middle, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :middle], np.s_[:, middle:]
-    min_pixels = PIXELS * model.numbers_per_channel
+    min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
     if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
         return None
     for half, other in ((left, right), (right, left)):
-        below = usable[other] & (image[other] < 1).all(axis=2)
-        fitted_to = below if np.count_nonzero(below) >= min_pixels else usable[other]
+        darker = usable[other] & (image[other] < 1).all(axis=2)
+        fitted_to = darker if np.count_nonzero(darker) >= min_pixels else usable[other]
         matrix = model.fit_matrix(image[other][fitted_to], truth[other][fitted_to])
-        changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
-    return changed
+        corrected[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
+    return corrected
 
 
 def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask) -> NDArray[np.float64]:
@@ -220,7 +221,7 @@ def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64]
     return np.clip(corrected, 0, 1)
 
 
-def log_color_figures(averages: dict[str, Any]) -> None:
+def log_color_metrics(averages: dict[str, Any]) -> None:
     """Log the metrics of a split after color fitting, if there are any."""
     if "psnr_color" not in averages:
         return
@@ -243,10 +244,12 @@ def log_color_figures(averages: dict[str, Any]) -> None:
 HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 
 
-def by_moment(psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]) -> dict[str, dict[str, float]]:
-    """Return the PSNR of views, dB, by name, under a key for timestamps of training views or for others.
+def psnr_by_time(
+    psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]
+) -> dict[str, dict[str, float]]:
+    """Return the PSNR of views, dB, by view name, under the key HELD_OUT or OTHERS for the timestamp of the view.
 
-    Empty if all views are of one kind, as in static scenes.
+    The result is empty if all timestamps are of one kind, as in static scenes.
     """
     trained_times, times = set(distinct_times(trained)), {view.name: view.time for view in views}
     kinds = {name: OTHERS if time in trained_times else HELD_OUT for name, time in times.items() if time is not None}
@@ -315,7 +318,7 @@ def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> f
     return float(sums.get().sum(dtype=np.float64)) / (3 * camera.width * camera.height)
 
 
-EMPTY_PSNR, EMPTY_ALPHA = 20.0, 0.01  # dB and mean alpha, below which almost nothing is drawn of what a photo shows
+EMPTY_PSNR, EMPTY_ALPHA = 20.0, 0.01  # dB and mean alpha; below both, the render is almost empty, unlike the photo
 
 
 def measure(
@@ -324,7 +327,7 @@ def measure(
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
-    colors: Fitted | None = None,
+    colors: ColorFit | None = None,
     counted: Iterable[View] | None = None,
     trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:
@@ -334,7 +337,7 @@ def measure(
     for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
     views wrapped by a progress counter; trained: the training views, for metrics by timestamp.
     """
-    results, stillness, empty = list[ViewMetrics](), Stillness(views), list[str]()
+    results, flicker_meter, empty = list[ViewMetrics](), FlickerMeter(views), list[str]()
     for view in views if counted is None else counted:
         photograph = photographs.get(view)
         if photograph.empty:
@@ -345,23 +348,24 @@ def measure(
             require_finite(floats, view)
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
-        color = color_figures(floats, image, mask, colors) if colors else {}
-        still = stillness.add(view, rendered, image, mask)
+        color = color_metrics(floats, image, mask, colors) if colors else {}
+        still = flicker_meter.add(view, rendered, image, mask)
         if mask is None:
             similarity = device_ssim(painter.workspace, photograph, rendered)
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
-        more = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, color, still))
-        if results[-1].psnr < EMPTY_PSNR and painter.layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
+        extra = perceptual.measure(rendered, image)
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, extra, color, still))
+        if results[-1].psnr < EMPTY_PSNR and painter.render_layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
             empty.append(view.name)
     if empty:
         LOG.warning(
             "almost nothing is drawn in %d of %s, such as %s; check that the model fits the cameras, and model.near",
             *(len(empty), pluralize(len(views), "view"), quote(empty[0])),
         )
-    flicker, moments = stillness.figures(), by_moment({result.view: result.psnr for result in results}, views, trained)
+    flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}
+    moments = psnr_by_time(psnrs, views, trained)
     return [
         replace(result, still={**result.still, **flicker.get(result.view, {})}, moments=moments.get(result.view, {}))
         for result in results
@@ -375,7 +379,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
-        **mean_figures([r.colors for r in results]),
+        **mean_color_metrics([r.colors for r in results]),
         **means([r.moments for r in results]),
         **means([r.still for r in results]),
         **perceptual.mean([r.perceptual for r in results]),

@@ -248,7 +248,7 @@ class Field:
             self.levels.write_colors(fine, image)
         return image
 
-    def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
+    def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
         """Return the image of the fine level on the host, its alpha, and the mean depth.
 
         The direction of a ray has depth 1, so that distances along it are depths.  Depths are in scene units.

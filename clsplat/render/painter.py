@@ -29,7 +29,7 @@ class Layers:
         return [self.image, self.alpha, *([] if self.depth is None else [self.depth])]
 
 
-def layers(
+def render_layers(
     rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array, depth: bool = False
 ) -> Layers:
     """Render a view.  background: [3]; depth: render it too, in a second pass."""
@@ -62,7 +62,7 @@ class Painter(Protocol):
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the render, [3, rows, stride], not clamped; valid until the next render."""
 
-    def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
+    def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
         """Return the render on the host, with alpha, and with depth if requested."""
 
 
@@ -81,5 +81,5 @@ class SplatPainter:
     def paint(self, camera: DeviceCamera) -> Array:
         return self.rasterizer.forward(self.model, camera, self.background).image
 
-    def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        return layers(self.rasterizer, self.model, camera, self.background, depth)
+    def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
+        return render_layers(self.rasterizer, self.model, camera, self.background, depth)

@@ -258,7 +258,7 @@ def write_pictures(
     _write_record(out, rendered)
     depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
     for view, layer_files in counted(zip(views, files, strict=True), "views rendered", len(views)):
-        buffers = canvas.layers(view, "depth" in layers)
+        buffers = canvas.render_layers(view, "depth" in layers)
         for layer, path in layer_files.items():
             if kind == "png":
                 write_image(path, layer_image(buffers, layer, depths))

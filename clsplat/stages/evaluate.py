@@ -10,7 +10,7 @@ from clsplat.core.files import invalid_output_reason
 from clsplat.core.settings import InputPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
-from clsplat.metrics.views import log_color_figures, mean, measure
+from clsplat.metrics.views import log_color_metrics, mean, measure
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.scene.view import sample_views
 from clsplat.training.modules.base import color_model, learned_scene
@@ -115,4 +115,4 @@ class Evaluate(Scheduled):
             if run.cache.get("evaluated") != line:  # the last evaluation of a training may be the same
                 run.cache["evaluated"] = line
                 LOG.info("%s", line)
-            log_color_figures(averages)
+            log_color_metrics(averages)

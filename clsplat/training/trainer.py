@@ -14,7 +14,7 @@ from clsplat.losses.base import (
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
-    checked_value,
+    require_loss_value,
     required_content,
 )
 from clsplat.opencl.device import Array, constants
@@ -120,7 +120,7 @@ class StepTrainer:
         for module in data.modules:
             module.before_losses(data)
         data.losses += [
-            checked_value(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)
+            require_loss_value(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)
         ]
         data.losses += data.module_losses
         return ViewLosses(data.frame, comparison, data.losses, step=data)
@@ -168,7 +168,7 @@ class StepTrainer:
         current = gradients.without_deferred() if is_deferred else gradients
         inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, current, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
-        view.losses.extend(checked_value(penalty, penalty.add(inputs)) for penalty in penalties)
+        view.losses.extend(require_loss_value(penalty, penalty.add(inputs)) for penalty in penalties)
         if has_views:
             attach_gradients(gaussians)
             gradients = add_gradients(gaussians, gradients)

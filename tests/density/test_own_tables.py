@@ -31,7 +31,7 @@ def edits_seen(without_plugins):
                 gaussians.add("edits_seen", 1, zero_fresh=True)
             seen = gaussians.get("edits_seen") + 1
             gaussians.set("edits_seen", seen)
-            edit.choose(seen[:, 0] >= 3, copies=0, kept=0)
+            edit.choose(seen[:, 0] >= 3, copies=0, old_rows=0)
 
     rebuild_models()
 

@@ -99,7 +99,10 @@ WRONG_CHOICES = {
         (np.arange(COUNT) == 7, np.full(COUNT, 2**32), 0),
         "copies: expected a number of rows, at most 4294967294, got 4294967296",
     ),
-    "negative kept": ((np.ones(COUNT, bool), 2, -1), "kept: expected a number of rows, 0 or more, got -1"),
+    "negative number of old rows": (
+        (np.ones(COUNT, bool), 2, -1),
+        "old_rows: expected a number of rows, 0 or more, got -1",
+    ),
 }
 
 
@@ -113,7 +116,7 @@ def test_invalid_selection_is_refused(device, rng, case):
 
 
 @on_one_setting
-@pytest.mark.parametrize("numbers", [{"copies": -1, "kept": 0}, {"copies": 2, "kept": -1}])
+@pytest.mark.parametrize("numbers", [{"copies": -1, "old_rows": 0}, {"copies": 2, "old_rows": -1}])
 def test_negative_row_counts_are_refused(device, rng, numbers):
     edit = edit_of(gaussians_of(device, rng))
     with pytest.raises(ValueError, match="expected a number of rows, 0 or more, got -1"):
@@ -155,17 +158,17 @@ def test_moments_without_an_optimizer_need_no_zeroing(device, rng):
     assert not [name for name in gaussians.tables if name.startswith("adam/")]
 
 
-@on_devices("count, kept", each_once([1, 15, 16, 17, 63, 64, 65, 150], [0, 1, 3]))
-def test_each_selected_gaussian_gets_its_row_count(device, rng, count, kept):
-    """`kept` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
+@on_devices("count, old_rows", each_once([1, 15, 16, 17, 63, 64, 65, 150], [0, 1, 3]))
+def test_each_selected_gaussian_gets_its_row_count(device, rng, count, old_rows):
+    """`old_rows` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
     edit = edit_of(gaussians_of(device, rng, count))
-    expected = {"copies": np.ones(count), "kept": np.ones(count), "shrink": np.ones(count)}
+    expected = {"copies": np.ones(count), "old_rows": np.ones(count), "shrink": np.ones(count)}
     for shrink in (0.5, 0.25):
         chosen, copies = rng.random(count) < 0.7, rng.integers(0, 5, count)
-        edit.choose(chosen, copies, kept, shrink)
+        edit.choose(chosen, copies, old_rows, shrink)
         acts = chosen & ((copies == 0) | (expected["copies"] == 1))
         expected["copies"][acts] = copies[acts]
-        expected["kept"][acts] = np.minimum(copies[acts], kept)
+        expected["old_rows"][acts] = np.minimum(copies[acts], old_rows)
         expected["shrink"][acts & (copies > 0)] = shrink
     assert count < 60 or set(expected["copies"]) == {0, 1, 2, 3, 4}
     for name, values in expected.items():
@@ -176,22 +179,22 @@ class Multiply(Rule):
     """Give Gaussians the numbers of rows that a test has decided on."""
 
     copies: list[int]
-    kept: int
+    old_rows: int
 
     def mark(self, edit: Edit) -> None:
-        edit.choose(np.ones(len(self.copies), bool), np.array(self.copies), self.kept)
+        edit.choose(np.ones(len(self.copies), bool), np.array(self.copies), self.old_rows)
 
 
-@on_devices("kept", [1, 2])
-def test_old_rows_keep_moments_and_new_rows_start_at_zero(device, rng, kept):
+@on_devices("old_rows", [1, 2])
+def test_old_rows_keep_moments_and_new_rows_start_at_zero(device, rng, old_rows):
     gaussians = gaussians_of(device, rng, 65)
     copies = rng.integers(0, 5, 65)
     before = {name: gaussians.get(name) for name in gaussians.tables}
-    rule = Multiply(copies=copies.tolist(), kept=kept)
+    rule = Multiply(copies=copies.tolist(), old_rows=old_rows)
     change = densify(edit_of(gaussians), [rule], Rasterizer(device, "radix").tiler)
     assert (change.before, change.after) == (65, copies.sum())
     source = np.repeat(np.arange(65), copies)
-    fresh = np.concatenate([np.arange(number) for number in copies]) >= kept
+    fresh = np.concatenate([np.arange(number) for number in copies]) >= old_rows
     assert 0 < fresh.sum() < len(fresh)
     for name in PARAMETERS:
         np.testing.assert_array_equal(gaussians.get(name), before[name][source], err_msg=name)
@@ -213,7 +216,7 @@ class Relocate(Rule):
         faded = logits[sources, None] - np.log(copies[sources, None])
         edit.set_rows("logit_opacity", sources, faded)
         edit.zero_moments(sources)
-        edit.choose(copies != 1, copies, kept=1)
+        edit.choose(copies != 1, copies, old_rows=1)
 
 
 @on_one_setting
@@ -264,6 +267,6 @@ def test_random_numbers_do_not_depend_on_earlier_rules(device, rng):
     tiler = Rasterizer(device, "radix").tiler
     for start in (0, 1000):
         gaussians = gaussians_of(device, rng)
-        densify(edit_of(gaussians), [Multiply(copies=[2] * COUNT, kept=1, start=start), Watch()], tiler)
+        densify(edit_of(gaussians), [Multiply(copies=[2] * COUNT, old_rows=1, start=start), Watch()], tiler)
     assert seen[0] == seen[1]
     assert seen[0][0] == 1

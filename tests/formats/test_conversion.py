@@ -326,7 +326,7 @@ def test_sizes_are_human_readable(tmp_path, rng):
     write(tmp_path / "a.spz", same)
     done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])
     assert done.exit_code == 0, done.output
-    assert re.search(r" MB, \d{1,3},\d{3}\.\d % of what was read", done.output), done.output
+    assert re.search(r" MB, \d{1,3},\d{3}\.\d % of the input", done.output), done.output
 
 
 def test_run_folder_is_read_as_its_model(source, tmp_path):

@@ -61,7 +61,7 @@ def pruned(survey: Survey, rule: PruneRedundant) -> np.ndarray:
     gaussians = survey._model.gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
-    edit.mark(copies=2, kept=1)
+    edit.mark(copies=2, old_rows=1)
     rule.mark(edit)
     for name, table in before.items():
         np.testing.assert_array_equal(gaussians.get(name), table)

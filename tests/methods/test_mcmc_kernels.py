@@ -127,9 +127,9 @@ def test_gaussians_selected_earlier_are_no_sources(device, rng, limit):
     class Take(Rule):
         def mark(self, edit: Edit) -> None:
             third = np.arange(100) // 20
-            edit.choose(third == 1, copies=0, kept=0)
-            edit.choose(third == 2, copies=2, kept=1)
-            edit.choose(third == 0, copies=0, kept=0)
+            edit.choose(third == 1, copies=0, old_rows=0)
+            edit.choose(third == 2, copies=2, old_rows=1)
+            edit.choose(third == 0, copies=0, old_rows=0)
 
     gaussians = some_gaussians(device, rng, 100, faint=20)
     logits = gaussians.get("logit_opacity")[:, 0]

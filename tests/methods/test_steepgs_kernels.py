@@ -319,7 +319,7 @@ class Double(Rule):
     """Copies every Gaussian."""
 
     def mark(self, edit: Edit) -> None:
-        edit.choose(np.ones(edit.gaussians.count, bool), copies=2, kept=1)
+        edit.choose(np.ones(edit.gaussians.count, bool), copies=2, old_rows=1)
 
 
 @on_one_setting

@@ -7,12 +7,12 @@ import pytest
 
 from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
 from clsplat.metrics.views import (
-    PIXELS,
-    color_figures,
+    PIXELS_PER_PARAMETER,
+    color_metrics,
     correct_by_regression,
     fit_colors,
-    log_color_figures,
-    mean_figures,
+    log_color_metrics,
+    mean_color_metrics,
 )
 from clsplat.stages.optimize import comparable_psnr
 from clsplat.training.modules.exposure import Affine, Gain
@@ -32,7 +32,7 @@ def all_pixels(image: np.ndarray) -> np.ndarray:
 def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
     photograph = to_8_bits(image * GAINS.astype(np.float32))
     assert psnr(image, photograph) < 25
-    found = color_figures(image, photograph, None, Gain())
+    found = color_metrics(image, photograph, None, Gain())
     assert found["psnr_color"] > 50
     assert found["psnr_affine"] > 50
 
@@ -40,7 +40,7 @@ def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
 def test_equal_images_stay_equal(image):
     photograph = to_8_bits(image)
     for model in (Gain(), Affine()):
-        assert color_figures(photograph / np.float32(255), photograph, None, model)["psnr_color"] == MAX_PSNR
+        assert color_metrics(photograph / np.float32(255), photograph, None, model)["psnr_color"] == MAX_PSNR
 
 
 def test_colors_are_fitted_on_other_pixels_than_measured(image):
@@ -67,9 +67,9 @@ def test_half_with_too_few_pixels_has_no_color_metric(image, model, numbers, hal
     photograph, counted = to_8_bits(image), all_pixels(image)
     counted[half] = False
     rows, columns = np.nonzero(~counted)
-    for number, has in ((PIXELS * numbers - 1, False), (PIXELS * numbers, True)):
+    for number, has in ((PIXELS_PER_PARAMETER * numbers - 1, False), (PIXELS_PER_PARAMETER * numbers, True)):
         counted[rows[:number], columns[:number]] = True
-        found = color_figures(image, photograph, counted, model)
+        found = color_metrics(image, photograph, counted, model)
         assert ("psnr_color" in found) == has
         assert "psnr_affine" in found
 
@@ -79,9 +79,9 @@ def test_views_with_the_metric_do_not_depend_on_the_model(image, model):
     """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colors."""
     photograph = to_8_bits(0.5 * image)
     for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
-        assert "psnr_color" in color_figures(step, photograph, None, model)
-    assert color_figures(np.ones_like(image), photograph, None, model)["psnr_color"] < 22, "one color"
-    bright = color_figures(image / 0.05, to_8_bits(image), None, model)
+        assert "psnr_color" in color_metrics(step, photograph, None, model)
+    assert color_metrics(np.ones_like(image), photograph, None, model)["psnr_color"] < 22, "one color"
+    bright = color_metrics(image / 0.05, to_8_bits(image), None, model)
     assert bright["psnr_color"] > 50, "beyond white a picture still says which colors it asks for"
 
 
@@ -94,22 +94,22 @@ def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
 
 def test_mean_reports_its_number_of_views():
     both, one = {"psnr_color": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
-    assert mean_figures([both, both]) == both
-    assert mean_figures([{}, {}]) == {}
-    assert mean_figures([both, one]) == {
+    assert mean_color_metrics([both, both]) == both
+    assert mean_color_metrics([{}, {}]) == {}
+    assert mean_color_metrics([both, one]) == {
         "psnr_color": 30.0,
         "psnr_affine": 26.0,
         "psnr_color_views": 1,
         "psnr_color_reason": "1 of 2 views have a half with too few pixels to fit colors to",
     }
-    none = mean_figures([one])
+    none = mean_color_metrics([one])
     assert (none["psnr_color"], none["psnr_color_views"]) == (None, 0)
 
 
 def test_log_reports_the_number_of_averaged_views(caplog):
     caplog.set_level("INFO", "clsplat")
     whole = {"psnr": 20.0, "psnr_color": 24.0}
-    log_color_figures({"psnr": 20.0})
+    log_color_metrics({"psnr": 20.0})
     assert not caplog.messages
     for averages, said in (
         (whole, r"PSNR 24.00 dB; the photographs' exposures differ"),
@@ -120,7 +120,7 @@ def test_log_reports_the_number_of_averaged_views(caplog):
         ),
     ):
         caplog.clear()
-        log_color_figures(averages)
+        log_color_metrics(averages)
         (message,) = caplog.messages
         assert re.search(said, message)
 
@@ -134,8 +134,8 @@ def test_best_model_is_chosen_by_psnr_without_color_metrics():
 
 def test_steps_are_compared_by_psnr_if_views_lack_colors():
     """30 dB of one view is no better than 31 and 22 dB of two."""
-    first = {"psnr": 20.0, **mean_figures([{"psnr_color": 30.0}, {"psnr_affine": 20.0}])}
-    second = {"psnr": 21.0, **mean_figures([{"psnr_color": 31.0}, {"psnr_color": 22.0}])}
+    first = {"psnr": 20.0, **mean_color_metrics([{"psnr_color": 30.0}, {"psnr_affine": 20.0}])}
+    second = {"psnr": 21.0, **mean_color_metrics([{"psnr_color": 31.0}, {"psnr_color": 22.0}])}
     assert (first["psnr_color"], second["psnr_color"]) == (30.0, 26.5)
     whole = {"psnr": 22.0, "psnr_color": 29.0}
     assert comparable_psnr([whole, first]) == [22.0, 20.0]

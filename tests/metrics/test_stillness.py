@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.metrics.views import HELD_OUT, OTHERS, STILL, Stillness, ViewMetrics, by_moment, mean, means
+from clsplat.metrics.views import HELD_OUT, OTHERS, STILL, FlickerMeter, ViewMetrics, mean, means, psnr_by_time
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -34,9 +34,9 @@ def stacks(rng):
 
 
 def gathered(views, renders, photographs, counted=None):
-    found = Stillness(views)
+    found = FlickerMeter(views)
     rows = [found.add(*one, counted) for one in zip(views, renders, photographs, strict=True)]
-    return rows, found.figures()
+    return rows, found.flicker()
 
 
 def test_flicker_is_the_deviation_over_time_of_one_camera(rng, static):
@@ -94,10 +94,10 @@ def test_static_scene_has_no_stillness_metrics(rng):
 def test_camera_with_one_time_needs_no_row_and_no_memory(rng, static):
     renders, photographs = stacks(rng)
     moving = [moment(f"m{i}", i / 19, x=1.0 + i, static_path=static) for i in range(20)]
-    assert Stillness(moving).camera_count == 0
+    assert FlickerMeter(moving).camera_count == 0
     fixed = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     places = [moment(f"p{i}{k}", k / 2, x=-1.0 - i) for i in range(9) for k in range(2)]
-    assert Stillness([*places, *fixed]).camera_count == 8
+    assert FlickerMeter([*places, *fixed]).camera_count == 8
     _, figures = gathered([*moving[:MOMENTS], *fixed], [*renders, *renders], [*photographs, *photographs])
     assert figures == gathered(fixed, renders, photographs)[1] != {}
 
@@ -105,12 +105,12 @@ def test_camera_with_one_time_needs_no_row_and_no_memory(rng, static):
 def test_held_out_times_are_measured_separately():
     views = [moment(f"{i}", time) for i, time in enumerate((0, 0.5, 1))]
     psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
-    moments = by_moment(psnr, views, [views[0], views[2]])
+    moments = psnr_by_time(psnr, views, [views[0], views[2]])
     assert moments == {"0": {OTHERS: 20.0}, "1": {HELD_OUT: 21.0}, "2": {OTHERS: 22.0}}
     found = mean([ViewMetrics(name, value, 0.9, moments=moments[name]) for name, value in psnr.items()])
     assert (found["psnr"], found[HELD_OUT], found[OTHERS]) == (21, 21, 21)
     for trained in (views, [moment("x", 0.2)], [moment("y", None)], []):
-        assert not by_moment(psnr, views, trained)
+        assert not psnr_by_time(psnr, views, trained)
 
 
 def test_means_are_over_views_with_the_metric():

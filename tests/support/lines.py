@@ -1,4 +1,4 @@
-"""Count the code lines of what a wheel holds: `python -m tests.support.lines`.
+"""Count the code lines of a wheel: `python -m tests.support.lines`.
 
 Blank lines, comments and docstrings do not count, nor do the recipes.
 """
@@ -19,13 +19,13 @@ BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, token
 
 
 def python_lines(text: str) -> int:
-    """Count the lines with a token that is no part of a comment or docstring."""
+    """Count the lines that hold more than comments and docstrings."""
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    held = {line for token in tokens if token.type not in BLANK for line in range(token.start[0], token.end[0] + 1)}
+    lines = {line for token in tokens if token.type not in BLANK for line in range(token.start[0], token.end[0] + 1)}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            held -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return len(held)
+            lines -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return len(lines)
 
 
 def other_lines(text: str) -> int:
@@ -35,8 +35,8 @@ def other_lines(text: str) -> int:
     return sum(bool(line.strip()) for line in text.splitlines())
 
 
-def blank(found: re.Match[str]) -> str:
-    return "\n" * found.group().count("\n")
+def blank(match: re.Match[str]) -> str:
+    return "\n" * match.group().count("\n")
 
 
 def main() -> None:

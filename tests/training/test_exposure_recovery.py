@@ -10,7 +10,7 @@ import pytest
 
 import clsplat
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
-from clsplat.metrics.views import color_figures
+from clsplat.metrics.views import color_metrics
 from clsplat.training.modules.exposure import Gain
 from tests.support.runs import train
 
@@ -51,7 +51,7 @@ def held_out(run: Path) -> float:
     for view in scene.split("test"):
         picture = renderer.render(view)
         photograph = np.rint(255 * view.photograph(picture.background)).astype(np.uint8)
-        found.append(color_figures(picture.image, photograph, None, Gain())["psnr_color"])
+        found.append(color_metrics(picture.image, photograph, None, Gain())["psnr_color"])
     return float(np.mean(found))
 
 

@@ -44,7 +44,7 @@ class Case:
 def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
-    _, row, of_weight, (wait,) = view.step.saved(case.state)
+    _, row, of_weight, (wait,) = view.step.saved_value(case.state)
     found, numeric = case.example.row_gradient(row, wait()) + of_weight, []
     gradients = case.trainer.rasterizer.gradients(case.trainer.model, view.frame, view.pixel_sums)["sh_base"].get()
     for key in case.keys:

@@ -14,7 +14,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.losses.base import ImageLoss, Loss, checked_value
+from clsplat.losses.base import ImageLoss, Loss, require_loss_value
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
@@ -285,7 +285,7 @@ def test_loss_that_returns_none_is_named():
             pass
 
     with pytest.raises(ConfigError, match="the loss Silent: expected a LossValue from 'add', got NoneType"):
-        checked_value(Silent(), Silent().add(None))
+        require_loss_value(Silent(), Silent().add(None))
 
 
 @pytest.mark.parametrize("more", [[], [Anisotropy(above=1.0)]], ids=["losses", "a penalty"])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Results, by_element, equal
+from clsplat.conformance.check import SUM, Checks, Results, compare_max, match
 from clsplat.conformance.checks.images import SIZES, make_camera, outside, to_planes
 from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import unclamped_grid_colors
@@ -73,22 +73,22 @@ def check_grid(
     exact = image[:3].astype(np.float64)
     colors = grids.transform(workspace, camera, planes, 1).get()
     expected = ref.apply_color_grid(exact, grid)
-    yield by_element("color_grid_forward", f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal("color_grid_forward", f"pixels outside the image, {label}", outside(camera, colors[:3]), 0.0)
+    yield compare_max("color_grid_forward", f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield match("color_grid_forward", f"pixels outside the image, {label}", outside(camera, colors[:3]), 0.0)
     gradients = grids.differentiate(workspace, camera, planes, uploaded, 1)
     grad_image, grad_grid = (array.get() for array in gradients)
     expected_image, expected_grid = ref.color_grid_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(expected_image).max()), 1.0)
     actual, kernel = grad_image[:3, :height, :width], "color_grid_backward"
-    yield by_element(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=largest)
-    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
+    yield compare_max(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=largest)
+    yield match(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
         actual = photograph_grid(grids, grad_grid)
-        yield by_element(kernel, f"gradient by the grid, {label}", actual, expected_grid, SUM, floor=floor)
+        yield compare_max(kernel, f"gradient by the grid, {label}", actual, expected_grid, SUM, floor=floor)
     if channels > 3:
-        yield equal("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
-        yield equal("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
+        yield match("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
+        yield match("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
@@ -104,10 +104,10 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         smoothness, slope = ref.grid_smoothness(photograph_grid(grids, expected[1]))
         actual, truth = np.array([terms.get().sum(dtype=np.float64)]), np.array([weight * smoothness])
         kernel = "color_grid_smoothness"
-        yield by_element(kernel, f"value, {label}", actual, truth, SUM, floor=1e-2)
+        yield compare_max(kernel, f"value, {label}", actual, truth, SUM, floor=1e-2)
         actual, truth = photograph_grid(grids, grad_smoothness), weight * slope
         largest = max(float(np.abs(truth).max()), 1e-6)
-        yield by_element(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=largest)
+        yield compare_max(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, 1, device.upload(gradient), step)
         total = gradient.astype(np.float64) + grad_smoothness
@@ -116,11 +116,11 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         expected = ref.center_grids(updated).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
-        yield by_element(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)
+        yield compare_max(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
         floor = 0.1 * float(np.abs(moment).max())
-        yield by_element("color_grid_update", f"{name}, {label}", tables[name][1], moment, bound, floor=floor)
-        yield equal("color_grid_update", f"{name} of other photographs, {label}", tables[name][[0, 2]], 0.0)
+        yield compare_max("color_grid_update", f"{name}, {label}", tables[name][1], moment, bound, floor=floor)
+        yield match("color_grid_update", f"{name} of other photographs, {label}", tables[name][[0, 2]], 0.0)
 
 
 @CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")
@@ -151,21 +151,21 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     actual = transform_colors(workspace, camera, planes, matrix).get()
     exact = image[:3].astype(np.float64)
     expected = ref.apply_color_matrix(exact, matrix)
-    yield by_element("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+    yield compare_max("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield match("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     uploaded = to_planes(device, camera, gradient)
     grad_image, wait_for_matrix = color_gradients(workspace, camera, planes, matrix, uploaded)
     expected, grad_matrix = ref.color_matrix_backward(exact, matrix, gradient[:3].astype(np.float64))
     grad = grad_image.get()
-    yield by_element("colors_backward", f"gradient, {label}", grad[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("colors_backward", f"gradient outside the image, {label}", outside(camera, grad), 0.0)
+    yield compare_max("colors_backward", f"gradient, {label}", grad[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield match("colors_backward", f"gradient outside the image, {label}", outside(camera, grad), 0.0)
     floor, actual_matrix = float(np.sqrt(gradient.size)), wait_for_matrix()
-    yield by_element(
+    yield compare_max(
         "colors_backward", f"gradient by the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
     )
     if channels > 3:
-        yield equal("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
-        yield equal("colors_backward", f"gradient of the fourth plane, {label}", grad[3], uploaded.get()[3])
+        yield match("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield match("colors_backward", f"gradient of the fourth plane, {label}", grad[3], uploaded.get()[3])
 
 
 @CHECKS.add("colors_forward", "colors_backward")
@@ -192,17 +192,17 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     sums = workspace.array("response sums", (20, camera.rows)).get()
     exact, upstream = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.apply_response(exact, row, center)
-    yield by_element(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
+    yield compare_max(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield match(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
     expected, grad_row = appearance.apply_response_backward(exact, row, center, upstream)
     largest = max(float(np.abs(expected).max()), 1.0)
-    yield by_element(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
-    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
+    yield compare_max(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
+    yield match(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield by_element(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
+    yield compare_max(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
     if channels > 3:
-        yield equal(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
-        yield equal(kernel, f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
+        yield match(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield match(kernel, f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 @CHECKS.add("camera_response")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, by_element, by_norm, check_image, equal
+from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, check_image, compare, compare_max, match
 from clsplat.conformance.checks.images import SIZES, make_camera, make_comparison, outside, to_planes
 from clsplat.conformance.scenes import Case, random_case, safe_case, sums_to_gradients
 from clsplat.density.statistics import ABS_X
@@ -38,7 +38,7 @@ def check_blend(device: Device, case: Case, label: str, sort: Sort = "radix") ->
     image, transmittance = frame.image.get(), frame.transmittance.get()
     outside = np.concatenate([image, transmittance[None]])
     outside[:, :height, :width] = 0
-    yield equal("blend_forward", f"pixels outside the image, {label}", outside, 0.0)
+    yield match("blend_forward", f"pixels outside the image, {label}", outside, 0.0)
     expected, left, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
     yield from check_image("blend_forward", f"image, {label}", image[:, :height, :width], expected)
     actual = transmittance[None, :height, :width]
@@ -72,13 +72,13 @@ def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], label: str) ->
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
     mean2d, conic = sums_to_gradients(splats, m)
-    yield by_norm(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
-    yield by_norm(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
-    yield by_norm(kernel, f"gradients of opacities, {label}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
-    yield by_norm(kernel, f"gradients of colors, {label}", m[:, 6:9], truth.color, GRADIENT)
+    yield compare(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
+    yield compare(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
+    yield compare(kernel, f"gradients of opacities, {label}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
+    yield compare(kernel, f"gradients of colors, {label}", m[:, 6:9], truth.color, GRADIENT)
     if m.shape[1] > PIXEL_SUMS:
         actual = m[:, ABS_X : ABS_X + 2]
-        yield by_norm(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
+        yield compare(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
 
 
 def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
@@ -131,16 +131,16 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     m = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
     yield from check_sum(case, m, weights, "with weights and texture")
     blended = ref.blend_weights(case.project(), width, height) * (texture >= 0)
-    yield by_norm("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
+    yield compare("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
     expected = (blended * texture).sum(axis=(1, 2))
-    yield by_norm("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
+    yield compare("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
     squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
-    yield by_norm("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
+    yield compare("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
     flags = np.where(texture < 0, -1, texture > 0.3).astype(np.float32)
     for scene in (case, safe_case(rng, 300, width, height, 2e-6, _make_opaque)):  # finished pixels
         counts = sum_pixels(device, scene, weights, ALL_SUMS, texture=flags)[:, BLENDED]
         expected = (ref.blend_weights(scene.project(), width, height) > 0) * (flags > 0)
-        yield equal("blend_backward", "numbers of pixels", counts, expected.sum(axis=(1, 2)))
+        yield match("blend_backward", "numbers of pixels", counts, expected.sum(axis=(1, 2)))
     yield from check_sum(case, sum_pixels(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
@@ -160,10 +160,10 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         black, channel = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
         from_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
         mean2d, conic = sums_to_gradients(splats, sums.get()[:, :count].T.astype(np.float64))
-        yield by_norm("blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_left.mean2d, GRADIENT)
-        yield by_norm("blend_backward", f"conics, {label}", conic, from_image.conic + from_left.conic, GRADIENT)
+        yield compare("blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_left.mean2d, GRADIENT)
+        yield compare("blend_backward", f"conics, {label}", conic, from_image.conic + from_left.conic, GRADIENT)
         opacity = (from_image.opacity + from_left.opacity) * splats.opacity
-        yield by_norm("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
+        yield compare("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
 
 
 @CHECKS.add("sum_records")
@@ -188,7 +188,7 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
                 count=count,
             )
             truth = expected[:PIXEL_SUMS] + accumulate * sums[:, :count].astype(np.float64)
-            yield by_norm("sum_records", f"sums of {count} Gaussians", pixel_sums.get()[:, :count], truth, SUM)
+            yield compare("sum_records", f"sums of {count} Gaussians", pixel_sums.get()[:, :count], truth, SUM)
 
 
 @CHECKS.add("blend_forward", "blend_backward")
@@ -197,12 +197,12 @@ def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.G
     case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and more tiles than a mask holds
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
     image, sums = render(device, case).image.get(), sum_pixels(device, case, weights)
-    yield equal("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
+    yield match("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
     again = sum_pixels(device, case, weights, sort="bitonic")
-    yield equal("sort_tiles", "sums over pixels, against the radix sort", again, sums)
+    yield match("sort_tiles", "sums over pixels, against the radix sort", again, sums)
     banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
-    yield equal("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
-    yield equal("blend_backward", "sums over pixels, a second time", sum_pixels(device, case, weights), sums)
+    yield match("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
+    yield match("blend_backward", "sums over pixels, a second time", sum_pixels(device, case, weights), sums)
 
 
 # inverse_depth.cl, and the fourth plane of blending, its input.
@@ -237,17 +237,17 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     mean2d, conic = (getattr(from_image, name) + getattr(from_depth, name) for name in ("mean2d", "conic"))
     opacity = from_image.opacity + from_depth.opacity
     actual = sums_to_gradients(splats, m)
-    yield by_norm("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
-    yield by_norm("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
-    yield by_norm("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
-    yield by_norm("blend_backward", f"colors with depths, {label}", m[:, 6:9], from_image.color, GRADIENT)
+    yield compare("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
+    yield compare("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
+    yield compare("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
+    yield compare("blend_backward", f"colors with depths, {label}", m[:, 6:9], from_image.color, GRADIENT)
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
-    yield by_norm("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
+    yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
     upstream = mean2d, conic, opacity, from_image.color
     numbers = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]
-    yield by_norm("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
+    yield compare("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")
@@ -260,9 +260,9 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
         image, *sums = differentiate(device, case, weights)
-        yield equal("blend_forward", f"colors, {label}", image[:3], plain.image.get()[:, :height, :width])
+        yield match("blend_forward", f"colors, {label}", image[:3], plain.image.get()[:, :height, :width])
         for actual, banded in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
-            yield equal("sum_inverse_depths", f"against bands of tiles, {label}", banded, actual)
+            yield match("sum_inverse_depths", f"against bands of tiles, {label}", banded, actual)
 
 
 @CHECKS.add("inverse_depth_loss")
@@ -282,12 +282,12 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         expected, grad_plane = ref.inverse_depth_loss(x[3].astype(np.float64), positions, targets, weights)
         label = f"{count} pixels of {width} x {height}"
         terms = comparison.workspace.array("inverse_depth_terms", count).get()
-        yield by_element("inverse_depth_loss", f"terms, {label}", terms, expected, SUM, floor=1e-3)
+        yield compare_max("inverse_depth_loss", f"terms, {label}", terms, expected, SUM, floor=1e-3)
         total = np.array([scale * expected.sum()])
-        yield by_element("inverse_depth_loss", f"value, {label}", np.array([value]), total, SUM, floor=1e-6)
+        yield compare_max("inverse_depth_loss", f"value, {label}", np.array([value]), total, SUM, floor=1e-6)
         actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
         truth[3, :height, :width] = scale * grad_plane
-        yield by_element("inverse_depth_loss", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
+        yield compare_max("inverse_depth_loss", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
 
 
 # layer.cl: a layer of splats in front of an image.
@@ -306,16 +306,16 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     composite, behind = actual.image.get(), actual.behind.get()
     inside = np.s_[..., :height, :width]
     exact = left.astype(np.float64)
-    yield by_element("lay_over", f"both, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
+    yield compare_max("lay_over", f"sum, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
     loss, grad_left = ref.layer_cover(exact, scale)
-    yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
-    yield by_element("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
+    yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
+    yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for output in (composite, behind):
-        yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, output), 0.0)
+        yield match("lay_over", f"pixels outside the image, {label}", outside(camera, output), 0.0)
     grad_both = to_planes(device, camera, gradient)
     look_behind(workspace, frame, grad_both)
     expected = ref.gradient_behind(exact, gradient)
-    yield by_element("look_behind", f"derivatives, {label}", grad_both.get()[inside], expected, 1e-6, floor=1.0)
+    yield compare_max("look_behind", f"derivatives, {label}", grad_both.get()[inside], expected, 1e-6, floor=1.0)
 
 
 @CHECKS.add("lay_over", "look_behind")

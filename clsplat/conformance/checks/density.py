@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Results, by_element, by_norm, equal
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Results, compare, compare_max, match
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
 from clsplat.conformance.checks.images import make_comparison, sobel_magnitude, to_planes
 from clsplat.conformance.scenes import Case, add_world_filter, random_case, safe_case
@@ -71,11 +71,11 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
             ("gain", "accumulate_gain"): width * height * ref.screen_gain(sums[:, :2], conic),
             ("view_error", "accumulate_error"): np.full(count, error),
         }
-        yield equal("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
+        yield match("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
         for (name, kernel), values in columns.items():
             actual = gaussians.get(f"stats/{name}")[:, 0]
             expected = 2 * values * (seen | (name == "view_error"))  # view_error also counts for unseen Gaussians
-            yield by_element(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
+            yield compare_max(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
 
 
 @CHECKS.add("accumulate_splitting")
@@ -94,7 +94,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
         on_screen = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
         expected = 2 * ref.splitting(case.gaussians(), case.camera(), on_screen)[:, *np.triu_indices(3)]
         actual = model.gaussians.get("stats/splitting")
-        yield by_norm("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
+        yield compare("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
 
 
 def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
@@ -133,25 +133,25 @@ def edits(device: Device, rng: np.random.Generator) -> Results:
         if gaussians.count != len(source):
             continue
         after = {name: gaussians.get(name) for name in gaussians.tables}
-        yield equal("list_rows", f"rows after {label}", after["sh_rest"], before["sh_rest"][source])
+        yield match("list_rows", f"rows after {label}", after["sh_rest"], before["sh_rest"][source])
         split = action[source] == ref.SPLIT
         second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
         fresh = split | ((action[source] == ref.CLONE) & second)
         moment = "adam/means/moment1"
         expected = np.where(fresh[:, None], 0, before[moment][source])
-        yield equal("list_rows", f"moments after {label}", after[moment], expected)
+        yield match("list_rows", f"moments after {label}", after[moment], expected)
         means, scales = before["means"].astype(np.float64)[source], before["log_scales"].astype(np.float64)[source]
         logits = before["logit_opacity"].astype(np.float64)[source]
         cloned = action[source] == ref.CLONE
         logits[cloned] = ref.shared_logit(logits[cloned], 2)
-        yield by_element("share_opacity", f"opacities after {label}", after["logit_opacity"], logits, SUM, floor=1)
+        yield compare_max("share_opacity", f"opacities after {label}", after["logit_opacity"], logits, SUM, floor=1)
         for i in np.flatnonzero(split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
             rotation = ref.rotation_matrix(before["quats"][source[i]].astype(np.float64))
             means[i] += rotation @ (np.exp(scales[i]) * noise)
         scales[split] -= np.log(1.6)
-        yield by_norm("spawn_children", f"means after {label}", after["means"], means, SUM)
-        yield by_element("spawn_children", f"scales after {label}", after["log_scales"], scales, SUM, floor=1)
+        yield compare("spawn_children", f"means after {label}", after["means"], means, SUM)
+        yield compare_max("spawn_children", f"scales after {label}", after["log_scales"], scales, SUM, floor=1)
 
 
 @CHECKS.add("mark_chosen")
@@ -167,7 +167,7 @@ def choices(device: Device, rng: np.random.Generator) -> Results:
             copies[acts], kept[acts] = numbers[acts], np.minimum(numbers, 3)[acts]
             shrink[acts & (copies > 0)] = factor
         for name, expected in (("copies", copies), ("kept", kept), ("shrink", shrink)):
-            yield equal("mark_chosen", f"{name} of {count} Gaussians", getattr(edit, name).get(), expected)
+            yield match("mark_chosen", f"{name} of {count} Gaussians", getattr(edit, name).get(), expected)
 
 
 @CHECKS.add("cap_opacity")
@@ -182,7 +182,7 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
             capped = ratio / (1 + np.exp(-expected)) > 0.3
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
             actual = gaussians.get("logit_opacity")[:, 0]
-            yield by_element("cap_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
+            yield compare_max("cap_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("add_noise")
@@ -200,7 +200,7 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
             axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
             offsets[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
         actual = gaussians.get("means").astype(np.float64)
-        yield by_norm("add_noise", f"means of {count} Gaussians", actual, p["means"] + offsets, SUM)
+        yield compare("add_noise", f"means of {count} Gaussians", actual, p["means"] + offsets, SUM)
 
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.
@@ -225,11 +225,11 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
         actual, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
         label = f"blend weights of {count} Gaussians"
-        yield by_element("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
-        yield equal("blend_backward", f"{label}, a second time", again, actual)
+        yield compare_max("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
+        yield match("blend_backward", f"{label}, a second time", again, actual)
         actual = sensitivities(_render_views(device, case, photographs, background), count)
         squares = np.sum([_falloff_squares(case, background, mask) for mask in masks], axis=0)
-        yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
+        yield compare("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
 
 
 def _render_views(
@@ -257,7 +257,7 @@ def alike(device: Device, rng: np.random.Generator) -> Results:
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins
         actual, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
-        yield equal("most_alike", f"labels of {count} points and {entries} vectors", actual, expected)
+        yield match("most_alike", f"labels of {count} points and {entries} vectors", actual, expected)
 
 
 @CHECKS.add("share_mean")
@@ -269,6 +269,6 @@ def shared_means(device: Device, rng: np.random.Generator) -> Results:
         set_clusters(gaussians, labels, weights)
         average_clusters(gaussians, "sh_rest")
         label, actual = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
-        yield by_element("share_mean", label, actual, ref.shared_means(values, labels, weights), SUM, floor=0.1)
+        yield compare_max("share_mean", label, actual, ref.shared_means(values, labels, weights), SUM, floor=0.1)
         average_clusters(gaussians, "sh_rest")
-        yield equal("share_mean", f"{label}, a second time", gaussians.get("sh_rest"), actual)
+        yield match("share_mean", f"{label}, a second time", gaussians.get("sh_rest"), actual)

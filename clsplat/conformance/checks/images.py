@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, by_element, equal
+from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, compare_max, match
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
@@ -67,12 +67,12 @@ def check_loss(
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
     value_kernel = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
     values = np.array([actual.value()]), np.array([weight * value])
-    yield by_element(value_kernel, f"value of {label}", *values, SUM, floor=1e-2)
+    yield compare_max(value_kernel, f"value of {label}", *values, SUM, floor=1e-2)
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     largest = max(float(np.abs(weight * gradient).max()), 1e-30)
     yield Deviation(kernel, f"gradient of {label}", float(error) / largest, LOSS_GRADIENT)
-    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, planes), 0.0)
+    yield match(kernel, f"gradient outside the image, {label}", outside(camera, planes), 0.0)
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
@@ -105,9 +105,9 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
         rows = comparison.workspace.array("row_errors", (3, comparison.camera.rows)).get()
         values = [table.astype(np.float64) for table in (gradient, x, y)]
         expected = np.array([[ref.view_error(*(v[c, row] for v in values)) for row in range(height)] for c in range(3)])
-        yield by_element("view_error", f"errors of rows, {label}", rows[:, :height], expected, SUM, floor=1e-2)
-        yield equal("view_error", f"errors of rows outside the image, {label}", rows[:, height:], 0.0)
-        yield by_element("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), SUM)
+        yield compare_max("view_error", f"errors of rows, {label}", rows[:, :height], expected, SUM, floor=1e-2)
+        yield match("view_error", f"errors of rows outside the image, {label}", rows[:, height:], 0.0)
+        yield compare_max("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), SUM)
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")
@@ -120,18 +120,18 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
         colors = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
         counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
         actual = colors.get()
-        yield by_element("unpack_pixels", f"colors, {label}", actual[:, :height, :width], pixels / 255, 1e-6)
-        yield equal("unpack_pixels", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
-        yield equal("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
+        yield compare_max("unpack_pixels", f"colors, {label}", actual[:, :height, :width], pixels / 255, 1e-6)
+        yield match("unpack_pixels", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+        yield match("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
         apply_mask(workspace, camera, colors, counted)
-        yield equal("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
+        yield match("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
         visibility, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
         uploaded = device.upload(np.ascontiguousarray(visibility)), device.upload(before), device.upload(after)
         masked = colors.get()
         change_background(workspace, camera, colors, *uploaded)
         truth = masked.astype(np.float64)
         truth[:, :height, :width] += visibility / 255 * (after - before.astype(np.float64))[:, None, None]
-        yield by_element("change_background", f"colors, {label}", colors.get(), truth, 1e-6, floor=1.0)
+        yield compare_max("change_background", f"colors, {label}", colors.get(), truth, 1e-6, floor=1.0)
 
 
 @CHECKS.add("blur_rows", "blur_columns")
@@ -146,8 +146,8 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
             actual = Blur(sigma=sigma).apply(planes, step=1).colors.get()
             expected = ref.blur(image.astype(np.float64), sigma, mask)
             label = f"sigma {sigma:g}, {width} x {height} px"
-            yield by_element("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
-            yield equal("blur_columns", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+            yield compare_max("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
+            yield match("blur_columns", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
 
 
 def check_haar(
@@ -165,13 +165,13 @@ def check_haar(
     planes = Planes(workspace, camera, to_planes(device, camera, image), counted)
     actual, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
     expected = ref.haar_filter(exact, taps, mask)
-    yield by_element("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+    yield compare_max("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
+    yield match("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     derivatives = filter_gradients(planes, numbers, to_planes(device, camera, gradient))()
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
     grad_both = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield by_element("haar_backward", label, actual, grad_both, SUM, floor=size)
+    yield compare_max("haar_backward", label, actual, grad_both, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")
@@ -202,8 +202,8 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
             if counted is not None:
                 expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
             kernel = "image_gradient" if counted is None else "hide_masked"
-            yield by_element(kernel, f"texture, {label}", actual[:height, :width], expected, 1e-6, floor=1)
-            yield equal(kernel, f"texture outside the image, {label}", outside(camera, actual), 0.0)
+            yield compare_max(kernel, f"texture, {label}", actual[:height, :width], expected, 1e-6, floor=1)
+            yield match(kernel, f"texture outside the image, {label}", outside(camera, actual), 0.0)
 
 
 SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside of the histogram's range
@@ -224,18 +224,18 @@ def check_transient(
     actual, wait_for_histogram = measure_residuals(workspace, camera, *planes, mask)
     label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
-    yield by_element("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
+    yield compare_max("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
     others = actual.get()[0].copy()
     others[:height, :width][counted] = -1
-    yield equal("measure_residuals", f"pixels that do not count, {label}", others, -1.0)
+    yield match("measure_residuals", f"pixels that do not count, {label}", others, -1.0)
     histogram = ref.residual_histogram(values[counted].astype(np.float64))
-    yield equal("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
+    yield match("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
         threshold = float(np.float32(np.quantile(values, quantile)))
         mask = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
         expected = np.zeros_like(mask)
         expected[:height, :width] = ref.mask_transients(values, counted, threshold, reach)
-        yield equal("mask_transients", f"mask, {label}", mask, expected)
+        yield match("mask_transients", f"mask, {label}", mask, expected)
 
 
 @CHECKS.add("measure_residuals", "mask_transients")

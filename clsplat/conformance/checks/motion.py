@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Results, by_element, by_norm, equal, wrong
+from clsplat.conformance.check import CONIC, SUM, Checks, Results, compare, compare_max, count_true, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, WIDTHS, motion_fields, motion_width
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
@@ -46,11 +46,11 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     means, quats, logits = ref.move_gaussians(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
     present = np.isfinite(means).all(axis=1)
     actual = moved.get("means")
-    yield wrong("move_forward", f"which are present, {label}", np.isfinite(actual).all(axis=1) != present)
-    yield by_element("move_forward", f"means, {label}", actual[present], means[present], 1e-6, floor=1.0)
+    yield count_true("move_forward", f"which are present, {label}", np.isfinite(actual).all(axis=1) != present)
+    yield compare_max("move_forward", f"means, {label}", actual[present], means[present], 1e-6, floor=1.0)
     actual = moved.get("logit_opacity")[present, 0]
-    yield by_element("move_forward", f"logits, {label}", actual, logits[present], 1e-5, 1.0)
-    yield by_element("turn_forward", f"quaternions, {label}", moved.get("quats"), quats, 1e-6, floor=1.0)
+    yield compare_max("move_forward", f"logits, {label}", actual, logits[present], 1e-5, 1.0)
+    yield compare_max("turn_forward", f"quaternions, {label}", moved.get("quats"), quats, 1e-6, floor=1.0)
 
     gradients = GaussianGradients(model.gaussians)
     grads = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
@@ -66,8 +66,8 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     actual, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
     for name, columns in motion_fields(width).items():
-        yield by_norm(kernel, f"by {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
-    yield by_norm("move_backward", f"by the logit at the center, {label}", center, grad_logit, CONIC)
+        yield compare(kernel, f"by {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
+    yield compare("move_backward", f"by the logit at the center, {label}", center, grad_logit, CONIC)
 
 
 def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
@@ -82,7 +82,7 @@ def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
     for scene in (case, still):
         frame = Rasterizer(device, "radix").forward(scene.model(device), scene.device_camera(device), device.zeros(3))
         images.append(frame.image.get())
-    yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
+    yield match("move_forward", "an image of Gaussians that stand still", images[1], images[0])
 
 
 def check_step(device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF) -> Results:
@@ -106,10 +106,10 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
         update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
     label = f"{count} of {width} columns" + (", only of visible rows" if every == 0 else "")
     actual, before = gaussians.get(MOTION), case.parameters[MOTION]
-    yield equal("motion_step", f"values of rows not seen, {label}", actual[~seen], before[~seen])
-    yield by_element("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)
+    yield match("motion_step", f"values of rows not seen, {label}", actual[~seen], before[~seen])
+    yield compare_max("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)
     for moment, expected in zip(moment_tables(MOTION), (m, v), strict=True):
-        yield by_norm("motion_step", f"moments, {label}", gaussians.get(moment), expected, 3 * SUM)
+        yield compare("motion_step", f"moments, {label}", gaussians.get(moment), expected, 3 * SUM)
 
 
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")

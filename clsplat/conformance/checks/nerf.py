@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Results, by_element, by_norm, equal
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Results, compare, compare_max, match
 from clsplat.conformance.checks.images import to_planes
 from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.reference.training import adam_step
@@ -135,8 +135,8 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(7, 11, 5))
         pixels = ref.draw_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
-        yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
-        yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
+        yield match("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
+        yield compare_max("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
         for rays in (case.rays, replace(case.rays, draw=None)):
             yield from _check_edge(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
@@ -149,10 +149,10 @@ def _check_edge(case: FieldCase, label: str) -> Results:
     expected = [
         ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, row if is_drawn else None) for row in coarse_units
     ]
-    yield by_element("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
+    yield compare_max("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
     pairs = zip(edges.astype(np.float64), weights.astype(np.float64), fine_units, strict=True)
     expected = [ref.fine_edges(t, w, shape.fine_samples, row if is_drawn else None) for t, w, row in pairs]
-    yield by_element("resample_edges", label, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
+    yield compare_max("resample_edges", label, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
 
 @CHECKS.add("encode_frustums", "encode_directions")
@@ -166,11 +166,11 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
             rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.direction)
         )
         actual = read_rows(table, first, case.shape.position_rows)
-        yield by_element("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
-        yield equal("encode_frustums", f"padding of blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
+        yield compare_max("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
+        yield match("encode_frustums", f"padding of blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
         actual = read_rows(seen, row, case.shape.direction_rows)
-        yield by_element("encode_directions", f"{count} rays", actual[:, : direction.shape[1]], direction, 2e-6, 1.0)
-        yield equal("encode_directions", f"padding of blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
+        yield compare_max("encode_directions", f"{count} rays", actual[:, : direction.shape[1]], direction, 2e-6, 1.0)
+        yield match("encode_directions", f"padding of blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
 
 
 # A grid of features: positions of samples in it, features, and gradients of its entries.
@@ -201,8 +201,8 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
         level = next(case.levels.render(case.on_device, case.rays))
         means, variances = case.places(level.edges.get())
         actual = read_rows(case.levels.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
-        yield by_element("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
-        yield by_element("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
+        yield compare_max("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
+        yield compare_max("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
         case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
         yield from _check_grid(device, rng, case, _random_positions(rng, tiles, ends))
@@ -237,19 +237,19 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
         gradients.append(sums.get())
     actual, *others = gradients
     for parts, gradient in zip((1, 3), others, strict=True):
-        yield equal("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
+        yield match("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
     by_sample = _by_sample(grad_features)
     means, variances = np.split(_by_sample(positions), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
         expected = grid.level.forward(grid.entries(case.parameters), means, variances)
-        yield by_element("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
+        yield compare_max("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
         expected, grad_entries = grid.level.backward(by_sample[:, rows], means, variances), grid.entries(actual)
-        yield by_norm("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
+        yield compare("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
         untouched = np.all(expected == 0, axis=1)
-        yield equal("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[untouched], 0.0)
-    yield equal("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
+        yield match("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[untouched], 0.0)
+    yield match("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
 
 
 # A field: its network, colors of rays, all gradients, images and updates.
@@ -278,7 +278,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
             yield from comparison.deviations(f"{count} rays, {level.samples} samples")
             case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
-            yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
+            yield compare_max("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
             grad_weights, grad_position = comparison.backward(count)
             expected.append(grad_weights)
             for number, grid in enumerate(case.grid_levels()):
@@ -287,7 +287,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
         for number, (grid, truth) in enumerate(zip(case.grid_levels(), grad_entries, strict=True)):
             label = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
-                yield by_norm(name, label, grid.entries(gradient.get()), truth, GRADIENT)
+                yield compare(name, label, grid.entries(gradient.get()), truth, GRADIENT)
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
@@ -298,12 +298,12 @@ def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[re
         grad_weights, grad_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
-            yield by_norm(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), GRADIENT)
-        yield by_norm("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), GRADIENT)
+            yield compare(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), GRADIENT)
+        yield compare("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), GRADIENT)
         table = used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
         table[np.ix_(layer.inputs, range(layer.outputs))] = True
         used[layer.first_bias : layer.first_bias + layer.outputs] = True
-    yield equal("dense_sums", f"padding of blocks, {label}", gradient[~used], 0.0)
+    yield match("dense_sums", f"padding of blocks, {label}", gradient[~used], 0.0)
 
 
 @dataclass(frozen=True)
@@ -338,11 +338,11 @@ class _Comparison:
             read_rows(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
         for name, actual, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
-            yield by_element("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
+            yield compare_max("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
         weights, left = self.composite.weights()
         for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
-            yield by_element("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
-        yield by_element("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
+            yield compare_max("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
+        yield compare_max("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
         grad_colors = 2 * self.scale * self.differences
@@ -360,7 +360,7 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
     *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))
     expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
     expected[:, :HEIGHT, :WIDTH] = fine.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
-    yield equal("place_colors", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
+    yield match("place_colors", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
 
 
 @CHECKS.add("dense_update")
@@ -375,6 +375,6 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
         exact = gradient.astype(np.float64)
         values, moment1, moment2 = adam_step(values, exact, moment1, moment2, number, 0.01, epsilon=epsilon)
     actual = learned.tables()
-    yield by_element("dense_update", "parameters", actual["parameters"][:, 0], values, 1e-4, 0.01)
-    yield by_element("dense_update", "first moments", actual["moment1"][:, 0], moment1, 1e-4, 1e-12)
-    yield by_element("dense_update", "second moments", actual["moment2"][:, 0], moment2, 1e-4, 1e-24)
+    yield compare_max("dense_update", "parameters", actual["parameters"][:, 0], values, 1e-4, 0.01)
+    yield compare_max("dense_update", "first moments", actual["moment1"][:, 0], moment1, 1e-4, 1e-12)
+    yield compare_max("dense_update", "second moments", actual["moment2"][:, 0], moment2, 1e-4, 1e-24)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, Checks, Results, by_norm, equal
+from clsplat.conformance.check import GRADIENT, Checks, Results, compare, match
 from clsplat.conformance.checks.blending import (
     ALL_SUMS,
     BACKGROUND,
@@ -63,7 +63,7 @@ def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Res
         sums = sum_pixels(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
         yield from check_sum(case, sums, weights, f"splats {label} over the pixel's box")
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
-        yield by_norm("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
+        yield compare("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
     default_sums = sum_pixels(device, case, weights)
     yield from check_sum(case, default_sums, weights, "without more sums over the pixel's box")
 
@@ -74,9 +74,9 @@ def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case.parameters["log_scales"][:10] += 1.5
     weights = rng.normal(size=(3, 130, 150)).astype(np.float32)
     image = render(device, case).image.get()
-    yield equal(
+    yield match(
         "sort_tiles", "pixels over their box, by the other sort", render(device, case, "bitonic").image.get(), image
     )
     sums = sum_pixels(device, case, weights)
     banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
-    yield equal("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)
+    yield match("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)

@@ -16,10 +16,10 @@ from clsplat.conformance.check import (
     Checks,
     Deviation,
     Results,
-    by_element,
-    by_norm,
-    equal,
-    wrong,
+    compare,
+    compare_max,
+    count_true,
+    match,
 )
 from clsplat.conformance.scenes import (
     Case,
@@ -65,28 +65,28 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     rendered = records[:, 5] > 0
     x, y = truth.mean2d.T
     unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
-    yield wrong(
+    yield count_true(
         kernel, f"which splats are drawn, {label}", (rendered & ~truth.visible) | (truth.visible & ~rendered & ~unseen)
     )
     rendered &= truth.visible
     record = records[rendered]
-    yield by_element(kernel, f"means, {label}", record[:, :2], truth.mean2d[rendered], PROJECTION, floor=50)
+    yield compare_max(kernel, f"means, {label}", record[:, :2], truth.mean2d[rendered], PROJECTION, floor=50)
     conic = record_covariances(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[rendered], axis=1), 1e-30)
     error = np.linalg.norm(conic - truth.conic[rendered], axis=1) / size
     yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
-    yield by_element(kernel, f"opacities, {label}", record[:, 5], truth.opacity[rendered], PROJECTION)
-    yield by_element(kernel, f"colors, {label}", record[:, 6:9], truth.color[rendered], PROJECTION, floor=1)
-    yield by_element(kernel, f"depths, {label}", keys[rendered].view(np.float32), truth.depth[rendered], DEPTH)
+    yield compare_max(kernel, f"opacities, {label}", record[:, 5], truth.opacity[rendered], PROJECTION)
+    yield compare_max(kernel, f"colors, {label}", record[:, 6:9], truth.color[rendered], PROJECTION, floor=1)
+    yield compare_max(kernel, f"depths, {label}", keys[rendered].view(np.float32), truth.depth[rendered], DEPTH)
     if not case.pixel_box:
         power_min = -np.log(255 * truth.opacity[rendered])
-        yield by_element(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
+        yield compare_max(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
     hidden = records[:, 5] <= 0
-    yield wrong(kernel, f"culled splats, {label}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
+    yield count_true(kernel, f"culled splats, {label}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
     # ceil() may jump by a pixel where the radius is close to an integer
-    yield wrong(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
-    yield wrong(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
-    yield wrong(kernel, f"extents, {label}", _wrong_extents(record, truth, rendered))
+    yield count_true(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
+    yield count_true(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
+    yield count_true(kernel, f"extents, {label}", _wrong_extents(record, truth, rendered))
 
 
 def record_covariances(record: NDArray[Any]) -> NDArray[Any]:
@@ -124,9 +124,9 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
     expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
     for name, array in gradients.arrays.items():
         value = array.get()[:, : gaussians.count].T
-        yield by_norm("project_backward", f"gradients of {name}, {label}", value, expected[name], CONIC)
+        yield compare("project_backward", f"gradients of {name}, {label}", value, expected[name], CONIC)
     value = gradients.mean2d.get()[:, : gaussians.count].T
-    yield by_norm("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
+    yield compare("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
 
 
 def check_long_splats(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
@@ -219,10 +219,10 @@ def projection(device: Device, rng: np.random.Generator) -> Results:
 def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Results:
     records, keys, radius = project_records(device, undrawable_case(rng))
     culled = [0, 1, 2, 3, 4, 5, 7, 8]
-    yield equal("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
-    yield equal("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
-    yield equal("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
-    yield wrong("project_forward", "records that are not numbers", np.isnan(records))
+    yield match("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
+    yield match("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
+    yield match("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
+    yield count_true("project_forward", "records that are not numbers", np.isnan(records))
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Results:
@@ -235,12 +235,12 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
         label = f"hidden Gaussians of {count}, view {view} of {views}"
         frame = rasterizer.forward(model, replace(camera, view=view), background)
         actual, hidden = frame.image.get().copy(), left_out[view]
-        yield equal("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
-        yield equal("project_forward", f"depths of {label}", frame.depth_key.get()[:count][hidden], CULLED)
-        yield equal("project_forward", f"radii of {label}", frame.radius.get()[:count][hidden], 0.0)
+        yield match("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
+        yield match("project_forward", f"depths of {label}", frame.depth_key.get()[:count][hidden], CULLED)
+        yield match("project_forward", f"radii of {label}", frame.radius.get()[:count][hidden], 0.0)
         others = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
         expected = rasterizer.forward(others.model(device), camera, background).image.get()
-        yield equal("project_forward", f"image without {label}", actual, expected)
+        yield match("project_forward", f"image without {label}", actual, expected)
 
 
 @CHECKS.add("project_forward")
@@ -289,7 +289,7 @@ def world_filter(device: Device, rng: np.random.Generator) -> Results:
         means = case.parameters["means"].astype(np.float64)
         interval = ref.sampling_interval(means, cameras, [view.camera.fx for view in views])
         actual = gaussians.get("filter_variance")[:, 0]
-        yield by_element("filter_variance", f"variances, {count} Gaussians", actual, 0.2 * interval**2, SUM)
+        yield compare_max("filter_variance", f"variances, {count} Gaussians", actual, 0.2 * interval**2, SUM)
 
 
 @CHECKS.add("paint_depth")
@@ -303,7 +303,7 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
         z = case.parameters["means"].astype(np.float64) @ pose[2, :3] + pose[2, 3]
         painted = frame.splats.get()[:, 6:9]
         expected = np.stack([z, np.ones(count), np.zeros(count)], axis=1)
-        yield by_element("paint_depth", f"depths, {count} Gaussians", painted, expected, DEPTH, floor=1)
+        yield compare_max("paint_depth", f"depths, {count} Gaussians", painted, expected, DEPTH, floor=1)
 
 
 # poses.cl: gradients of the pose and the focal length of a camera.
@@ -326,7 +326,7 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str)
     rotation = case.camera().rotation
     values = {"shift": rotation @ actual[:3], "turn": rotation @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
-        yield by_norm("pose_gradient", f"derivative by the {name}, {label}", value[None], exact[None], CONIC)
+        yield compare("pose_gradient", f"derivative by the {name}, {label}", value[None], exact[None], CONIC)
 
 
 @CHECKS.add("pose_gradient")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Results, by_element, by_norm, equal
+from clsplat.conformance.check import SUM, Checks, Results, compare, compare_max, match
 from clsplat.conformance.checks.images import outside, to_planes
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
@@ -65,16 +65,16 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
     expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
     actual = planes.get()
-    yield by_element("sky_forward", f"image, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
-    yield equal("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
+    yield compare_max("sky_forward", f"image, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
+    yield match("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
     grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
     shown = view.skies.runs(view.camera, side).shown.get()
     rows = all_texels.reshape(-1, 3)
-    yield by_norm("sky_backward", f"derivatives, {label}", grad_texels.get().T, rows[shown], SUM)
-    yield by_norm("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, rows[shown], SUM)
+    yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, rows[shown], SUM)
+    yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, rows[shown], SUM)
     hidden = np.delete(rows, shown, axis=0)
-    yield equal("sky_gather", f"texels outside the view, {label}", hidden, 0.0)
+    yield match("sky_gather", f"texels outside the view, {label}", hidden, 0.0)
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
@@ -92,10 +92,10 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
     loss, grad_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
         expected = view.left * grad_left
-        yield by_element(kernel, f"T dL/dT, {label}", view.inside(actual), expected, NEAR, floor=scale)
-    yield equal("sky_cover", f"T dL/dT outside the image, {label}", outside(view.camera, actual[None]), 0.0)
+        yield compare_max(kernel, f"T dL/dT, {label}", view.inside(actual), expected, NEAR, floor=scale)
+    yield match("sky_cover", f"T dL/dT outside the image, {label}", outside(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])
-    yield by_element("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
+    yield compare_max("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
 
 
 @CHECKS.add("sky_forward", "sky_backward", "sky_gather")
@@ -128,8 +128,8 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
         new, first, second = ref.adam_step(expected, total, first, second, updates, 0.01, epsilon=1.0)
         expected = np.where(free, new, expected)
     actual = view.sky.texels.get()
-    yield by_element("sky_update", "colors of texels", actual[:, shown], expected, 1e-6, floor=1.0)
+    yield compare_max("sky_update", "colors of texels", actual[:, shown], expected, 1e-6, floor=1.0)
     for name, moment in (("moment1", first), ("moment2", second)):
-        yield by_element("sky_update", f"{name} of texels", moments[name].get()[:, shown], moment, 1e-5, floor=0.1)
+        yield compare_max("sky_update", f"{name} of texels", moments[name].get()[:, shown], moment, 1e-5, floor=0.1)
     hidden = np.setdiff1d(np.arange(texels), shown)
-    yield equal("sky_update", "texels outside the view", actual[:, hidden], before[:, hidden])
+    yield match("sky_update", "texels outside the view", actual[:, hidden], before[:, hidden])

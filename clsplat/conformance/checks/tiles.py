@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import Checks, Deviation, Results, equal, wrong
+from clsplat.conformance.check import Checks, Deviation, Results, count_true, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
@@ -27,15 +27,15 @@ def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
     """Compare an exclusive prefix sum, which saturates at the largest number."""
     offsets = make_tiler(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
-    return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
+    return match("scan_offsets", f"sums of {len(values)} values", offsets, expected)
 
 
 def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
     """Compare a stable sort of keys below 2^bits."""
     sorted_keys, order = make_tiler(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
-    yield equal("radix_scatter", f"positions of {len(keys)} keys of {bits} bits", order.get(), expected)
-    yield equal("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
+    yield match("radix_scatter", f"positions of {len(keys)} keys of {bits} bits", order.get(), expected)
+    yield match("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
 
 
 def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
@@ -49,9 +49,9 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
         upload(pair_tile), upload(pair_splat), upload(depth_key), pairs, tiles
     )
     actual = offsets.get()
-    yield equal("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
+    yield match("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
     expected = np.lexsort((pair_splat, depth_key, pair_tile))
-    yield equal("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", ordered.get(), expected)
+    yield match("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", ordered.get(), expected)
 
 
 @CHECKS.add("scan_blocks", "scan_offsets")
@@ -96,25 +96,25 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     splats, offsets = lists.pair_splat.get()[: lists.pairs], lists.tile_offset.get()[: tiles + 1]
     ordered = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
     kernel = "find_tile_offsets" if sort == "radix" else "count_pairs"
-    yield wrong(kernel, f"offsets of tiles, {label}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
+    yield count_true(kernel, f"offsets of tiles, {label}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
     tile = np.repeat(np.arange(tiles), np.maximum(np.diff(offsets.astype(np.int64)), 0))[: lists.pairs]
     if len(tile) < lists.pairs:
-        yield wrong(kernel, f"pairs outside all tiles, {label}", np.ones(lists.pairs - len(tile)))
+        yield count_true(kernel, f"pairs outside all tiles, {label}", np.ones(lists.pairs - len(tile)))
         return
     sorted_order = np.lexsort((ordered, keys[ordered], tile))
     kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
-    yield equal(kernel, f"order in tiles, {label}", sorted_order, np.arange(lists.pairs))
+    yield match(kernel, f"order in tiles, {label}", sorted_order, np.arange(lists.pairs))
     listed = np.zeros((tiles, count), int)
     np.add.at(listed, (tile, ordered), 1)
-    yield wrong("emit_pairs", f"pairs listed twice, {label}", listed > 1)
+    yield count_true("emit_pairs", f"pairs listed twice, {label}", listed > 1)
     strongest, bounded = _strongest(frame, case)
-    yield wrong("emit_pairs", f"missing pairs, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
-    yield wrong("emit_pairs", f"superfluous pairs, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
+    yield count_true("emit_pairs", f"missing pairs, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
+    yield count_true("emit_pairs", f"superfluous pairs, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
     pairs = np.bincount(splats, minlength=count)
     tile_count = lists.tile_count.get()[:count]
-    yield equal("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, tile_count)
+    yield match("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, tile_count)
     first = lists.first_pair.get()[:count][tile_count > 0]
-    yield equal("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(tile_count))
+    yield match("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(tile_count))
 
 
 def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -200,9 +200,9 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
         tile, splat = (array.get() for array in arrays)
         label = f"large Gaussians counted with {surplus:+d} tiles"
         owner = np.repeat(np.arange(number), count)
-        yield equal("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
-        yield wrong("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
-        yield equal("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED)
+        yield match("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
+        yield count_true("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
+        yield match("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
         yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, twice), 0, counts=True)

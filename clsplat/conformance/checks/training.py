@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Results, by_element, by_norm, equal
+from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Results, compare, compare_max, match
 from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
 from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, project_records
@@ -56,12 +56,12 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
         max_change, label = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
         actual = model.gaussians.get(name)
         # values are rounded to float32, and their changes to 2e-5 of the largest change
-        yield by_element("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * max_change / 3e-7)
+        yield compare_max("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * max_change / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
         for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
             largest = float(np.abs(expected).max())
             actual = model.gaussians.get(moment)
-            yield by_element("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * largest)
+            yield compare_max("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * largest)
 
 
 def _random_pixel_sums(
@@ -83,15 +83,15 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
     frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
     grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
     expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
-    yield by_norm(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
+    yield compare(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
     for name in PARAMETERS:
         moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
-        yield by_norm(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
-        yield by_norm(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
+        yield compare(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
+        yield compare(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
         step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
         before = case.parameters[name].astype(np.float64)
         floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
-        yield by_element(kernel, f"{name}, {label}", gaussians.get(name), before - step, 3e-7, floor)
+        yield compare_max(kernel, f"{name}, {label}", gaussians.get(name), before - step, 3e-7, floor)
 
 
 def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
@@ -124,8 +124,8 @@ def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label:
             adam.update(model, frame, pixel_sums, rates, rows="seen")
         for table, truth in expected.items():
             actual = gaussians.get(table)
-            yield equal(kernel, f"{table} of rows not seen, {label}", actual[~seen], truth[~seen])
-            yield by_element(kernel, f"{table} of rows seen, {label}", actual[seen], truth[seen], 3 * SUM, floor=0.1)
+            yield match(kernel, f"{table} of rows not seen, {label}", actual[~seen], truth[~seen])
+            yield compare_max(kernel, f"{table} of rows seen, {label}", actual[seen], truth[seen], 3 * SUM, floor=0.1)
 
 
 def put_every_fifth_behind(case: Case) -> Case:
@@ -176,10 +176,10 @@ def check_penalty(
     actual = penalty.add(inputs).value()
     value, gradient = oracle(case.parameters[parameter].astype(np.float64))
     kernel, label = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
-    yield by_element(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), SUM, floor=1e-7)
+    yield compare_max(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), SUM, floor=1e-7)
     added = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
     floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
-    yield by_element(kernel, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)
+    yield compare_max(kernel, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)
 
 
 @CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity", "opacity_pressure")
@@ -213,7 +213,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     for count in (0, 1, 15, 17, 1025):
         array = device.upload(np.full(count, 3, np.float32))
         array.fill(-1.5)
-        yield equal("fill_words", f"{count} values", array.get(), -1.5)
+        yield match("fill_words", f"{count} values", array.get(), -1.5)
     gaussians = random_case(rng, 65).model(device).gaussians
     before, rows, values = _tables(gaussians), rng.permutation(65)[:17], rng.normal(size=(17, 45))
     gaussians.set_rows("sh_rest", rows, values)
@@ -221,7 +221,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     gaussians.zero_rows(["quats"], rows)
     before["quats"][:, rows] = 0
     for name, kernel in (("sh_rest", "set_rows"), ("quats", "zero_rows"), ("means", "set_rows")):
-        yield equal(kernel, f"17 rows of {name}", gaussians[name].get(), before[name])
+        yield match(kernel, f"17 rows of {name}", gaussians[name].get(), before[name])
     source, fresh = rng.integers(0, 65, 150).astype(np.uint32), rng.integers(0, 2, 150).astype(np.uint32)
     gaussians.add("fresh", 2, zero_fresh=True)
     gaussians.set("fresh", rng.normal(size=(65, 2)))
@@ -229,7 +229,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     gaussians.rearrange(device.upload(source), device.upload(fresh), 150)
     for name, table in old.items():
         expected = table[source] * (1 if name != "fresh" else 1 - fresh[:, None])
-        yield equal("gather_rows", f"150 rows of {name}", gaussians.get(name), expected)
+        yield match("gather_rows", f"150 rows of {name}", gaussians.get(name), expected)
     for value in (np.nan, np.inf, -np.inf):
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
@@ -291,13 +291,13 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     actual = train(device, case.model(device), seen, gradients, "deferred")
     at_once = train(device, case.model(device), seen, gradients, "all")
     max_change = max(float(np.abs(values - before).max(initial=0)), 1e-6)
-    yield by_element("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
+    yield compare_max("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
     for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
-        yield by_element("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
+        yield compare_max("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
     for name in Deferred.names:
         bits, expected_bits = actual[name].view(np.uint32), at_once[name].view(np.uint32)
-        yield equal("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
+        yield match("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
 
 
 @CHECKS.add("replay_updates", "note_update", "adam_step")
@@ -333,7 +333,7 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
         expected = values.mean(axis=0)
         expected[-1] = values[1 if count > 1 else 0 :, -1].mean(axis=0)
         actual = gaussians.get(name)
-        yield by_element("take_average", f"average of {name}, {count} Gaussians", actual, expected, SUM, floor=1)
+        yield compare_max("take_average", f"average of {name}, {count} Gaussians", actual, expected, SUM, floor=1)
 
 
 # dropout.cl, and the projection of the Gaussians that it keeps.
@@ -356,7 +356,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Result
     actual = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
     expected, _, _ = project_records(device, case)
     expected[left_out[1]] = 0
-    yield equal("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)
+    yield match("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)
 
 
 @CHECKS.add("draw_left_out", "project_forward", "project_backward")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
 from clsplat.conformance.bench.cases import case as bench_case
-from clsplat.conformance.check import Checks, Deviation, Note, Results, by_element, equal
+from clsplat.conformance.check import Checks, Deviation, Note, Results, compare_max, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.core.errors import MemoryLimitError
 from clsplat.core.machine import available_memory
@@ -77,14 +77,14 @@ def training(device: Device, rng: np.random.Generator) -> Results:
     again, again_tables = train(device, case, start, len(values))
     count, label = len(tables["means"]), f"{len(values)} steps"
     yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
-    yield equal("training", f"losses of {label}, a second time", np.array(again), np.array(values[: len(again)]))
+    yield match("training", f"losses of {label}, a second time", np.array(again), np.array(values[: len(again)]))
     for name, table in tables.items():
         if table.shape != again_tables[name].shape:
             difference, where = abs(len(again_tables[name]) - count), f"rows of {name} after {label}, a second time"
             yield Deviation("training", where, difference, 0, counts=True)
         else:
             bits = again_tables[name].view(np.uint32), table.view(np.uint32)
-            yield equal("training", f"{name} after {label}, a second time", *bits)
+            yield match("training", f"{name} after {label}, a second time", *bits)
     finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
     yield Deviation("training", f"values that are not finite after {label}", finite, 0, counts=True)
     if len(values) == STEPS:
@@ -125,7 +125,7 @@ def _check_buffer(device: Device, size: int) -> Results:
     indices = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
     actual = np.array([buffer.get_item(i) for i in indices])
     expected = np.where(np.arange(len(actual)) == 0, 2.5, 1.5)
-    yield equal("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", actual, expected)
+    yield match("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", actual, expected)
 
 
 @SPEED.add("peak_fma", "peak_exp", "peak_copy")
@@ -138,16 +138,16 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Results:
     for _ in range(5):
         chains = chains * 0.5 + 0.25
     expected = np.repeat(chains.sum(axis=1), lanes)
-    yield by_element("peak_fma", "chains of multiply-adds", result.get(), expected, 1e-6)
+    yield compare_max("peak_fma", "chains of multiply-adds", result.get(), expected, 1e-6)
     program.peak_exp(items=item_count, result=result, step=1e-3, rounds=4)
     x = -0.01 * (np.arange(item_count) % 8)
     sums = sum(np.exp(x - 1e-3 * k) + np.exp(x - 0.5 - 1e-3 * k) for k in range(4))
-    yield by_element("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
+    yield compare_max("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
     items = 2 * program.peak_copy.group[0]
     values = rng.normal(size=items * max(lanes, 4)).astype(np.float32)
     copied = device.zeros(len(values))
     program.peak_copy(items=items, values=device.upload(values), copied=copied)
-    yield equal("peak_copy", "copied values", copied.get(), values)
+    yield match("peak_copy", "copied values", copied.get(), values)
 
 
 @SPEED.add()

@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.settings import Settings, variants
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.losses.base import Comparison, Loss, LossValue
-from clsplat.metrics.views import Fitted
+from clsplat.metrics.views import ColorFit
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import Photograph
 from clsplat.photos.transforms import PhotographTransform, Planes
@@ -74,7 +74,7 @@ class TrainingStep:
         """Save a value for later hooks of the same module in this step."""
         self._saved[id(state)] = value
 
-    def saved(self, state: "ModuleState") -> Any:
+    def saved_value(self, state: "ModuleState") -> Any:
         """Return the value that an earlier hook of the module saved in this step, or None."""
         return self._saved.get(id(state))
 
@@ -128,7 +128,7 @@ class ModuleState:
         """Act after the last step, before the best model replaces the last one."""
 
     @property
-    def color_model(self) -> Fitted | None:
+    def color_model(self) -> ColorFit | None:
         """The color model that metrics fit to each photograph; None to measure renders as they are."""
         return None
 
@@ -200,7 +200,7 @@ class TrainingModule(Settings):
                 raise DataError(f"{name} of its {cls.__name__} has values that are not finite float32 numbers")
 
     @classmethod
-    def read_color_model(cls, model: Path) -> Fitted | None:
+    def read_color_model(cls, model: Path) -> ColorFit | None:
         """Read the color model of a training from the side files next to its model.  Raises DataError."""
         return None
 
@@ -302,12 +302,12 @@ def module_class(name: str) -> type[TrainingModule]:
     return kind
 
 
-def color_model(run: Run) -> Fitted | None:
+def color_model(run: Run) -> ColorFit | None:
     """Return the color model that metrics fit to each photograph; None to measure renders as they are."""
     return next((model for state in run.modules.values() if (model := state.color_model)), None)
 
 
-def read_color_model(model: Path) -> Fitted | None:
+def read_color_model(model: Path) -> ColorFit | None:
     """Read the color model of a training from the side files next to its model.  Raises DataError."""
     models = (kind.read_color_model(model) for kind in variants(TrainingModule).values())
     return next((model for model in models if model), None)

@@ -143,14 +143,14 @@ class GridState(ColorState):
         step.save(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if (saved := step.saved(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view is not None:
             step.gradient, grad_grid = self.differentiate(
                 step.workspace, step.camera, saved[0], step.gradient, step.view
             )
             saved[1].append(grad_grid)
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view is not None:
             self.learn(step.workspace, step.view, saved[1][0], step.number)
 
     def report(self) -> ColorReport:

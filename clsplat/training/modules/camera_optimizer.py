@@ -209,7 +209,7 @@ class CameraState(ModuleState):
             step.save(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
 
     def update(self, step: TrainingStep) -> None:
-        if not (download := step.saved(self)) or step.view is None:
+        if not (download := step.saved_value(self)) or step.view is None:
             return
         sums, name, (rotations, translations) = download(), self.views[step.view].name, self.pose_tables
         change, (rotation, translation, focal) = self.pose_change(name), [at_step(r, step.number) for r in self.rates]

@@ -116,7 +116,7 @@ class DistractorsState(ModuleState):
         step.save(self, (layer, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if not (saved := step.saved(self)):
+        if not (saved := step.saved_value(self)):
             return
         layer, sums = saved
         frame = replace(layer.frame, image=layer.image)  # the gradient of blending needs the combined colors
@@ -124,7 +124,7 @@ class DistractorsState(ModuleState):
         look_behind(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view is not None:
             frame, pixel_sums = saved[1]
             self.adams[self._rows[step.view]].update(frame.model, frame, pixel_sums, RATES)
 

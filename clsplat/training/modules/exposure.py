@@ -154,7 +154,7 @@ class ColorModel(Settings):
     """A color transform of a photograph: one matrix for all pixels, defined by a few parameters."""
 
     columns: ClassVar[tuple[str, ...]] = ()  # names of the parameters of a photograph
-    numbers_per_channel: ClassVar[int] = 1  # fitted by `fit_matrix`
+    parameters_per_channel: ClassVar[int] = 1  # fitted by `fit_matrix`
 
     type: str
     """Name of the model."""
@@ -215,7 +215,7 @@ class Affine(ColorModel):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
     columns: ClassVar[tuple[str, ...]] = tuple(f"{y}_{c}" for y in ("red", "green", "blue") for c in "rgb1")
-    numbers_per_channel: ClassVar[int] = 4
+    parameters_per_channel: ClassVar[int] = 4
 
     type: Literal["affine"] = "affine"
     weight: Annotated[float, Field(ge=0)] = 1e-2
@@ -333,13 +333,13 @@ class ExposureState(ColorState):
         step.module_losses.append(LossValue("colors", lambda: penalty))
 
     def backward(self, step: TrainingStep) -> None:
-        if saved := step.saved(self):
+        if saved := step.saved_value(self):
             image, matrix, downloads = saved
             step.gradient, download = color_gradients(step.workspace, step.camera, image, matrix, step.gradient)
             downloads.append(download)
 
     def update(self, step: TrainingStep) -> None:
-        if not (saved := step.saved(self)) or step.view is None:
+        if not (saved := step.saved_value(self)) or step.view is None:
             return
         self.learn(step.view, saved[2][0](), step.number)
 

@@ -100,4 +100,4 @@ class LearnedSky(ModuleState):
     def update(self, step: TrainingStep) -> None:
         """Update the texels that the view shows by Adam."""
         rate = at_step(self.settings.rate, step.number)
-        step.rasterizer.skies.update(self.sky, step.frame.camera, step.saved(self), self._arrays, rate)
+        step.rasterizer.skies.update(self.sky, step.frame.camera, step.saved_value(self), self._arrays, rate)

@@ -91,7 +91,7 @@ class TransientsState(ModuleState):
         step.save(self, counts)
 
     def update(self, step: TrainingStep) -> None:
-        self.settings.learn(self.scalars, step.saved(self)())
+        self.settings.learn(self.scalars, step.saved_value(self)())
 
 
 def measure_residuals(

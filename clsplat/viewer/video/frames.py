@@ -28,16 +28,16 @@ class Canvas:
 
     painter: Painter
 
-    def layers(self, view: View, depth: bool = False) -> Layers:
+    def render_layers(self, view: View, depth: bool = False) -> Layers:
         """Render a view.  Raises NumericError if the render is not finite."""
-        rendered = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
+        rendered = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), depth)
         for values in rendered.arrays:
             require_finite(values, view)
         return rendered
 
     def picture(self, view: View) -> Image:
         """Render a view to 8 bits, [height, width, 3]."""
-        return to_8_bits(self.layers(view).image)
+        return to_8_bits(self.render_layers(view).image)
 
     def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
         """Return near and far, scene units: quantiles of the depths in a sample of the views."""
@@ -45,7 +45,7 @@ class Canvas:
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
             small = replace(view, camera=view.camera.downscaled(max(1, longest / PROBE_SIDE)))
-            rendered = self.layers(small, depth=True)
+            rendered = self.render_layers(small, depth=True)
             assert rendered.depth is not None
             depths.append(rendered.depth[rendered.alpha > OPAQUE])
         all_depths = np.concatenate(depths)

@@ -199,7 +199,7 @@ def render_video(
             for layer, path in videos.items()
         }
         for view in progress(plan.views):
-            rendered = canvas.layers(view, "depth" in videos)
+            rendered = canvas.render_layers(view, "depth" in videos)
             for layer, write in writers.items():
                 picture = layer_image(rendered, layer, depths)
                 write(side_by_side(picture, side(view)) if side and layer == LAYERS[0] else picture)
