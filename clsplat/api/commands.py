@@ -6,6 +6,7 @@ argument, DataError for a dataset or a model, DeviceError for a device, OutputEr
 strongest working GPU, or else the first CPU.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -160,18 +161,14 @@ def evaluate(
     model, scene: as for `render_views`; downscales: divisors of the image size; metrics: some of psnr (dB), ssim,
     ms_ssim and flip; lpips: an ONNX file; lpips_input: the range of pixel values that it expects.
     """
-    from clsplat.runs import model_file
+    from clsplat.metrics.perceptual import Perceptual, metric_names
+    from clsplat.runs.model_file import ModelFile
 
     load_plugins()
-    return model_file.evaluate(
-        Path(model),
-        to_path(scene),
-        downscales=downscales,
-        metrics=metrics,
-        lpips=to_path(lpips),
-        lpips_input=lpips_input,
-        device=device,
-    )
+    if invalid := [value for value in downscales or () if not 1 <= value < math.inf]:
+        raise ConfigError(f"--downscales: expected downscale factors of at least 1, got {invalid[0]:g}")
+    perceptual = Perceptual.open(metric_names(metrics), to_path(lpips), lpips_input)
+    return ModelFile(Path(model), to_path(scene), device).evaluate(downscales, perceptual)
 
 
 def _job(

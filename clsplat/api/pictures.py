@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from clsplat.api.arguments import PathLike, layer_names, load_plugins, to_path
+from clsplat.core.errors import ConfigError
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     import numpy as np
@@ -37,20 +38,14 @@ def render_views(
     also write NAME_depth and NAME_alpha, as arrays [height, width] in scene units and in [0, 1]; time: for a moving
     model, in [0, 1], instead of the times of the views.
     """
-    from clsplat.runs import model_file
+    from clsplat.runs.model_file import KINDS, SPLITS, ModelFile
 
     load_plugins()
-    return model_file.render(
-        Path(model),
-        to_path(scene),
-        Path(out),
-        split=split,
-        downscale=downscale,
-        kind=kind,
-        layers=layer_names(depth, alpha),
-        time=time,
-        device=device,
-    )
+    for option, value, choices in (("split", split, SPLITS), ("kind", kind, KINDS)):
+        if value not in choices:
+            raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
+    opened = ModelFile(Path(model), to_path(scene), device, downscale)
+    return opened.render(split, Path(out), kind, layer_names(depth, alpha), time)
 
 
 def render_path(

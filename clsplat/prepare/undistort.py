@@ -11,7 +11,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.manifest import Manifest, hash_values
 from clsplat.core.progress import Count
 from clsplat.scene.camera import intern_lens
-from clsplat.scene.colmap_writer import write_model
+from clsplat.scene.colmap_writer import write_colmap
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_exposures, write_image
 from clsplat.scene.times_file import write_times
@@ -43,14 +43,12 @@ def undistort_scene(
             if unmasked is not None and not unmasked.all():
                 write_image(mask, np.repeat(np.where(unmasked, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
-        views.append(replace(pinhole_view, name=name, lens=None))
+        views.append(replace(pinhole_view, lens=None))
         count.reach(number)
     write_exposures(out / "images", dict(zip(names, load_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
-    tracks = scene.tracks and scene.tracks.renamed({v.name: name for v, name in zip(scene.views, names, strict=True)})
-    world_scene = replace(scene, views=tuple(views), tracks=tracks).in_world()
-    write_model(out / "sparse" / "0", world_scene.views, world_scene.points, world_scene.tracks)
+    write_colmap(out, replace(scene, views=tuple(views)).renamed(names).in_world())
     return len(views)
 
 

@@ -3,7 +3,6 @@
 import io
 import json
 import logging
-import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +22,7 @@ from clsplat.core.progress import counted
 from clsplat.core.reading import read_json
 from clsplat.formats.table import model_file
 from clsplat.gaussians.model import MODEL, Model, load, model_path, run_model
-from clsplat.metrics.perceptual import InputRange, Perceptual, metric_names
+from clsplat.metrics.perceptual import Perceptual
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
 from clsplat.nerf.files import FieldModel, field_of_run, is_field, load_field
 from clsplat.opencl.device import Device
@@ -392,42 +391,6 @@ class ModelFile:
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, **size_of(self.loaded), "device": self.device.text}
-
-
-def render(
-    model: Path,
-    scene: Path | None = None,
-    out: Path = Path("renders"),
-    *,
-    split: str = "test",
-    downscale: float | None = None,
-    kind: str = "png",
-    layers: Sequence[str] = LAYERS[:1],
-    time: float | None = None,
-    device: str | Device | None = None,
-) -> int:
-    """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
-    for option, value, choices in (("split", split, SPLITS), ("kind", kind, KINDS)):
-        if value not in choices:
-            raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
-    return ModelFile(model, scene, device, downscale).render(split, out, kind, layers, time)
-
-
-def evaluate(
-    model: Path,
-    scene: Path | None = None,
-    *,
-    downscales: Sequence[float] | None = None,
-    metrics: Sequence[str] = ("psnr", "ssim"),
-    lpips: Path | None = None,
-    lpips_input: InputRange = "-1..1",
-    device: str | Device | None = None,
-) -> dict[str, Any]:
-    """Measure a model file or run folder on a scene's views, with the keys of metrics.json.  Raises ClsplatError."""
-    if invalid := [value for value in downscales or () if not 1 <= value < math.inf]:
-        raise ConfigError(f"--downscales: expected downscale factors of at least 1, got {invalid[0]:g}")
-    perceptual = Perceptual.open(metric_names(list(metrics)), lpips, lpips_input)
-    return ModelFile(model, scene, device).evaluate(downscales, perceptual)
 
 
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:

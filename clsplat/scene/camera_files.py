@@ -3,7 +3,7 @@
 import json
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,17 +17,20 @@ from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
 from clsplat.scene.colmap_writer import FILES, MODEL, write_colmap
 from clsplat.scene.images import EXPOSURES_FILE, is_image, write_exposures
 from clsplat.scene.points import write_points_ply
-from clsplat.scene.scene import PointCloud, Scene, Tracks
+from clsplat.scene.scene import Scene
 from clsplat.scene.transforms_json import POINTS, TRANSFORMS_FILE, JsonFrame, opengl_matrix
-from clsplat.scene.view import NO_FILE, Floats, PosedView, View, load_exposures
+from clsplat.scene.view import NO_FILE, Floats, View, load_exposures, photo_lens
 
-# The views of a scene with the unique names of their images below one folder.
+# The views of a scene, named like their images below one folder.
 
 IMAGES = "images"  # the folder of the photographs, as in COLMAP and nerfstudio
 
 
-def posed_views(scene: Scene) -> list[PosedView]:
-    """Return the views in order.  Raises DataError for duplicate names and for names that are not one line of text."""
+def with_image_names(scene: Scene) -> Scene:
+    """Return the scene with views named like their images.
+
+    Raises DataError for duplicate names and for names that are not one line of text.
+    """
     names = []
     for view in scene.views:  # with the suffix of the file, which some formats leave out
         has_suffix = is_image(PurePosixPath(view.name)) or view.image_path == NO_FILE
@@ -41,21 +44,20 @@ def posed_views(scene: Scene) -> list[PosedView]:
         if name in seen:
             raise DataError(f"{scene.path}: two images would be called {quote(name)}; rename one")
         seen.add(name)
-    test = set(scene.test)
-    return [PosedView(name, view, i in test) for i, (name, view) in enumerate(zip(names, scene.views, strict=True))]
+    return scene.renamed(names)
 
 
-def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
+def image_files(views: Sequence[View], folder: Path) -> dict[Path, Path]:
     """Return the photograph of each view, by its path below `folder`.  Raises DataError without a photograph."""
-    for posed in views:
-        if posed.view.image_path == NO_FILE:
-            raise DataError(f"the view {quote(posed.name)} has no photograph to copy; write only the cameras")
-        if posed.view.lens is not None and posed.view.lens.is_wide:
+    for view in views:
+        if view.image_path == NO_FILE:
+            raise DataError(f"the view {quote(view.name)} has no photograph to copy; write only the cameras")
+        if view.lens is not None and view.lens.is_wide:
             raise DataError(
-                f"the view {quote(posed.name)} is part of a wide photograph; run `clsplat data undistort` first, "
+                f"the view {quote(view.name)} is part of a wide photograph; run `clsplat data undistort` first, "
                 "or write only the cameras"
             )
-    return {folder / posed.name: posed.view.image_path for posed in views}
+    return {folder / view.name: view.image_path for view in views}
 
 
 LOG = logging.getLogger("clsplat")
@@ -68,13 +70,13 @@ MAX_VIEWS = 100_000
 TOLERANCE = 0.5  # px: a smaller difference is only a convention about pixel centers
 
 
-def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_inria(out: Path, scene: Scene) -> list[Path]:
     """Write out/cameras.json, which does not hold points and tracks, and return its path.  Raises OutputError.
 
     Warns if the principal point is not in the center of the image, where other programs assume it.
     """
-    write_text(out / INRIA_FILE, json.dumps([_camera(posed, i) for i, posed in enumerate(views)], indent=1) + "\n")
-    cameras = [posed.view.camera for posed in views]
+    write_text(out / INRIA_FILE, json.dumps([_camera(view, i) for i, view in enumerate(scene.views)], indent=1) + "\n")
+    cameras = [view.camera for view in scene.views]
     offset = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if offset > TOLERANCE:
         LOG.warning(
@@ -84,14 +86,14 @@ def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tr
     return [out / INRIA_FILE]
 
 
-def _camera(posed: PosedView, number: int) -> dict[str, Any]:
-    camera, pose = posed.view.camera, posed.view.world_to_camera
+def _camera(view: View, number: int) -> dict[str, Any]:
+    camera, pose = view.camera, view.world_to_camera
     return {
         "id": number,
-        "img_name": posed.name,
+        "img_name": view.name,
         "width": camera.width,
         "height": camera.height,
-        "position": posed.view.position.tolist(),
+        "position": view.position.tolist(),
         "rotation": pose[:, :3].T.tolist(),
         "fy": camera.fy,
         "fx": camera.fx,
@@ -152,38 +154,40 @@ DISTORTION = {  # by COLMAP's model: nerfstudio's model, and the names of the di
 REMEDY = "write colmap, or run `clsplat data undistort` first"
 
 
-def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
     """Write out/transforms.json, and the points, if any, without tracks; return the files.
 
     The test views are listed as validation views, too, because nerfstudio evaluates those.  Raises OutputError.
     """
-    lenses = [_lens(posed) for posed in views]
+    lenses = [_lens(view) for view in scene.views]
     model, common = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
-    matrices = [opengl_matrix(posed.view.world_to_camera).tolist() for posed in views]
+    matrices = [opengl_matrix(view.world_to_camera).tolist() for view in scene.views]
     frames = [
         {
-            "file_path": f"{IMAGES}/{posed.name}",
+            "file_path": f"{IMAGES}/{view.name}",
             **({} if common else {key: value for key, value in lens.items() if key != "camera_model"}),
-            **({} if posed.view.time is None else {"time": posed.view.time}),
+            **({} if view.time is None else {"time": view.time}),
             "transform_matrix": matrix,
         }
-        for posed, lens, matrix in zip(views, lenses, matrices, strict=True)
+        for view, lens, matrix in zip(scene.views, lenses, matrices, strict=True)
     ]
     table: dict[str, Any] = {"camera_model": model, **common, "frames": frames}
-    if any(posed.test for posed in views):
-        train, test = ([f"{IMAGES}/{posed.name}" for posed in views if posed.test is test] for test in (False, True))
+    if scene.test:
+        names = [f"{IMAGES}/{view.name}" for view in scene.views]
+        train = [name for i, name in enumerate(names) if i not in scene.test]
+        test = [name for i, name in enumerate(names) if i in scene.test]
         table |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
     files = [out / TRANSFORMS_FILE]
-    if points is not None:
+    if scene.points is not None:
         table["ply_file_path"] = POINTS
-        write_points_ply(out / POINTS, points)
+        write_points_ply(out / POINTS, scene.points)
         files.append(out / POINTS)
     write_text(out / TRANSFORMS_FILE, json.dumps(table, indent=1) + "\n")
     return files
 
 
-def _lens(posed: PosedView) -> dict[str, Any]:
-    lens = posed.lens
+def _lens(view: View) -> dict[str, Any]:
+    lens = photo_lens(view)
     model, names = DISTORTION[lens.model]
     camera, distortion = lens.camera, lens.params[len(lens.params) - len(names) :]
     return {
@@ -200,7 +204,7 @@ def _lens(posed: PosedView) -> dict[str, Any]:
 
 # The formats by name.
 
-WRITERS: dict[str, Callable[[Path, list[PosedView], PointCloud | None, Tracks | None], list[Path]]] = {
+WRITERS: dict[str, Callable[[Path, Scene], list[Path]]] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
     "inria": write_inria,
@@ -216,19 +220,19 @@ SPLIT = "nerfstudio"  # the format that stores the split and times
 TRACKS = "colmap"  # the format that stores which points the photographs show
 
 
-def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
-    """Return the views with the names of their images.  Raises DataError for views that the format cannot hold."""
-    views, models = posed_views(scene), dict[str, str]()
-    for posed in views if format_ == "nerfstudio" else ():
-        if posed.lens.model not in DISTORTION:
-            raise DataError(f"{posed.name}: nerfstudio has no camera model {posed.lens.model}; {REMEDY}")
-        models[DISTORTION[posed.lens.model][0]] = posed.name
+def check_cameras(scene: Scene, format_: str) -> Scene:
+    """Return the scene with views named like their images.  Raises DataError for one that the format cannot hold."""
+    named, models = with_image_names(scene), dict[str, str]()
+    for view in named.views if format_ == "nerfstudio" else ():
+        if (model := photo_lens(view).model) not in DISTORTION:
+            raise DataError(f"{view.name}: nerfstudio has no camera model {model}; {REMEDY}")
+        models[DISTORTION[model][0]] = view.name
     if len(models) > 1:
         model, name = models.popitem()
         raise DataError(
             f"{name}: is {model}, other views are {next(iter(models))}; nerfstudio allows one model per file; {REMEDY}"
         )
-    return views
+    return named
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
@@ -241,22 +245,22 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if value not in choices:
             raise ConfigError(f"{name}: expected one of {', '.join(choices)}, got {quote(value)}")
     scene = scene.in_world()
-    views = check_cameras(scene, format_)
-    if images == "copy" and format_ in UNDISTORTED and any(posed.view.lens is not None for posed in views):
+    named = check_cameras(scene, format_)
+    if images == "copy" and format_ in UNDISTORTED and any(view.lens is not None for view in scene.views):
         raise DataError(
             f"{scene.path}: {format_} has no lens distortion, and these photographs are distorted; "
             "run `clsplat data undistort` first, or write only the cameras"
         )
-    copies = image_files(views, out / IMAGES) if images == "copy" else {}
+    copies = image_files(named.views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if over else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
-    files = WRITERS[format_](out, views, scene.points, scene.tracks)
+    files = WRITERS[format_](out, named)
     if format_ != SPLIT and scene.test:
-        test_views = f"{len(scene.test)} of {len(views)}"
+        test_views = f"{len(scene.test)} of {len(scene.views)}"
         LOG.warning("%s: %s does not store which views are for testing, %s; %s does", out, format_, test_views, SPLIT)
-    if format_ != SPLIT and any(posed.view.time is not None for posed in views):
+    if format_ != SPLIT and any(view.time is not None for view in scene.views):
         LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT)
     if format_ != TRACKS and copies and scene.tracks is not None:
         LOG.warning("%s: %s does not store which points the photographs show; %s does", out, format_, TRACKS)
@@ -264,6 +268,6 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         with open_file(source, "an image") as old, open_atomic(path) as new:
             shutil.copyfileobj(old, new)
     if copies:
-        exposures = load_exposures([posed.view for posed in views])
-        write_exposures(out / IMAGES, dict(zip((posed.name for posed in views), exposures, strict=True)))
+        exposures = load_exposures(scene.views)  # found by the names in the dataset
+        write_exposures(out / IMAGES, dict(zip((view.name for view in named.views), exposures, strict=True)))
     return files

@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,17 @@ from clsplat.core.quaternions import unit_quaternions
 from clsplat.scene.camera import Lens
 from clsplat.scene.colmap import MODELS, POINT2D
 from clsplat.scene.reprojection import project_points
-from clsplat.scene.scene import PointCloud, Tracks
-from clsplat.scene.view import PosedView, View, photo_lens
+from clsplat.scene.scene import PointCloud, Scene, Tracks
+from clsplat.scene.view import View, photo_lens
 
 MODEL = Path("sparse/0")  # the folder of the model, next to that of the images
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 NO_RESIDUAL = np.zeros((1, 2))
 
 
-def write_colmap(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_colmap(out: Path, scene: Scene) -> list[Path]:
     """Write the model to out/sparse/0; return its files.  Raises OutputError."""
-    renamed = tracks and tracks.renamed({posed.view.name: posed.name for posed in views})
-    write_model(out / MODEL, [replace(posed.view, name=posed.name) for posed in views], points, renamed)
+    write_model(out / MODEL, scene.views, scene.points, scene.tracks)
     return [out / MODEL / name for name in FILES]
 
 

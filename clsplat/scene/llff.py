@@ -1,5 +1,6 @@
 """Read LLFF datasets: `poses_bounds.npy` next to a folder of photographs (Mildenhall et al. 2019)."""
 
+import io
 import logging
 import re
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, one_line
+from clsplat.core.reading import read_file
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
 from clsplat.scene.images import is_image, read_header
 from clsplat.scene.points import MAX_VALUE
@@ -52,11 +54,9 @@ def read_poses(path: Path) -> NDArray[np.float64]:
 
     Raises DataError for a damaged file and for numbers that are not finite.
     """
+    data = read_file(path, "a NumPy file", limit=MAX_BYTES)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES} bytes")
-        with path.open("rb") as file:
-            rows = np.lib.format.read_array(file, allow_pickle=False)
+        rows = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
         if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
             raise ValueError(f"it has shape {rows.shape}, {rows.dtype}")
         if not (np.abs(rows) < MAX_VALUE).all():

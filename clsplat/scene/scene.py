@@ -144,6 +144,12 @@ class Scene:
         """Return the scene with the validation views moved to the training views."""
         return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
+    def renamed(self, names: Sequence[str]) -> "Scene":
+        """Return the scene with other names of its views."""
+        views = tuple(replace(view, name=name) for view, name in zip(self.views, names, strict=True))
+        new_names = {view.name: name for view, name in zip(self.views, names, strict=True)}
+        return replace(self, views=views, tracks=self.tracks and self.tracks.renamed(new_names))
+
     def with_alpha(self, alpha: Alpha) -> "Scene":
         """Return the scene with the fourth channel of its photographs used as transparency or as mask."""
         return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))

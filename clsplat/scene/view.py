@@ -431,17 +431,3 @@ def _below(view: View) -> Iterator[tuple[Path, str]]:
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:
             yield folder, "/".join(parts[-number:])
-
-
-@dataclass(frozen=True)
-class PosedView:
-    """A view, the name of its image below the image folder, and whether it is a test view."""
-
-    name: str
-    view: View
-    test: bool
-
-    @property
-    def lens(self) -> Lens:
-        """The lens of the photograph on disk."""
-        return photo_lens(self.view)

@@ -6,7 +6,6 @@ another processor.  Devices of one class can continue each other's cells.
 
 import json
 import logging
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -16,16 +15,16 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core import machine
+from clsplat.core.child import run_module
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, pluralize
 from clsplat.core.files import write_text
 from clsplat.core.machine import Owner, cache_folder
 from clsplat.core.manifest import hash_values
-from clsplat.core.reading import read_file, read_json, sha256
+from clsplat.core.reading import read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.opencl.runtimes import no_device_error
 from clsplat.pipeline.files import shipped
 from clsplat.sweeps.cell import code_digest
-from clsplat.sweeps.child import fill_command, run_command
 
 LOG = logging.getLogger("clsplat")
 Parts = list[tuple[int, ...]]  # the cores of each run; (): all cores, not pinned
@@ -126,31 +125,19 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
 def _hash_fixed_run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
-        folder = Path(name)
-        scene = str(folder / "scene")
-        _run_command(
-            device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder
-        )
-        words = fill_command(run_command(device), shipped()[PIPELINE], folder / "run")
-        _run_command(
-            device, [*words, "--scene", scene, *(word for setting in SETTINGS for word in ("--set", setting))], folder
-        )
-        return sha256(folder / "run" / "point_cloud.ply")[:CLASS_DIGITS]
+        scene, out = Path(name, "scene"), Path(name, "run")
+        settings = [word for setting in SETTINGS for word in ("--set", setting)]
+        _run_command(device, "data", "synthetic", str(scene), *SCENE_OPTIONS)
+        words = ("run", str(shipped()[PIPELINE]), "--scene", str(scene), "--out", str(out), "--device", device)
+        _run_command(device, *words, *settings)
+        return sha256(out / "point_cloud.ply")[:CLASS_DIGITS]
 
 
-def _run_command(device: str, command: list[str], folder: Path) -> None:
-    """Run a command of the test, with its standard input open.  Raises DeviceError if it fails."""
-    with (folder / "errors.txt").open("wb") as errors:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
-        try:
-            process.wait(RUN_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            raise DeviceError(f"{device}: the test run did not end within {RUN_TIMEOUT_S:.0f} s") from None
-        finally:
-            process.kill()
-            process.wait()
-            assert process.stdin
-            process.stdin.close()
-    if process.returncode:
-        lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
-        raise DeviceError(f"{device}: the test run failed: {lines[-1] if lines else process.returncode}")
+def _run_command(device: str, *words: str) -> None:
+    """Run a command of the test.  Raises DeviceError if it fails."""
+    result = run_module("clsplat", *words, seconds=RUN_TIMEOUT_S)
+    if result.code is None:
+        raise DeviceError(f"{device}: the test run did not end within {RUN_TIMEOUT_S:.0f} s")
+    if result.code:
+        lines = result.output.strip().splitlines()
+        raise DeviceError(f"{device}: the test run failed: {lines[-1] if lines else result.code}")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from clsplat.scene import camera_files
-from clsplat.scene.camera_files import posed_views
 from clsplat.scene.scene import make_scene
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import MAX_FRAMES, SIDES
@@ -23,7 +22,7 @@ WORDS = ['"camera_path"', '"camera_to_world"', '"fov"', '"fisheye"', "179.9", '"
 @pytest.fixture(scope="module")
 def seeds(folder):
     write_camera_path(folder / "a.json", VIEWS, 24)
-    camera_files.write_inria(folder, posed_views(make_scene(folder, VIEWS, set(), None)), None, None)
+    camera_files.write_inria(folder, make_scene(folder, VIEWS, set(), None))
     moved = json.loads((folder / "a.json").read_text())
     del moved["seconds"]
     return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]

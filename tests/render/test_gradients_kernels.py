@@ -10,6 +10,7 @@ from clsplat.conformance.scenes import SHARP, Case, add_world_filter, random_cas
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
 from tests.support.devices import on_devices, on_one_setting
+from tests.support.oracle import render_backward
 
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 
@@ -31,7 +32,7 @@ def gradients_of(
 
 def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = SHARP) -> dict:
     splats = case.project(thresholds)
-    by_parameter, by_splat = ref.render_backward(
+    by_parameter, by_splat = render_backward(
         case.gaussians(),
         case.camera(),
         BACKGROUND,

@@ -17,6 +17,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.deviations import assert_schedules_agree
 from tests.support.devices import each_once, on_devices, on_one_setting
+from tests.support.oracle import render_backward
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
 PIECES = 6
@@ -117,7 +118,7 @@ def test_reference_gradients_match_finite_differences(rng):
 
     gaussians = case.gaussians()
     splats = rendered(gaussians).splats
-    found, _ = ref.render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH)
+    found, _ = render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH)
     for name in ("means", "quats", "log_scales", "logit_opacity"):
         table = getattr(gaussians, name)
         truth = np.zeros_like(table)

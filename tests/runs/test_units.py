@@ -10,13 +10,13 @@ from pydantic import ValidationError
 
 from clsplat import FieldModel, FieldRenderer, load_field
 from clsplat import run as run_pipeline
+from clsplat.api.commands import evaluate
 from clsplat.core.errors import DataError
 from clsplat.formats.splats import SplatFile, Writing
 from clsplat.formats.table import write
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.nerf.shape import FieldShape
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
 from clsplat.scene.quality import near_plane
 from clsplat.scene.scene import PointCloud, Scene, camera_extent

@@ -132,7 +132,7 @@ def test_least_important_bands_become_zero(tiny_scene, pipeline, tmp_path):
 
 def test_measured_file_is_read_back(finished, tiny_scene):
     """Metrics are those of the quantized file, not those of the model that it was made from."""
-    from clsplat.runs.model_file import evaluate
+    from clsplat.api.commands import evaluate
 
     found = json.loads((finished.out / "metrics.json").read_text())["test"]["1"]
     quantized = evaluate(finished.out / "model.sog", tiny_scene)["test"]["1"]

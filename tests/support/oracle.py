@@ -5,6 +5,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 
 WIDTH, HEIGHT = 40, 30
+USUAL = ref.Thresholds()
 
 
 BACKGROUND = np.array([0.2, 0.5, 0.9])
@@ -35,3 +36,20 @@ def random_gaussians(
         logit_opacity=rng.uniform(-1, 2, count),
         sh=sh[:, : (degree + 2) ** 2],  # some coefficients stay above the active degree
     )
+
+
+def render_backward(
+    gaussians: ref.RawGaussians,
+    camera: ref.PinholeCamera,
+    background: np.ndarray,
+    degree: int,
+    splats: ref.Splats,
+    grad_image: np.ndarray,
+    variance: float = 0.3,
+    compensate: float = 0.0,
+    thresholds: ref.Thresholds = USUAL,
+) -> tuple[dict[str, np.ndarray], ref.SplatGradients]:
+    """Return the gradients of the parameters, and those of the splats (for density control)."""
+    grad = ref.blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
+    upstream = grad.mean2d, grad.conic, grad.opacity, grad.color
+    return ref.project_backward(gaussians, camera, degree, variance, compensate, splats, *upstream), grad

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.api.commands import evaluate
 from clsplat.core.errors import DataError
 from clsplat.photos.exposure_estimate import UNKNOWN, Exposures
 from clsplat.pipeline.loading import load, without_auto
 from clsplat.runs import opening, run_folder
-from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import RunState
 from clsplat.sweeps.compare.comparison import RunComparison
 from clsplat.sweeps.compare.page import main_table

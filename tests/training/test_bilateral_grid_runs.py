@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from clsplat.api import commands
+from clsplat.api.commands import evaluate
 from clsplat.conformance.checks.appearance import random_grids
 from clsplat.conformance.checks.images import make_camera, to_planes
 from clsplat.core.errors import ConfigError, DataError
@@ -20,7 +21,6 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
-from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
 from clsplat.training.modules.base import attach_modules, read_color_model

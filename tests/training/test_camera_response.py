@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.api.commands import evaluate
 from clsplat.conformance.checks.appearance import check_response
 from clsplat.conformance.reference.appearance import apply_response, apply_response_backward
 from clsplat.core.errors import DataError
 from clsplat.core.resources import resource_dir
 from clsplat.data_tools.synthetic import write_dataset
-from clsplat.runs.model_file import evaluate
 from clsplat.training.modules import camera_response
 from clsplat.training.run import Run
 from tests.support.city import City

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from clsplat.api.commands import evaluate
 from clsplat.conformance import reference as ref
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import at_step
 from clsplat.pipeline.loading import load
-from clsplat.runs.model_file import evaluate, write_cameras
+from clsplat.runs.model_file import write_cameras
 from clsplat.scene.detect import read_scene
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import attach_modules

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.api.commands import evaluate
 from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
 from clsplat.gaussians.conversion import convert, with_sky_splats
@@ -18,7 +19,6 @@ from clsplat.metrics.images import psnr
 from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
 from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
-from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import RunState
 from clsplat.runs.status import summary
 from clsplat.scene.camera import Camera

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from clsplat.core.errors import DataError
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
-from clsplat.scene.view import PosedView, View
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import PATHS
 from tests.support.camera_paths import write_camera_path
@@ -93,7 +94,7 @@ def oblique(tmp_path):
     """A cameras.json with two lenses off the middle, and its path."""
     cameras = [Camera(640, 480, 500.0, 400.0, cx, 200.0) for cx in (300.0, 350.0)]
     views = [View(f"{i}.png", camera, np.eye(3, 4)) for i, camera in enumerate(cameras)]
-    camera_files.write_inria(tmp_path, [PosedView(view.name, view, False) for view in views], None, None)
+    camera_files.write_inria(tmp_path, Scene.from_views(views))
     return camera_path.read(tmp_path / "cameras.json")
 
 

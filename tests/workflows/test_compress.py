@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
+from clsplat.api.commands import evaluate
 from clsplat.cli import app
 from clsplat.core import lock
 from clsplat.core.errors import ConfigError, DataError, Interrupted, OutputError
@@ -20,7 +21,7 @@ from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import model_file, runner
-from clsplat.runs.model_file import ModelSource, evaluate
+from clsplat.runs.model_file import ModelSource
 from clsplat.training.run import Run
 from clsplat.workflows import compress
 from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Ladder, Point, ordered_keeps, page, table

@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
+from clsplat.api.commands import evaluate
 from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import model_bytes, read
 from clsplat.gaussians.sky import Sky
 from clsplat.runs import runner
-from clsplat.runs.model_file import evaluate
 from clsplat.workflows import lod
 from clsplat.workflows.lod import LodPlan, decimate, table
 from tests.support.runs import NO_PROCESS

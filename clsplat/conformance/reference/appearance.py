@@ -103,12 +103,6 @@ def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
     return np.column_stack([np.diag(np.exp(exposure + np.array([red, green, blue]))), np.zeros(3)])
 
 
-def gain_gradient(exposure: float, red: float, blue: float, grad_matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return the gradients of exposure, red and blue, [3], from those of the matrix."""
-    q = np.diag(grad_matrix) * np.diag(gain_matrix(exposure, red, blue))
-    return np.array([q.sum(), q[0] - 0.299 / 0.587 * q[1], q[2] - 0.114 / 0.587 * q[1]])
-
-
 def _transform(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
     """Return E c + b for every pixel."""
     return np.asarray(np.einsum("ab,bhw->ahw", matrix[:, :3], image) + matrix[:, 3, None, None])

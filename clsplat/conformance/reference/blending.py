@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, SplatGradients, Splats, Thresholds
-from clsplat.conformance.reference.projection import project, project_backward
+from clsplat.conformance.reference.projection import project
 
 # The mean of a Gaussian over the box of a pixel, as the kernels approximate it (cl_kernels/pixel_box.h).
 
@@ -286,23 +286,6 @@ def render(
     """Project and blend Gaussians."""
     splats = project(gaussians, camera, degree, near, variance, compensate, thresholds, pixel_box)
     return RenderOutput(*blend(splats, camera.width, camera.height, background, thresholds), splats)
-
-
-def render_backward(
-    gaussians: RawGaussians,
-    camera: PinholeCamera,
-    background: NDArray[Any],
-    degree: int,
-    splats: Splats,
-    grad_image: NDArray[Any],
-    variance: float = 0.3,
-    compensate: float = 0.0,
-    thresholds: Thresholds = Thresholds(),
-) -> tuple[dict[str, NDArray[Any]], SplatGradients]:
-    """Return the gradients of the parameters, and those of the splats (for density control)."""
-    grad = blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
-    upstream = grad.mean2d, grad.conic, grad.opacity, grad.color
-    return project_backward(gaussians, camera, degree, variance, compensate, splats, *upstream), grad
 
 
 # The blended inverse depth, its gradient, and the loss against known depths of some pixels.

@@ -353,15 +353,6 @@ def sampling_interval(
     return intervals
 
 
-def apply_world_filter(
-    log_scales: NDArray[Any], logit: NDArray[Any], variance: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return standard deviations, [N,3], and opacities, [N], after the 3D filter."""
-    scale = np.exp(log_scales)
-    drawn = np.sqrt(scale**2 + variance[:, None])
-    return drawn, np.prod(scale / drawn, axis=1) / (1 + np.exp(-logit))
-
-
 # Gradients of the pose and the focal length of a camera, one Gaussian at a time, in camera axes.
 
 
