@@ -107,7 +107,8 @@ class Densify(Scheduled):
             remedy = f"smaller photos{offload_advice(run)} leave room for more"
             most = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
             LOG.warning("step %d: growth stops at %s", run.step, most)
-        run.records.add(run.step, "densify", **asdict(change))
+        is_limited = self.per_pixel is not None and 0 < limit <= change.after
+        run.records.add(run.step, "densify", **asdict(change), **({"limit": limit} if is_limited else {}))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")

@@ -3,7 +3,6 @@
 import logging
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -11,131 +10,22 @@ from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from clsplat.core.errors import pluralize, size_text
 from clsplat.core.files import PIPELINE, write_text
 from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
-from clsplat.metrics.views import QUANTILES, Gains, ViewMetrics, measure, render_view
+from clsplat.metrics.views import QUANTILES, render_view
 from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS, position_text
-from clsplat.scene.view import View, sample_views
-from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
+from clsplat.stages.advice import advice
 from clsplat.stages.export import sky_gaussians
 from clsplat.training.best_model import Scores
-from clsplat.training.modules.base import color_model, learned_scene
-from clsplat.training.modules.sky_choice import sky_advice
 from clsplat.training.records import VIEWS, moving_average
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
-
-# Advice: how to improve the scene.
-
-MAX_MEASURED = 24  # training views, evenly spaced
-MAX_NAMES = 3  # of photos in a sentence
-OUTLIER_DB = 5.0  # below the median of the views
-MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
-FEW_PHOTOS = 24  # for training
-AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the center: cameras look at one point
-MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
-MIN_GAP = 40.0  # degrees around the center without a photo
-OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
-UNEVEN = 3.0  # times the median gap
-
-
-def advice(run: Run) -> list[str]:
-    """Return advice in sentences; empty if nothing stands out.  Renders at most MAX_MEASURED training views."""
-    views = learned_scene(run).downscaled(run.downscale).split("train")
-    chosen = sample_views(views, MAX_MEASURED)
-    counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    metrics = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
-    lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
-    test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
-    return [
-        *advise_on_training_views(metrics, has_exposures=color_model(run) is not None),
-        *advise_on_test_views(test),
-        *advise_on_capture(views, run.original.views),
-        *sky_advice(run),
-    ]
-
-
-def advise_on_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> Iterator[str]:
-    """Yield advice from the metrics of training views.  has_exposures: whether training learns exposures."""
-    if names := find_outliers({view.view: view.psnr for view in metrics}):
-        yield (
-            f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos: look "
-            "for blur, wrong poses and moving objects; remove these photos, or mask the objects"
-        )
-    gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
-    gained = float(np.mean(gains)) if gains else 0.0
-    if not has_exposures and gained >= MIN_EXPOSURE_GAIN:
-        yield (
-            f"exposures or colors differ between photos: matching them would gain {gained:.1f} dB; "
-            "try `--set optimize.modules.exposure={}`"
-        )
-
-
-def advise_on_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
-    """Yield advice from the PSNR of test views, dB by name."""
-    if names := find_outliers(psnr):
-        yield f"{_join_names(names)}: much worse than the other test views; take more photos of what is visible there"
-
-
-def advise_on_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
-    """Yield advice from the number of training views and the positions of all views."""
-    number = len({view.name for view in train})
-    if number < FEW_PHOTOS:
-        yield f"only {pluralize(number, 'training photograph')}; show every part in at least five, from several sides"
-    if gap := find_widest_gap(views):
-        degrees, first, second = gap
-        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there"
-
-
-def find_outliers(psnr: Mapping[str, float]) -> list[str]:
-    """Return the names of views far below the median, the worst first; psnr: dB, by name."""
-    median = float(np.median(list(psnr.values()))) if psnr else 0.0
-    return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - OUTLIER_DB]
-
-
-def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
-    """Return the widest gap between views around the point that they look at, in degrees, and the views next to it.
-
-    None if the views do not surround a point, if no gap stands out, and for an open side.
-    """
-    if len(views) < 3:
-        return None
-    centers = np.stack([view.position for view in views])
-    axes = np.stack([view.world_to_camera[2, :3] for view in views])
-    offsets = centers - nearest_to_axes(centers, axes, centers.mean(axis=0))
-    distances = np.linalg.norm(offsets, axis=1)
-    angles, radii = _cylindrical(offsets, up_direction(views))
-    cosines = -(axes * offsets).sum(axis=1) / np.maximum(distances, 1e-12)
-    if cosines.mean() < AIMED_COSINE or np.median(radii / np.maximum(distances, 1e-12)) < MIN_OFFSET:
-        return None
-    order = np.argsort(angles, kind="stable")
-    gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
-    inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
-    widest = int(np.argmax(inner_gaps))
-    if inner_gaps[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
-        return None
-    return float(gaps[widest]), views[order[widest]].name, views[order[(widest + 1) % len(views)]].name
-
-
-def _cylindrical(
-    offsets: NDArray[np.floating], up: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles around the upward axis, radians, and distances from it, [V] each, of offsets, [V, 3]."""
-    ahead = perpendicular(up)
-    x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
-    return np.arctan2(y, x), np.hypot(x, y)
-
-
-def _join_names(names: Sequence[str]) -> str:
-    more = len(names) - MAX_NAMES
-    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def cameras(run: Run) -> list[Markup]:
@@ -358,7 +248,7 @@ class HtmlReport(Stage):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        advised = advice(run)
+        advised = advice(run, is_overfit(run))
         page = render(
             "report.html.j2",
             title=run.scene_name,

@@ -7,19 +7,24 @@ import numpy as np
 import pytest
 
 from clsplat.metrics.views import ViewMetrics
+from clsplat.pipeline.loading import load
 from clsplat.render.backdrops import Auto, Backdrop, EnvironmentMap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.stages.report import (
+from clsplat.stages.advice import (
     FEW_PHOTOS,
+    LOW_PSNR,
     advise_on_capture,
+    advise_on_fit,
     advise_on_test_views,
     advise_on_training_views,
+    find_limit,
     find_outliers,
     find_widest_gap,
 )
-from clsplat.training.modules.sky_choice import sky_advice
+from clsplat.training.modules.sky_choice import sky_reason
 
+AGAIN = "clsplat run out/pipeline.yaml"
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
 
@@ -44,28 +49,32 @@ def test_views_far_below_the_median_are_named_worst_first():
 
 
 def test_training_photographs_that_disagree_are_named():
-    (text,) = advise_on_training_views(measured([30, 31, 10, 30]), has_exposures=False)
+    (text,) = advise_on_training_views(measured([30, 31, 10, 30]), False, AGAIN, 900)
     assert text.startswith("2.jpg disagrees with the other photos")
-    (text,) = advise_on_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_exposures=False)
+    assert text.endswith(f"`{AGAIN} --set 'optimize.modules.transients={{start: 300}}'`")
+    load("photos", ["optimize.modules.transients={start: 300}"])
+    (text,) = advise_on_training_views(measured([30, 31, 10, 30]), False, AGAIN, None)
+    assert text.endswith(f"then `{AGAIN}`")
+    (text,) = advise_on_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), False, AGAIN, 900)
     assert text.startswith("9.jpg, 10.jpg, 11.jpg and 2 more disagree with")
-    assert not [*advise_on_training_views([], has_exposures=False)]
+    assert not [*advise_on_training_views([], False, AGAIN, 900)]
 
 
 @pytest.mark.parametrize(("gained", "has_exposures", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
 def test_differing_colors_are_reported_if_none_are_trained(gained, has_exposures, said):
-    texts = [*advise_on_training_views(measured([30, 30, 31], gained), has_exposures)]
+    texts = [*advise_on_training_views(measured([30, 30, 31], gained), has_exposures, AGAIN, 900)]
     assert len(texts) == said
     assert all("would gain 1.5 dB" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
 def test_images_without_fitted_colors_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
-    assert "would gain 1.5 dB" in "".join(advise_on_training_views(found, has_exposures=False))
-    assert not [*advise_on_training_views(found[2:], has_exposures=False)]
+    assert "would gain 1.5 dB" in "".join(advise_on_training_views(found, False, AGAIN, 900))
+    assert not [*advise_on_training_views(found[2:], False, AGAIN, 900)]
 
 
 def test_much_worse_test_views_are_named():
-    (text,) = advise_on_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
+    (text,) = advise_on_test_views({"a": 22.0, "b": 16.0, "c": 26.0}, AGAIN)
     assert text.startswith("b: much worse")
 
 
@@ -75,16 +84,37 @@ def run_with(background: Backdrop | None) -> SimpleNamespace:
 
 def test_added_sky_is_reported_with_its_reason():
     added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
-    (text,) = sky_advice(run_with(added))
-    assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
-    others = None, EnvironmentMap(), Auto(), Auto(chosen="off")
-    assert not [text for other in others for text in sky_advice(run_with(other))]
+    assert sky_reason(run_with(added)) == "25 of 25 photographs show one"
+    assert not any(sky_reason(run_with(other)) for other in (None, EnvironmentMap(), Auto(), Auto(chosen="off")))
+
+
+@pytest.mark.parametrize(
+    ("psnr", "is_overfit", "growth", "start"),
+    [
+        (30.0, True, (600, "less"), "the model overfits"),
+        (30.0, False, (600, "less"), "growth stopped at its limit of 600 Gaussians, 30.0 dB"),
+        (LOW_PSNR - 1, False, None, "the model underfits: only 23.0 dB"),
+        (LOW_PSNR, False, None, ""),
+    ],
+)
+def test_what_limited_the_fit_is_named_once(psnr, is_overfit, growth, start):
+    texts = [*advise_on_fit(measured([psnr - 1, psnr + 1]), is_overfit, growth, "again", "longer")]
+    assert len(texts) == bool(start)
+    command = "again" if is_overfit else "less" if growth else "longer"
+    assert all(text.startswith(start) and text.endswith(f"`{command}`") for text in texts)
+
+
+def test_setting_that_limits_growth_is_named_as_in_set():
+    limited = load("photos", ["optimize.during.1.per_pixel=0.1"])
+    key = find_limit(limited.resolved()["stages"])
+    assert key == "optimize.during.1.per_pixel"
+    load("photos", [f"{key}=null"])
 
 
 def test_few_images_are_reported():
-    assert "only 1 training photograph" in "".join(advise_on_capture(views_around([0]), views_around([0])))
+    assert "only 1 training photograph" in "".join(advise_on_capture(views_around([0]), views_around([0]), AGAIN))
     many = views_around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
-    assert not [*advise_on_capture(many, many)]
+    assert not [*advise_on_capture(many, many, AGAIN)]
 
 
 @pytest.mark.parametrize("turn", [0, 250])

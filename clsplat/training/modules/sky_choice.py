@@ -71,13 +71,12 @@ def start_sky(run: Run, source: Model | None) -> None:
     LOG.info("sky: %d of %d x %d texels are learned", free.sum(), background.side, background.side)
 
 
-def sky_advice(run: Run) -> list[str]:
-    """Return a sentence for the report of a run in which `auto` added a sky."""
+def sky_reason(run: Run) -> str:
+    """Return why `auto` added a sky to a run; empty if it did not."""
     background = run.model_settings.background
     if not isinstance(background, Auto) or background.sky is None:
-        return []
-    reason, _, _ = background.reason.partition(";")
-    return [f"a sky was added, since {reason}; other viewers show it if `export` has `sky: splats`"]
+        return ""
+    return background.reason.partition(";")[0]
 
 
 def _reason_unknown(run: Run) -> str:

@@ -1,0 +1,184 @@
+"""Advise on what limited the result of a run, from its views, records and cameras, with a command for each."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import pluralize, shell_quote
+from clsplat.core.files import PIPELINE
+from clsplat.metrics.views import Gains, ViewMetrics, measure
+from clsplat.scene.view import View, sample_views
+from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
+from clsplat.stages.export import sky_gaussians
+from clsplat.training.modules.base import color_model, learned_scene
+from clsplat.training.modules.sky_choice import sky_reason
+from clsplat.training.run import Run
+
+MAX_LINES = 5
+MAX_MEASURED = 24  # training views, evenly spaced
+MAX_NAMES = 3  # of photos in a sentence
+OUTLIER_DB = 5.0  # below the median of the views
+MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
+LOW_PSNR = 24.0  # dB, mean of the training views
+TRANSIENTS_START = 1 / 3  # of the training
+FEW_PHOTOS = 24  # for training
+AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the center: cameras look at one point
+MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
+MIN_GAP = 40.0  # degrees around the center without a photo
+OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
+UNEVEN = 3.0  # times the median gap
+
+
+def advice(run: Run, is_overfit: bool) -> list[str]:
+    """Return at most MAX_LINES sentences, the most important first, each with a command; empty if nothing stands out.
+
+    Renders at most MAX_MEASURED training views.
+    """
+    views = learned_scene(run).downscaled(run.downscale).split("train")
+    chosen = sample_views(views, MAX_MEASURED)
+    counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
+    metrics = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
+    lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
+    test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
+    again, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
+    stages = run.pipeline["stages"]
+    can_mask = run.learned_field is None and not {"transients", "distractors"} & run.modules.keys()
+    has_exposures = color_model(run) is not None or run.learned_field is not None
+    limits = [edit["limit"] for edit in run.records.read("densify") if "limit" in edit]
+    key = find_limit(stages)
+    growth = (limits[-1], f"{again} --set {key}=null") if limits and key else None
+    longer = f"{resume} --steps {2 * run.step}"
+    found = [
+        *advise_on_training_views(metrics, has_exposures, again, run.step if can_mask else None),
+        *advise_on_fit(metrics, is_overfit, growth, again, longer),
+        *advise_on_test_views(test, again),
+        *advise_on_capture(views, run.original.views, again),
+    ]
+    if (reason := sky_reason(run)) and any("export" in entry for entry in stages):
+        choice, effect = ("sidecar", "leaves it out") if sky_gaussians(run) else ("splats", "adds it")
+        shown = "has it as distant Gaussians" if sky_gaussians(run) else "does not show it in other viewers"
+        text = f"a sky was added, since {reason}; the model file {shown}: `{resume} --set export.sky={choice}` {effect}"
+        found.append(text)
+    return found[:MAX_LINES]
+
+
+def advise_on_training_views(
+    metrics: Sequence[ViewMetrics], has_exposures: bool, again: str, steps: int | None
+) -> Iterator[str]:
+    """Yield advice from the metrics of training views.
+
+    has_exposures: whether training learns exposures; again: the command that repeats the run; steps: of the training,
+    None if moving objects cannot be masked.
+    """
+    if names := find_outliers({view.view: view.psnr for view in metrics}):
+        text = f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos"
+        if steps is None:
+            yield f"{text}: remove those that are blurred or have wrong poses, then `{again}`"
+        else:
+            transients = shell_quote(f"optimize.modules.transients={{start: {round(TRANSIENTS_START * steps)}}}")
+            yield f"{text}: remove those that are blurred; if objects move, `{again} --set {transients}`"
+    gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
+    gained = float(np.mean(gains)) if gains else 0.0
+    if not has_exposures and gained >= MIN_EXPOSURE_GAIN:
+        yield (
+            f"exposures or colors differ between photos: matching them would gain {gained:.1f} dB; "
+            f"try `{again} --set optimize.modules.exposure={{}}`"
+        )
+
+
+def advise_on_fit(
+    metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, again: str, longer: str
+) -> Iterator[str]:
+    """Yield advice if the model overfits, or else if its growth was limited, or else if it fits the photos badly.
+
+    growth: the limit that stopped growth, and the command without it; again, longer: commands that repeat the run, and
+    that train it longer.
+    """
+    train = float(np.mean([view.psnr for view in metrics])) if metrics else np.inf
+    if is_overfit:
+        yield f"the model overfits: add photos between the existing ones, then `{again}`"
+    elif growth:
+        limit, command = growth
+        yield f"growth stopped at its limit of {limit:,} Gaussians, {train:.1f} dB at training views: `{command}`"
+    elif train < LOW_PSNR:
+        yield f"the model underfits: only {train:.1f} dB at training views; train longer: `{longer}`"
+
+
+def find_limit(stages: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return the key, as in `--set`, of the number of Gaussians per pixel in the stages of a pipeline."""
+    trainings = ((name, i, entry) for part in stages for name, stage in part.items() for i, entry in _during(stage))
+    return next((f"{name}.during.{i}.per_pixel" for name, i, entry in trainings if _has_limit(entry)), None)
+
+
+def _during(stage: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    yield from enumerate(stage.get("during") or ())
+
+
+def _has_limit(entry: Mapping[str, Any]) -> bool:
+    return (entry.get("densify") or {}).get("per_pixel") is not None
+
+
+def advise_on_test_views(psnr: Mapping[str, float], again: str) -> Iterator[str]:
+    """Yield advice from the PSNR of test views, dB by name."""
+    if names := find_outliers(psnr):
+        yield (
+            f"{_join_names(names)}: much worse than the other test views; add photos of what is visible there, then "
+            f"`{again}`"
+        )
+
+
+def advise_on_capture(train: Sequence[View], views: Sequence[View], again: str) -> Iterator[str]:
+    """Yield advice from the number of training views and the positions of all views."""
+    number = len({view.name for view in train})
+    if number < FEW_PHOTOS:
+        count = pluralize(number, "training photograph")
+        yield f"only {count}; show every part in at least five, from several sides, then `{again}`"
+    if gap := find_widest_gap(views):
+        degrees, first, second = gap
+        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there, then `{again}`"
+
+
+def find_outliers(psnr: Mapping[str, float]) -> list[str]:
+    """Return the names of views far below the median, the worst first; psnr: dB, by name."""
+    median = float(np.median(list(psnr.values()))) if psnr else 0.0
+    return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - OUTLIER_DB]
+
+
+def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
+    """Return the widest gap between views around the point that they look at, in degrees, and the views next to it.
+
+    None if the views do not surround a point, if no gap stands out, and for an open side.
+    """
+    if len(views) < 3:
+        return None
+    centers = np.stack([view.position for view in views])
+    axes = np.stack([view.world_to_camera[2, :3] for view in views])
+    offsets = centers - nearest_to_axes(centers, axes, centers.mean(axis=0))
+    distances = np.linalg.norm(offsets, axis=1)
+    angles, radii = _cylindrical(offsets, up_direction(views))
+    cosines = -(axes * offsets).sum(axis=1) / np.maximum(distances, 1e-12)
+    if cosines.mean() < AIMED_COSINE or np.median(radii / np.maximum(distances, 1e-12)) < MIN_OFFSET:
+        return None
+    order = np.argsort(angles, kind="stable")
+    gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
+    inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
+    widest = int(np.argmax(inner_gaps))
+    if inner_gaps[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
+        return None
+    return float(gaps[widest]), views[order[widest]].name, views[order[(widest + 1) % len(views)]].name
+
+
+def _cylindrical(
+    offsets: NDArray[np.floating], up: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return angles around the upward axis, radians, and distances from it, [V] each, of offsets, [V, 3]."""
+    ahead = perpendicular(up)
+    x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
+    return np.arctan2(y, x), np.hypot(x, y)
+
+
+def _join_names(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMES
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
