@@ -30,13 +30,13 @@ STARTS = (  # of files that are not what their names say: their first bytes, con
 )
 
 
-def require_content(path: Path, data: bytes) -> None:
-    """Raise DataError, with the cause, if a file that starts with `data` is empty or a failed download."""
+def require_content(path: Path, data: bytes, kind: type[ClsplatError] = DataError) -> None:
+    """Raise `kind`, with the cause, if a file that starts with `data` is empty or a failed download."""
     if not data:
-        raise DataError(f"{path}: the file is empty; copy or export it again")
+        raise kind(f"{path}: the file is empty; copy or export it again")
     for start, content, remedy in STARTS:
         if data.lstrip()[: len(start)].lower() == start:
-            raise DataError(f"{path}: the file is {content}; {remedy}")
+            raise kind(f"{path}: the file is {content}; {remedy}")
 
 
 @contextmanager
@@ -87,6 +87,7 @@ def read_json(
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
+        require_content(path, data, kind)
         reason = str(error).partition(";")[0]
         raise kind(f"{path}: not a JSON file ({reason}); expected {expected}: create it again") from error
 

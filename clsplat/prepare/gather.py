@@ -14,7 +14,7 @@ import numpy as np
 from clsplat.core.errors import DataError, first_few, pluralize, shell_quote
 from clsplat.core.files import open_atomic
 from clsplat.core.progress import Count
-from clsplat.core.reading import open_regular, read_file
+from clsplat.core.reading import STARTS, open_regular, read_file
 from clsplat.scene.images import (
     IMAGE_SUFFIXES,
     JPEG,
@@ -27,6 +27,7 @@ from clsplat.scene.images import (
     read_gray,
     write_exposures,
 )
+from clsplat.scene.lookup import unread_cameras
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.quality import is_blank
 from clsplat.scene.times_file import read_times, write_times
@@ -37,6 +38,7 @@ CONVERTERS = {  # photographs that OpenCV cannot read, and commands that convert
     "AVIF": ({".avif"}, "ffmpeg -i d.avif d.jpg"),
     "DNG": ({".dng"}, "darktable-cli d.dng d.jpg"),
     "raw": ({".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}, "darktable-cli d.nef d.jpg"),
+    "other": ({".gif", ".jxl", ".jp2", ".exr", ".hdr", ".psd", ".tga"}, "magick d.gif d.jpg"),
 }
 BRANDS = {  # at byte 8, after `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV1 Image File Format
     "HEIC": {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"},
@@ -54,8 +56,9 @@ def list_photographs(folder: Path, excluded: Path | None = None) -> list[str]:
     Raises DataError when there are too few.
     """
     names, unreadable = _photo_names(folder, excluded)
-    for text in _how_to_convert(unreadable):
-        LOG.warning("%s: %s", folder, text)
+    for text in (*_how_to_convert(unreadable), unread_cameras(folder)):
+        if text:
+            LOG.warning("%s: %s", folder, text)
     require_photographs(folder, excluded)
     return names
 
@@ -153,10 +156,12 @@ def failure_reason(photograph: Path, error: DataError) -> str:
 
 def remedy_for(damaged: Mapping[str, str]) -> str:
     """Return how to make damaged photographs readable.  damaged: reasons by name, as `gather` returns them."""
-    kinds = [kind for kind in BRANDS if OTHER_FORMAT.format(kind) in damaged.values()]
-    texts = [f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}" for kind in kinds]
-    if {OTHER_FORMAT.format(kind) for kind in kinds} != set(damaged.values()):
-        texts.append("export the others again" if kinds else "export them again")
+    remedies = {f"the file is {content}": remedy for _, content, remedy in STARTS}
+    for kind in BRANDS:
+        remedies[OTHER_FORMAT.format(kind)] = f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}"
+    texts = [remedy for reason, remedy in remedies.items() if reason in damaged.values()]
+    if set(damaged.values()) - remedies.keys():
+        texts.append("export the others again" if texts else "export them again")
     return "; ".join(texts)
 
 

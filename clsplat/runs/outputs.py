@@ -22,6 +22,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, sha256
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.state import Phase, RunState, damaged_files, is_below, read_sums
+from clsplat.scene.images import is_image
 from clsplat.stages.export import sky_gaussians
 from clsplat.stages.report import is_overfit
 from clsplat.training.run import Run
@@ -117,9 +118,18 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
     forbidden = (
         [folder, folder.parent] if pipeline.settings.prepare else [folder]
     )  # `prepare` hashes the photos' folder
-    if scene.path is not None and scene.folder.resolve() in forbidden:
+    is_inside = scene.path is not None and (
+        scene.folder.resolve() in forbidden or (state.phase < Phase.BEGUN and _is_among_photos(folder, scene.folder))
+    )
+    if is_inside:
         raise ConfigError(f"{out}: is, or is inside, the folder of the photos; use another folder for the run")
     check_names(state, RUN_FILES, [path for stage in pipeline.stages for path in stage.outputs(out)])
+
+
+def _is_among_photos(out: Path, scene: Path) -> bool:
+    """Return whether a folder below that of a scene, or a folder between the two, contains photos."""
+    between = [path for path in (out, *out.parents) if scene.resolve() in path.parents and path.is_dir()]
+    return any(is_image(file) for path in between for file in path.iterdir())
 
 
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:

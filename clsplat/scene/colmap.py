@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.quaternions import rotation_matrix
-from clsplat.core.reading import read_file
+from clsplat.core.reading import read_file, require_content
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, intern_lens, panorama_lens
 from clsplat.scene.camera import MODELS as LENS_MODELS
 from clsplat.scene.lookup import FileLookup
@@ -149,6 +149,7 @@ def points_text(path: Path) -> PointTable:
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the position and the text of every line that is not a comment."""
     text = decode(str(path), read_file(path)).lstrip("\ufeff")
+    require_content(path, text.encode() or b"#")  # a file without points may be empty
     for number, line in enumerate(map(str.strip, text.split("\n")), start=1):
         if not line.startswith("#"):
             yield f"{path}: line {number}", line
@@ -186,6 +187,7 @@ class _Binary:
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.offset = path, read_file(path), 0
+        require_content(path, self.data or b"#")  # `skip` says what an empty file lacks
 
     @property
     def source(self) -> str:

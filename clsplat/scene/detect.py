@@ -10,7 +10,7 @@ from clsplat.formats.table import detect as model_format
 from clsplat.scene.colmap import ColmapReader, find_models, read_images
 from clsplat.scene.images import is_image
 from clsplat.scene.llff import LlffReader
-from clsplat.scene.lookup import walk_folders
+from clsplat.scene.lookup import unread_cameras, walk_folders
 from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
@@ -125,10 +125,11 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
         return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
+    unread = f"; {text}" if (text := unread_cameras(path)) else ""
     if any(is_image(file) for file in path.iterdir()):
         above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {above}: give that folder" if above else remedy
-        raise DataError(f"{path}: photographs without cameras; {remedy}")
+        raise DataError(f"{path}: photographs without cameras; {remedy}{unread}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
-    raise DataError(f"{path}: no dataset found; looked for {formats}")
+    raise DataError(f"{path}: no dataset found; looked for {formats}{unread}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
 from clsplat.core.files import open_atomic, write_text
-from clsplat.core.reading import open_file, read_file, read_json
+from clsplat.core.reading import open_file, read_file, read_json, require_content
 
 # Size, orientation and completeness of an image file, without decoding it.
 
@@ -257,6 +257,7 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     except cv2.error:
         pass
     if pixels is None:
+        require_content(path, data)
         raise DataError(f"{path}: not an image, or a damaged one{fault}; copy or export it again")
     return np.asarray(pixels)
 

@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path, PurePath, PureWindowsPath
@@ -15,6 +16,7 @@ from urllib.parse import unquote
 
 from clsplat.core.errors import DataError, first_few, pluralize, quote, shorten
 from clsplat.core.files import STATUS
+from clsplat.core.reading import open_regular
 from clsplat.scene.images import is_image
 
 Missing = Literal["refuse", "skip"]  # what to do about missing photographs
@@ -28,6 +30,12 @@ OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the 
 )
 SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph in one does not match another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
+OTHER_PROGRAMS = {  # whose files hold cameras that no reader reads: part of the start of such a file
+    "Polycam": rb'"t_00"',
+    "Record3D": rb'"initPose"|"poses": *\[\[',
+    "Metashape": rb"<document[^>]*>\s*<chunk",
+    "RealityScan": rb"^#name,x,y",
+}
 ELSEWHERE = "…"  # instead of folders outside of the scene, in paths of missing files
 logger = logging.getLogger("clsplat")
 
@@ -69,6 +77,22 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
         is_deep = len(folder.parts) - len(path.parts) >= depth
         folders[:] = [] if is_deep else sorted(name for name in folders if name[0] != ".")
         yield folder, sorted(files)
+
+
+def unread_cameras(path: Path) -> str:
+    """Return a sentence about a file with the cameras of another program, in a folder or at a path; "" without one."""
+    folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
+    for folder, names in folders:
+        for file in [folder / name for name in names if name.endswith((".json", ".xml", ".csv"))][:8]:
+            with suppress(OSError), open_regular(file) as stream:
+                start = stream.read(4096)
+                for program, pattern in OTHER_PROGRAMS.items():
+                    if re.search(pattern, start):
+                        return (
+                            f"the cameras of {program} in {file} are not read; to use them, export COLMAP's format, or "
+                            "convert them with `ns-process-data` of nerfstudio"
+                        )
+    return ""
 
 
 class FileLookup:

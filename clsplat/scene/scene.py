@@ -237,7 +237,7 @@ def make_scene(
     names: set[str] = set()
     for view in views:
         if view.name in names:
-            raise DataError(f"{path}: two images are called {quote(view.name)}; names must differ")
+            raise DataError(f"{path}: two images are called {quote(view.name)}; rename one")
         names.add(view.name)
         try:
             view.camera.check()

@@ -16,7 +16,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens, panorama_lens
 from clsplat.scene.images import stored_size
-from clsplat.scene.lookup import FileLookup, Missing, safe_join
+from clsplat.scene.lookup import FileLookup, Missing, safe_join, unread_cameras
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import Background, PointCloud, Scene, every_nth, make_scene
@@ -392,7 +392,8 @@ class MultiscaleReader(Reader):
     expects = METADATA_FILE
 
     def matches(self, path: Path) -> bool:
-        return (path / METADATA_FILE).is_file()
+        file = path / METADATA_FILE
+        return file.is_file() and not unread_cameras(file)
 
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)

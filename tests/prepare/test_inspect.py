@@ -142,7 +142,7 @@ def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
     os.mkfifo(scene / "images" / "03.png")
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == []
-    assert "decoded (03.png): cannot be read (it is a pipe); copy or export" in finding_text(inspection, "error")
+    assert "decoded (03.png): cannot be read (it is a pipe); export" in finding_text(inspection, "error")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_test_view_with_damaged_pixels(scene):
     done = clsplat("inspect", scene, expect=3)
     printed = " ".join(done.stdout.split())
     assert "1 image file cannot be decoded (08.png): not an image, or a damaged one" in printed
-    assert "is wrong); copy or export them again" in printed
+    assert "is wrong); export them again" in printed
 
 
 def test_nonfinite_pose_in_a_text_model(tmp_path):

@@ -12,6 +12,8 @@ from clsplat.core.errors import DataError
 from clsplat.prepare.gather import gather, list_photographs
 from clsplat.prepare.inspect.facts import CaptureFacts, compare_photos, measure_capture
 from clsplat.prepare.inspect.findings import Inspection, summarize
+from clsplat.scene.colmap import read_cameras
+from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure
 from tests.support.commands import clsplat as run_command
 from tests.support.orbit_scene import finding_text, photograph
@@ -103,7 +105,7 @@ def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):
     assert texts(inspection, "warning")[1:] == [*warned, damaged]
 
 
-@pytest.mark.parametrize("names", [("a.heic",), ("a.png", "b.png"), ("a.png", "b.png", "c.heic")])
+@pytest.mark.parametrize("names", [("a.heic",), ("a.png", "b.png"), ("a.png", "b.png", "c.gif")])
 def test_too_few_photographs_are_refused_as_in_preparation(tmp_path, names):
     for name in names:
         photograph(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_bytes(b"raw")
@@ -171,3 +173,37 @@ def test_larger_object_on_black_is_no_brightness_step(tmp_path):
         pixels[:, wide:] = 0
         cv2.imwrite(str(files[name]), pixels)
     assert compare_photos(files).steps == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "program"),
+    [
+        ("keyframes/corrected_cameras/0.json", '{"fx": 1, "t_00": 1}', "Polycam"),
+        ("metadata.json", '{"w": 4, "poses": [[0, 0, 0, 1, 0, 0, 0]]}', "Record3D"),
+        ("cameras.xml", '<?xml version="1.0"?>\n<document version="1.5.0">\n  <chunk label="a"/>', "Metashape"),
+        ("cameras.csv", "#name,x,y,alt,heading", "RealityScan"),
+    ],
+)
+def test_cameras_of_other_programs_are_reported(tmp_path, name, content, program):
+    for image in ("a.png", "b.png", "c.png"):
+        photograph(tmp_path / image)
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text(content)
+    inspection = Inspection.from_folder(tmp_path)
+    expected = f"the cameras of {program} in {tmp_path / name} are not read; to use them, export COLMAP's format"
+    assert texts(inspection, "warning")[1].startswith(expected)
+    assert inspection.next_step
+    with pytest.raises(DataError, match=f"photographs without cameras; .*the cameras of {program}"):
+        read_scene(tmp_path)
+
+
+def test_files_that_git_lfs_has_not_fetched(tmp_path):
+    for image in ("a.png", "b.png", "c.png"):
+        photograph(tmp_path / image)
+    (tmp_path / "d.png").write_text("version https://git-lfs.github.com/spec/v1\n")
+    warning = texts(Inspection.from_folder(tmp_path), "warning")[1]
+    assert warning.endswith("d.png (the file is a Git LFS pointer); fetch the content with `git lfs pull`")
+    for name in ("cameras.txt", "cameras.bin"):
+        (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\n")
+        with pytest.raises(DataError, match=f"{name}: the file is a Git LFS pointer"):
+            read_cameras(tmp_path)

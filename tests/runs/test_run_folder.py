@@ -32,6 +32,9 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
     with pytest.raises(ConfigError, match="is the root of a file system"):
         opened(tiny_scene, Path(Path.cwd().anchor))
     opened(tiny_scene, tiny_scene / "runs" / "a")
+    for out in (tiny_scene / "train", tiny_scene / "train" / "a" / "b"):
+        with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
+            opened(tiny_scene, out)
     photographs = tiny_scene / "train"
     with pytest.raises(ConfigError, match="is, or is inside, the folder of the photos"):
         outputs.check_output_paths(

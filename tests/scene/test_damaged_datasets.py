@@ -166,7 +166,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
     "a photograph that links to itself": (with_photo(lambda file: file.symlink_to(file)), 3, MISSING),
     "a photograph that is a folder": (with_photo(lambda file: file.mkdir()), 3, "it is a folder"),
     "a photograph that is a pipe": (with_photo(lambda file: os.mkfifo(file)), 3, "it is a pipe"),
-    "a photograph that is empty": (with_photo(lambda file: file.touch()), 3, "not an image"),
+    "a photograph that is empty": (with_photo(lambda file: file.touch()), 3, "the file is empty"),
     "a photograph that is text": (with_photo(lambda file: file.write_text("no")), 3, "not an image"),
     "a photograph of another size": (
         with_photo(lambda file: photo(file, np.zeros((20, 64, 3), np.uint8))),

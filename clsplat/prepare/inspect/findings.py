@@ -116,9 +116,10 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         skip = ", or skip them with --set scene.missing=skip" if len(facts.missing) < facts.registered else ""
         yield Finding("error", f"{fault} ({_join(facts.missing)}){facts.hint}", f"restore the files{skip}")
     if photographs.unreadable:
-        unreadable, reason = _join(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
+        unreadable = _join(list(photographs.unreadable))
+        reason = next(iter(photographs.unreadable.values())).partition(";")[0]
         fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
-        yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
+        yield Finding("error", fault, f"{reason}; {remedy_for({unreadable: reason})}")
     if photographs.no_content:
         fault, _, remedy = photographs.no_content.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
