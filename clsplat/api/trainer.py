@@ -108,7 +108,7 @@ class Trainer:
         opened = open_checked(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as stack:
             status = stack.enter_context(run_folder.open_run_folder(state, start, step=0))
-            with recording_failures(status, as_raised=True):
+            with recording_failures(status, reraise=True):
                 run_scene = RunScene.from_scene(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, run_scene, opened, self.out, status)
                 self.pipeline = resolve_choices(self.pipeline, self._run)
@@ -158,7 +158,7 @@ class Trainer:
             raise ClsplatError(f"{self!r} {reason}; create another, with start='resume' if `out` has a checkpoint")
         try:
             with (
-                recording_failures(self._run.status, as_raised=True),
+                recording_failures(self._run.status, reraise=True),
                 stopping_on_signals(finish_step),
                 save_on_failure(self._run),
             ):

@@ -15,7 +15,7 @@ from clsplat.core.errors import ConfigError, MemoryLimitError
 from clsplat.core.machine import process_limit
 from clsplat.core.resources import full_version
 from clsplat.core.signals import stop_when_stdin_closes
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
@@ -166,7 +166,7 @@ def _device_or_global(context: typer.Context, device: str | None) -> str | None:
 
 
 def recipe_names(incomplete: str) -> list[str]:
-    return [name for name in shipped() if name.startswith(incomplete)]
+    return [name for name in shipped_pipelines() if name.startswith(incomplete)]
 
 
 DeviceOption = Annotated[

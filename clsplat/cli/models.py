@@ -87,7 +87,7 @@ def _metrics_table(results: dict[str, Any]) -> str:
     cells = [
         [f"{row[name]:.4f}" if isinstance(row[name], float) else str(row[name]) for name in columns] for row in rows
     ]
-    return text_table([columns, *cells], left=2)
+    return text_table([columns, *cells], left_columns=2)
 
 
 @command(

@@ -54,26 +54,26 @@ def _judge_failures(
     default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]
 ) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
-    others = [text for result in once for text in result.failures]
-    good = [name for name, texts in failures.items() if not texts]
-    if good and (default in good or default not in failures):
-        return _judge_default(failures, others)
-    if good:
+    other_failures = [text for result in once for text in result.failures]
+    passing = [name for name, texts in failures.items() if not texts]
+    if passing and (default in passing or default not in failures):
+        return _judge_default(failures, other_failures)
+    if passing:
         reason = f"with the {default} schedule, {failures[default][0]}"
-        return Verdict(True, f"use it with --set rasterizer.schedule={good[0]}: {reason}", REMEDY)
-    wrong = [result for result in schedules[default] if not result.passes]
-    if all(_is_bitonic(result) for result in wrong):
+        return Verdict(True, f"use it with --set rasterizer.schedule={passing[0]}: {reason}", REMEDY)
+    wrong_results = [result for result in schedules[default] if not result.passes]
+    if all(_is_bitonic(result) for result in wrong_results):
         return Verdict(True, f"use it with --set rasterizer.sort=radix: {failures[default][0]}", REMEDY)
     first, more = failures[default][0], sum(map(len, failures.values())) - 1
     others_text = f"; {pluralize(more, 'more failure')}" if more else ""
     return Verdict(False, f"do not use it: {first}{others_text}", REMEDY)
 
 
-def _judge_default(failures: Mapping[str, list[str]], others: list[str]) -> Verdict:
-    wrong = [f"with the {name} schedule, {texts[0]}" for name, texts in failures.items() if texts] + others
-    if not wrong:
+def _judge_default(failures: Mapping[str, list[str]], other_failures: list[str]) -> Verdict:
+    faults = [f"with the {name} schedule, {texts[0]}" for name, texts in failures.items() if texts] + other_failures
+    if not faults:
         return Verdict(True, "use it")
-    return Verdict(True, f"use it as it is; but {wrong[0]}", f"training is not affected; {REPORT}")
+    return Verdict(True, f"use it as it is; but {faults[0]}", f"training is not affected; {REPORT}")
 
 
 def _is_bitonic(result: CheckResult) -> bool:
@@ -278,7 +278,8 @@ def report_page(report: DeviceReport) -> str:
         failures=[(name or "once", text) for name, texts in report.failures.items() for text in texts],
         facts=_facts(report),
         parts={
-            name: (summary(results), [(result, worst(result)) for result in results]) for name, results in parts.items()
+            name: (summary(results), [(result, largest_error(result)) for result in results])
+            for name, results in parts.items()
         },
         speed=report.note("speed"),
         speed_text=report.speed(),
@@ -310,7 +311,7 @@ def _facts(report: DeviceReport) -> dict[str, str]:
     return facts
 
 
-def worst(result: CheckResult) -> str:
+def largest_error(result: CheckResult) -> str:
     """Return the largest deviation relative to its bound, as text."""
     largest = max(result.deviations, key=_excess, default=None)
     if largest is None:

@@ -22,7 +22,7 @@ from clsplat.render.tiles import Sort, resolve_sort
 
 LOG = logging.getLogger("clsplat")
 TIMEOUT_S = 300  # longest time without output from a check
-Resolved = Literal["wide", "simt"]
+FixedSchedule = Literal["wide", "simt"]
 SORTS = ("radix", "bitonic")  # each has a record
 
 
@@ -62,21 +62,21 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     remember(info, schedule, sorts)
 
 
-def remember(info: DeviceInfo, schedule: Resolved, sorts: Sequence[str] = SORTS) -> None:
+def remember(info: DeviceInfo, schedule: FixedSchedule, sorts: Sequence[str] = SORTS) -> None:
     """Record that a device computes correctly; if the cache cannot be written, the next run checks it again."""
     with suppress(OutputError):
         for sort in sorts:
             write_text(_record_file(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
 
 
-def forget(info: DeviceInfo, schedule: Resolved) -> None:
+def forget(info: DeviceInfo, schedule: FixedSchedule) -> None:
     """Remove the records of a device that computes wrongly: the next run checks it again."""
     for sort in SORTS:
         with suppress(OSError):
             _record_file(info, schedule, sort).unlink(missing_ok=True)
 
 
-def _record_file(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
+def _record_file(info: DeviceInfo, schedule: FixedSchedule, sort: str) -> Path:
     """Return the file of a result, named by all that affects it: checks, device, driver, kernels, build options."""
     checks = (__version__, _hash_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))

@@ -22,7 +22,7 @@ PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial(\.\w+)?")
 NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 SYSTEM = os.name
 _number = itertools.count()
-_open: set[str] = set()  # names of the temporary files that this process is writing
+_temporary_names: set[str] = set()  # names of the temporary files that this process is writing
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        _open.discard(temporary.name)
+        _temporary_names.discard(temporary.name)
 
 
 @contextmanager
@@ -95,7 +95,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
         yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        _open.discard(temporary.name)
+        _temporary_names.discard(temporary.name)
 
 
 def require_free(folder: Path) -> None:
@@ -119,7 +119,7 @@ def raising_output_error(path: Path) -> Iterator[None]:
 def _temporary_path(path: Path, suffix: str = "") -> Path:
     """Return a hidden name next to `path` and register it as being written by this process."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
-    _open.add(temporary.name)
+    _temporary_names.add(temporary.name)
     return temporary
 
 
@@ -207,7 +207,7 @@ def _remove_partial_folders(folder: Path) -> None:
 
 def _is_abandoned(name: str) -> bool:
     """Return whether a file or folder is temporary and no process of this machine is writing it any more."""
-    if not (match := PARTIAL.fullmatch(name)) or name in _open:
+    if not (match := PARTIAL.fullmatch(name)) or name in _temporary_names:
         return False
     process = int(match[1])
     return process == os.getpid() or not is_alive(process)  # an earlier container may have had the same number

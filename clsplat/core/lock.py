@@ -123,8 +123,8 @@ def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
 
 LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # error codes for a lock that another process holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-_held: set[Path] = set()  # lock files that this process holds or is locking
-_held_lock = threading.Lock()
+_locked_files: set[Path] = set()  # lock files that this process holds or is locking
+_locked_files_lock = threading.Lock()
 
 
 @contextmanager
@@ -159,13 +159,13 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
 @contextmanager
 def _reserve(path: Path, folder: Path) -> Iterator[None]:
     """Reserve a lock file for this thread during the block.  Raises OutputError if another thread holds it."""
-    with _held_lock:
+    with _locked_files_lock:
         _require_not_held(path, folder)
-        _held.add(path)
+        _locked_files.add(path)
     try:
         yield
     finally:
-        _held.discard(path)
+        _locked_files.discard(path)
 
 
 def check_free(folder: Path) -> bool:
@@ -200,7 +200,7 @@ def _resolve(folder: Path, file: Path) -> Path:
 
 
 def _require_not_held(path: Path, folder: Path) -> None:
-    if path in _held:
+    if path in _locked_files:
         raise OutputError(
             f"{folder}: is in use by this process; close that run or trainer first, or use another folder"
         )

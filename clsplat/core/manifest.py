@@ -29,7 +29,7 @@ class Manifest:
             except (ValueError, TypeError, KeyError):
                 continue  # incomplete, after a crash
 
-    def lists(self, path: Path) -> bool:
+    def has_entry(self, path: Path) -> bool:
         """Return whether a tool wrote this file, or was about to write it."""
         return self._name(path) in self._sources
 
@@ -56,7 +56,7 @@ class Manifest:
 
     def require_listed(self, path: Path) -> None:
         """Raise DataError if a file exists that no tool wrote."""
-        if path.is_file() and not self.lists(path):
+        if path.is_file() and not self.has_entry(path):
             raise DataError(f"{path}: exists and was not made from this scene; use another folder, or remove the file")
 
     def _name(self, path: Path) -> str:

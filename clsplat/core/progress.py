@@ -101,8 +101,8 @@ class Count:
         """The estimated time for the remaining items; None before the first is done."""
         if not self.is_even or self._start is None or self.done <= self._start[1]:
             return None
-        start, before = self._start
-        return (time.monotonic() - start) / (self.done - before) * (self.total - self.done)
+        start, start_count = self._start
+        return (time.monotonic() - start) / (self.done - start_count) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
         """Record and report how many items are done; a count of 0 items is not reported."""
@@ -111,12 +111,12 @@ class Count:
             return
         if self._start is None or self.done < self._start[1]:
             self._start = time.monotonic(), done
-        left = self.seconds_left
+        seconds_left = self.seconds_left
         if listener := _listener.get():
-            listener(self.label, done, self.total, seconds_left=left)
+            listener(self.label, done, self.total, seconds_left=seconds_left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            remaining = f", {clock(left)} left" if left else ""
+            remaining = f", {clock(seconds_left)} left" if seconds_left else ""
             LOG.log(_level.get(), "%s: %d of %d%s", self.label, done, self.total, remaining)
 
 
@@ -131,11 +131,11 @@ def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
 @contextmanager
 def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
     """Report progress of the block from a thread that polls how many items are done."""
-    ended, context = threading.Event(), contextvars.copy_context()
+    stop, context = threading.Event(), contextvars.copy_context()
 
     def watch() -> None:
         start = time.monotonic()
-        while not ended.wait(min(max(MIN_POLL_INTERVAL, (time.monotonic() - start) / MAX_POLLS), MAX_POLL_INTERVAL)):
+        while not stop.wait(min(max(MIN_POLL_INTERVAL, (time.monotonic() - start) / MAX_POLLS), MAX_POLL_INTERVAL)):
             done = poll()
             if done > count.done:
                 count.reach(min(done, count.total))
@@ -145,7 +145,7 @@ def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
     try:
         yield
     finally:
-        ended.set()
+        stop.set()
         thread.join()
 
 

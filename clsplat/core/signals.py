@@ -83,14 +83,14 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
         _received.record(number)
         stop()
 
-    before = _handlers()
+    previous_handlers = _handlers()
     _received.blocks += 1
     try:
-        for number in before:
+        for number in previous_handlers:
             signal.signal(number, handler)
         yield
     finally:
-        for number, previous in before.items():
+        for number, previous in previous_handlers.items():
             signal.signal(number, previous)
         _received.blocks -= 1
         if not _received.blocks:
@@ -99,8 +99,8 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 def stop_at_once() -> None:
     """Raise KeyboardInterrupt; during an import, which it would break, wait for the import to end."""
-    waited = time.monotonic() - _received.since if _received.number else 0.0
-    if waited < IMPORT_SECONDS and _is_importing():
+    wait_seconds = time.monotonic() - _received.since if _received.number else 0.0
+    if wait_seconds < IMPORT_SECONDS and _is_importing():
         _thread.start_new_thread(_signal_again, (_received.number or signal.SIGINT,))  # `threading` would take a lock
     else:
         raise KeyboardInterrupt

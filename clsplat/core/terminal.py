@@ -180,8 +180,8 @@ def counts_on_terminal() -> Iterator[None]:
     task = bar.add_task("", total=None, visible=False)
 
     def update(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
-        bar.update(task, total=total, completed=done, description=f"{label}: {done} of {total}{left}", visible=True)
+        suffix = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
+        bar.update(task, total=total, completed=done, description=f"{label}: {done} of {total}{suffix}", visible=True)
 
     with _draw(bar), listening(update):
         yield
@@ -216,12 +216,12 @@ class _RunBar:
         time_now = time.monotonic()
         if self.last and self.last[1].steps == steps:
             since, report = self.last
-            left = max(0.0, report.seconds_left - (time_now - since))
-            return progress_line(replace(report, step=step, seconds_left=left))
+            seconds_left = max(0.0, report.seconds_left - (time_now - since))
+            return progress_line(replace(report, step=step, seconds_left=seconds_left))
         if self.first is None or self.first[2] != steps:
             self.first = time_now, step, steps
-        since, before, _ = self.first
-        seconds = (time_now - since) / (step - before) * (steps - step) if step > before else None
+        since, start_step, _ = self.first
+        seconds = (time_now - since) / (step - start_step) * (steps - step) if step > start_step else None
         return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
 
 

@@ -15,7 +15,7 @@ from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, Photographs, apply_mask
-from clsplat.render.painter import inside
+from clsplat.render.painter import crop
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.scene.view import View
 
@@ -48,14 +48,14 @@ class RenderedView:
         """Render the views of photographs, one after another.  background: [3]."""
         return (cls.render(rasterizer, model, photograph, background) for photograph in photographs)
 
-    def counted(self) -> NDArray[np.bool_]:
+    def counted_pixels(self) -> NDArray[np.bool_]:
         """Return the mask of pixels that count, [height, width]."""
-        camera, mask = self.photograph.camera, self.photograph.counted()
+        camera, mask = self.photograph.camera, self.photograph.counted_pixels()
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
     def error(self) -> Floats:
         """Return the absolute difference of render and photograph, averaged over channels, [height, width]."""
-        image = inside(self.frame, self.frame.image.get())
+        image = crop(self.frame, self.frame.image.get())
         error: Floats = np.abs(image - self.photograph.image() / np.float32(255)).mean(axis=2)
         return error
 
@@ -78,7 +78,7 @@ class RenderedView:
         plane: the texture, [height, width], 0 or more; None for 0.  channel: the differentiated loss is the sum of this
         channel over the image; None for no loss.
         """
-        camera, counted = self.photograph.camera, self.counted()
+        camera, counted = self.photograph.camera, self.counted_pixels()
         texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
         texture[: camera.height, : camera.width] = np.where(counted, 0 if plane is None else plane, -1)
         uploaded = self._workspace.array("surveyed texture", texture.shape)
@@ -138,7 +138,7 @@ class Survey:
         indices = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
         return [self.views[index] for index in np.sort(indices)]
 
-    def cached(self, function: Callable[..., Result], *arguments: Any) -> Result:
+    def compute_once(self, function: Callable[..., Result], *arguments: Any) -> Result:
         """Return function(survey, *arguments), computed only once for all rules of the edit."""
         key = function, arguments
         if key not in self._cache:

@@ -70,7 +70,7 @@ class Gltf:
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes | None) -> None:
         self.path, self.tree, self.binary = path, tree, binary
-        self.left = self.unpacked = 0  # bytes that may still be read, and bytes of unpacked SPZ data
+        self.bytes_left = self.spz_bytes = 0  # bytes that may still be read, and bytes of unpacked SPZ data
         self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
         self.notes: set[str] = set()  # about the file, for the user
         self.is_mip = False
@@ -131,9 +131,9 @@ class Gltf:
         data, start, length, _ = self._view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])
         self.is_mip |= splats.mode == "mip"
-        self.unpacked += sum(table.nbytes for table in splats.parameters.values())
-        if self.unpacked > 4 * max(RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as much as a single SPZ
-            raise DataError(f"{self.path}: its SPZ data unpack to {self.unpacked} bytes; export it again")
+        self.spz_bytes += sum(table.nbytes for table in splats.parameters.values())
+        if self.spz_bytes > 4 * max(RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as much as a single SPZ
+            raise DataError(f"{self.path}: its SPZ data unpack to {self.spz_bytes} bytes; export it again")
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
         position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
         if len(splats) and {"min", "max"} <= position.keys():
@@ -186,8 +186,8 @@ class Gltf:
                 f"{self.path}: accessor {number} has {count} rows, more than fit into its view of {length} bytes; "
                 "copy or export it again"
             )
-        self.left -= count * size
-        if self.left < 0:
+        self.bytes_left -= count * size
+        if self.bytes_left < 0:
             raise DataError(f"{self.path}: its accessors share too much data; export it again")
         require_memory(self.path, count, 0)
         rows = np.ndarray((count, width), kind, data, start + offset, (stride, np.dtype(kind).itemsize))
@@ -233,7 +233,7 @@ class Gltf:
                 "export it again"
             )
         self.files[uri] = data
-        self.left += SHARED * len(data)
+        self.bytes_left += SHARED * len(data)
         return data
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
@@ -243,11 +243,11 @@ class Gltf:
         seen: set[int] = set()
         waiting = [(_index(root), np.eye(4)) for root in self._roots()]
         while waiting:
-            number, above = waiting.pop()
+            number, parent_matrix = waiting.pop()
             if number in seen:
                 raise DataError(f"{self.path}: its nodes are not a tree: node {number} occurs twice; export it again")
             seen.add(number)
-            matrix = above @ self._matrix(number)
+            matrix = parent_matrix @ self._matrix(number)
             if not np.isfinite(matrix).all():
                 raise DataError(f"{self.path}: node {number} has no finite transform; export it again")
             if "mesh" in nodes[number]:
@@ -479,8 +479,8 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)
     scales = np.exp(np.clip(p["log_scales"].astype(np.float64), -80, 80))
-    around = EXTENT * scales.max(axis=1, keepdims=True)
-    extent = np.stack([(p["means"] - around).min(axis=0), (p["means"] + around).max(axis=0)])
+    half_sides = EXTENT * scales.max(axis=1, keepdims=True)
+    extent = np.stack([(p["means"] - half_sides).min(axis=0), (p["means"] + half_sides).max(axis=0)])
     harmonics = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(-1, 3)
     tables = {
         "float3[] extent": extent,

@@ -133,7 +133,7 @@ def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
             bits = struct.unpack_from("<I", data, 21)[0]
             return (bits & 16383) + 1, (bits >> 14 & 16383) + 1
         if kind == b"VP8X":
-            sides = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+            sides = (int.from_bytes(data[offset : offset + 3], "little") + 1 for offset in (24, 27))
             return next(sides), next(sides)
     raise DataError(f"{path}: {name} is not a lossless WebP image; export the file again")
 

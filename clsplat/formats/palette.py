@@ -42,8 +42,8 @@ class _Cells:
 
     def __init__(self, ordered: NDArray[np.float64]) -> None:
         self.ordered, self.center = ordered, ordered[len(ordered) // 2]
-        around = ordered - self.center
-        self.sums, self.squares = _sums(around), _sums(np.square(around))
+        offsets = ordered - self.center
+        self.sums, self.squares = _sums(offsets), _sums(np.square(offsets))
 
     def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the mean of each cell, or the value before an empty cell."""
@@ -65,12 +65,12 @@ class _Cells:
                 np.searchsorted(self.ordered, self.means(cuts)), cuts[:-1], cuts[1:]
             )  # clipped for empty cells
             gain = errors - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
-            worst = int(gain.argmax())
-            loss[max(worst - 1, 0) : worst + 1] = np.inf  # neighbors of the split cell
-            cheap = int(loss.argmin())
-            if gain[worst] <= loss[cheap] * (1 + 1e-9):
+            split = int(gain.argmax())
+            loss[max(split - 1, 0) : split + 1] = np.inf  # neighbors of the split cell
+            merge = int(loss.argmin())
+            if gain[split] <= loss[merge] * (1 + 1e-9):
                 break
-            cuts = np.sort(np.append(np.delete(cuts, cheap + 1), middle[worst]))
+            cuts = np.sort(np.append(np.delete(cuts, merge + 1), middle[split]))
         return cuts
 
 

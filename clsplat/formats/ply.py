@@ -370,13 +370,13 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_degree(path, names)) - 1)))
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
-        wide = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
-        parameters["means"] = np.where(np.isfinite(parameters["means"]), wide, parameters["means"])
+        doubles = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
+        parameters["means"] = np.where(np.isfinite(parameters["means"]), doubles, parameters["means"])
     rest = reorder_columns(_columns(vertices, columns), 3, len(columns) // 3)
     parameters["sh_rest"] = np.ascontiguousarray(rest[:, : 3 * (sh_coefficients(MAX_DEGREE) - 1)])
     if is_flat:
-        thin = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
-        parameters["log_scales"] = np.hstack([parameters["log_scales"], thin]).astype(np.float32)
+        smallest = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
+        parameters["log_scales"] = np.hstack([parameters["log_scales"], smallest]).astype(np.float32)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
         with np.errstate(over="ignore"):  # infinity is refused later

@@ -355,10 +355,10 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     if splats.rendering:
         meta["extras"] = {"clsplat": splats.rendering}
 
-    def image(name: str, *planes: NDArray[Any], across: int = width) -> str:
+    def image(name: str, *planes: NDArray[Any], columns: int = width) -> str:
         pixels = np.full((len(planes[0]), 4), 255, np.uint8)
         pixels[:, : len(planes)] = np.stack(planes, axis=1)
-        data = packing.encode(path, pixels, across)
+        data = packing.encode(path, pixels, columns)
         name += f"_{sha256(data).hexdigest()[:DIGITS]}" * in_folder + ".webp"
         images[name] = data
         return name
@@ -379,11 +379,11 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
 
 def _write_folder(path: Path, images: dict[str, bytes]) -> str:
     """Write images and then meta.json, so that the old model stays valid until then; remove unused images."""
-    before, new = set(sog_folder_files(path)), {path.with_name(name) for name in images}
-    unused = new - before
+    old_files, new_files = set(sog_folder_files(path)), {path.with_name(name) for name in images}
+    unused = new_files - old_files
     try:
         sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
-        unused = before - new
+        unused = old_files - new_files
     finally:
         for file in unused - set(sog_folder_files(path)):
             if file.suffix == ".webp":
@@ -393,10 +393,10 @@ def _write_folder(path: Path, images: dict[str, bytes]) -> str:
 
 
 def _means(p: Parameters, image: Any) -> dict[str, Any]:
-    wide = p["means"].astype(np.float64)
-    t = np.sign(wide) * np.log1p(np.abs(wide))
-    ends = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
-    minimum, maximum = (np.array([_short(end, way) for end in row]) for row, way in ends)
+    means = p["means"].astype(np.float64)
+    t = np.sign(means) * np.log1p(np.abs(means))
+    extrema = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
+    minimum, maximum = (np.array([_short(value, rounding) for value in values]) for values, rounding in extrema)
     span = np.where(maximum > minimum, maximum - minimum, 1)
     levels = np.rint(65535 * (t - minimum) / span).astype(np.uint16)
     files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
@@ -484,7 +484,7 @@ def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> 
 
 def _write_harmonics(sh: Harmonics, bands: int, image: Any) -> dict[str, Any]:
     size = sh.palette.shape[1] // 3
-    files = [image("shN_centroids", *sh.palette.reshape(-1, 3).T, across=PER_ROW * size)]
+    files = [image("shN_centroids", *sh.palette.reshape(-1, 3).T, columns=PER_ROW * size)]
     files.append(image("shN_labels", sh.labels & 255, sh.labels >> 8, np.zeros_like(sh.labels)))
     return {"count": len(sh.palette), "bands": bands, "codebook": sh.numbers.tolist(), "files": files}
 

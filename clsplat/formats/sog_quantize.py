@@ -46,11 +46,11 @@ def round_means(
 
 def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return positions in SOG levels, [N, 3], and the smallest logarithm and the level size of each axis, [3]."""
-    wide = means.astype(np.float64)
-    t = np.sign(wide) * np.log1p(np.abs(wide))
-    low, span = t.min(axis=0), np.ptp(t, axis=0)
+    positions = means.astype(np.float64)
+    logarithms = np.sign(positions) * np.log1p(np.abs(positions))
+    low, span = logarithms.min(axis=0), np.ptp(logarithms, axis=0)
     level = np.where(span > 0, span, 1) / LEVELS
-    return np.rint((t - low) / level), low, level
+    return np.rint((logarithms - low) / level), low, level
 
 
 def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
@@ -70,14 +70,14 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
     smallest angle is chosen: w is then the largest component, and the others are small.
     """
     q, rows = unit(quats), np.arange(len(quats))
-    along, taken = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
+    largest_w, turn = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
     for number, (w, x, y, z) in enumerate(_TURNS):
-        size = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
-        taken, along = np.where(size > along, number, taken), np.maximum(size, along)
-    largest, others = smallest_three(multiply(q, _TURNS[taken]))
+        w_size = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
+        turn, largest_w = np.where(w_size > largest_w, number, turn), np.maximum(w_size, largest_w)
+    largest, others = smallest_three(multiply(q, _TURNS[turn]))
     levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5) / step) * step, 0, 255)
-    turned = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
-    return turned, log_scales[rows[:, None], _axes(_TURNS)[taken]].astype(np.float32)
+    rounded = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
+    return rounded, log_scales[rows[:, None], _axes(_TURNS)[turn]].astype(np.float32)
 
 
 def _axes(turns: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -113,9 +113,9 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
     form = np.zeros((count, count))
     for start in range(0, len(rest) if largest else 0, ROWS):
         block = rest[start : start + ROWS].astype(np.float64) / largest
-        whole = np.rint(PALETTE_LEVELS * np.clip(block, -1, 1)).reshape(-1, count, 3)
+        levels = np.rint(PALETTE_LEVELS * np.clip(block, -1, 1)).reshape(-1, count, 3)
         for channel in range(3):
-            form += whole[:, :, channel].T @ whole[:, :, channel]
+            form += levels[:, :, channel].T @ levels[:, :, channel]
     trace = np.trace(form)
     return (form * (count / trace) if trace else form) + ISOTROPIC * np.eye(count)
 
@@ -142,15 +142,15 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
     feedback /= np.diag(feedback)[:, None].copy()
     rounded = np.empty(rest.shape, np.float32)
     for start in range(0, len(rest), ROWS):
-        part, step = rest[start : start + ROWS], steps[start : start + ROWS]
-        left = np.ascontiguousarray(part.reshape(len(part), count, 3)[:, ::-1].transpose(1, 2, 0), np.float32)
+        block, step = rest[start : start + ROWS], steps[start : start + ROWS]
+        remaining = np.ascontiguousarray(block.reshape(len(block), count, 3)[:, ::-1].transpose(1, 2, 0), np.float32)
         for k in range(count):
-            wanted = left[k].copy()
-            left[k] = np.rint(wanted / step) * step
-            error = wanted - left[k]
+            exact = remaining[k].copy()
+            remaining[k] = np.rint(exact / step) * step
+            error = exact - remaining[k]
             for later in range(k + 1, count):
-                left[later] -= feedback[k, later] * error
-        rounded[start : start + ROWS] = left[::-1].transpose(2, 0, 1).reshape(part.shape)
+                remaining[later] -= feedback[k, later] * error
+        rounded[start : start + ROWS] = remaining[::-1].transpose(2, 0, 1).reshape(block.shape)
     return rounded
 
 
@@ -204,19 +204,19 @@ def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], e
     while parts < entries:
         totals = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half can be empty
         mean = _sums(labels, weights, points, parts) / totals[:, None]
-        away = (points - mean[labels]).astype(np.float32)
-        spread = _sums(labels, weights, np.square(away), parts)
+        offsets = (points - mean[labels]).astype(np.float32)
+        spread = _sums(labels, weights, np.square(offsets), parts)
         errors = np.where(np.bincount(labels, minlength=parts) > 1, spread.sum(axis=1), 0)
         max_chosen = min(entries - parts, -(-parts // round(1 / AT_ONCE)))
         chosen = np.argsort(-errors, kind="stable")[:max_chosen]
         chosen = chosen[errors[chosen] > 0]
         if not len(chosen):
             break
-        new = np.full(parts, -1)
-        new[chosen] = np.arange(len(chosen))
-        rows = np.flatnonzero(new[labels] >= 0)
-        cluster = new[labels[rows]]
-        is_second = away[rows, spread.argmax(axis=1)[labels[rows]]] > 0
+        number_of = np.full(parts, -1)
+        number_of[chosen] = np.arange(len(chosen))
+        rows = np.flatnonzero(number_of[labels] >= 0)
+        cluster = number_of[labels[rows]]
+        is_second = offsets[rows, spread.argmax(axis=1)[labels[rows]]] > 0
         is_second = _bisect(points[rows], weights[rows], cluster, is_second)
         labels[rows[is_second]] = parts + cluster[is_second]
         parts += len(chosen)
@@ -277,8 +277,8 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
 def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which distances, [N], are before the gap that separates a sky; all if there is no gap."""
     ordered, count = np.sort(distances), len(distances)
-    within = np.arange(1, count + 1)
-    inside = np.searchsorted(ordered, ordered / GAP, side="right")
-    ends = (inside >= INSIDE * within) & (within >= MIN_INSIDE * count) & (count - within >= MIN_BEHIND * count)
-    ends &= ordered > 0
-    return distances <= ordered[ends][-1] / 2 if ends.any() else np.ones(count, np.bool_)
+    counts = np.arange(1, count + 1)
+    close_counts = np.searchsorted(ordered, ordered / GAP, side="right")
+    is_end = (close_counts >= INSIDE * counts) & (counts >= MIN_INSIDE * count) & (count - counts >= MIN_BEHIND * count)
+    is_end &= ordered > 0
+    return distances <= ordered[is_end][-1] / 2 if is_end.any() else np.ones(count, np.bool_)

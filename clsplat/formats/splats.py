@@ -174,8 +174,8 @@ def concatenate(parts: Sequence[Parameters]) -> Parameters:
 
 def logits(alpha: Floats) -> NDArray[np.float32]:
     """Return the logits of opacities in [0, 1]; 0 and 1 become MIN_ALPHA and 1 - MIN_ALPHA."""
-    inside = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
-    return np.asarray(np.log(inside / (1 - inside)), np.float32)
+    clipped = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
+    return np.asarray(np.log(clipped / (1 - clipped)), np.float32)
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
@@ -197,10 +197,10 @@ def logs(scales: Floats) -> NDArray[np.float32]:
 
 def unit(quats: Floats) -> NDArray[np.float64]:
     """Return unit quaternions [N, 4]; those of length 0 become (1, 0, 0, 0)."""
-    wide = quats.astype(np.float64)
-    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    doubles = quats.astype(np.float64)
+    length = np.linalg.norm(doubles, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(length > 0, wide / length, [1.0, 0, 0, 0])
+        return np.where(length > 0, doubles / length, [1.0, 0, 0, 0])
 
 
 def flip_axes(parameters: Parameters, axes: Sequence[float] = FLIP) -> Parameters:
@@ -295,8 +295,8 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     if not options.quiet:
         fault = f"{count:,} Gaussians have an opacity of 0 or 1, or a scale of 0, without a finite logit or logarithm"
         LOG.warning("%s: %s; they are moved by %g", path, fault, MIN_ALPHA)
-    ends, flat_scale = logits((logit > 0).astype(np.float32)), np.float32(FLAT_LOG_SCALE)
-    limits = {"logit_opacity": np.where(infinite, ends, logit), "log_scales": np.where(flat, flat_scale, log_scales)}
+    bound, flat_scale = logits((logit > 0).astype(np.float32)), np.float32(FLAT_LOG_SCALE)
+    limits = {"logit_opacity": np.where(infinite, bound, logit), "log_scales": np.where(flat, flat_scale, log_scales)}
     return replace(splats, parameters={**splats.parameters, **limits})
 
 

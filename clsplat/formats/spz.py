@@ -148,8 +148,8 @@ def _positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32
     if header.version == 1:
         return data.view("<f2").astype(np.float32)
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
-    whole = (low | middle << 8 | (high ^ 128) << 16) - (1 << 23)
-    return (whole.astype(np.float32) / np.float32(2**header.fraction)).reshape(-1, 3)
+    integers = (low | middle << 8 | (high ^ 128) << 16) - (1 << 23)
+    return (integers.astype(np.float32) / np.float32(2**header.fraction)).reshape(-1, 3)
 
 
 def _three_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -272,14 +272,14 @@ class ZstdFrame:
     """A frame of `size` bytes, read in parts.  Raises DataError for another size or a damaged frame."""
 
     def __init__(self, path: Path, data: bytes, size: int) -> None:
-        self.path, self.size, self.left = path, size, size
+        self.path, self.size, self.bytes_left = path, size, size
         self.stream, self.error = _open_zstd(data)
 
     def read(self, size: int) -> bytes:
         """Return the next `size` bytes."""
         data = self._read(size)
-        self.left -= size
-        if len(data) != size or (not self.left and self._read(1)):
+        self.bytes_left -= size
+        if len(data) != size or (not self.bytes_left and self._read(1)):
             fault = "too short" if len(data) != size else "too long"
             raise DataError(f"{self.path}: a stream is {fault}; expected {self.size} bytes; copy or export it again")
         return data
@@ -448,14 +448,14 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
     start, frames = table + 16 * streams, []
     for number, size in enumerate(sizes):
-        stored, declared = struct.unpack_from("<2Q", data, table + 16 * number)
-        if declared != size or stored > len(data) - start:
+        length, unpacked = struct.unpack_from("<2Q", data, table + 16 * number)
+        if unpacked != size or length > len(data) - start:
             raise DataError(
-                f"{path}: stream {number} declares {stored} bytes for {declared}; expected {size} for {header.count} "
+                f"{path}: stream {number} declares {length} bytes for {unpacked}; expected {size} for {header.count} "
                 "splats, inside the file; copy or export it again"
             )
-        frames.append(ZstdFrame(path, data[start : start + stored], size))
-        start += stored
+        frames.append(ZstdFrame(path, data[start : start + length], size))
+        start += length
     if start != len(data):
         raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
     return header, decode(header, [frame.read for frame in frames]), axes

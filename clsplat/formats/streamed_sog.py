@@ -55,7 +55,7 @@ def read_lod(path: Path) -> SplatFile:
     parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
     _require_count(path, meta, 0, runs)
     if "environment" in meta:
-        parts.append(read_sog(path.parent / _inside(path, meta["environment"])))
+        parts.append(read_sog(path.parent / _check_name(path, meta["environment"])))
     return SplatFile(concatenate([part.parameters for part in parts]), parts[0].rendering, parts[0].mode)
 
 
@@ -88,7 +88,7 @@ def lod_files(path: Path) -> list[Path]:
     """Return a lod-meta.json and all files of its levels."""
     meta = _meta(path)
     names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
-    metas = [path.parent / _inside(path, name) for name in names]
+    metas = [path.parent / _check_name(path, name) for name in names]
     return [path, *(file for meta in metas for file in sog_folder_files(meta))]
 
 
@@ -98,7 +98,7 @@ def _meta(path: Path) -> dict[str, Any]:
         version = quote(meta.get("version") if isinstance(meta, dict) else meta)
         raise DataError(f"{path}: streamed SOG of version {version}; expected 1; export it again")
     names, counts = meta.get("filenames"), meta.get("counts")
-    if not isinstance(names, list) or len({PureWindowsPath(_inside(path, name)) for name in names}) < len(names):
+    if not isinstance(names, list) or len({PureWindowsPath(_check_name(path, name)) for name in names}) < len(names):
         raise DataError(f"{path}: filenames is {quote(names)}; expected distinct file names; export it again")
     if not isinstance(counts, list) or not 1 <= len(counts) <= MAX_LEVELS:
         raise DataError(
@@ -112,7 +112,7 @@ def _meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _inside(path: Path, name: Any) -> str:
+def _check_name(path: Path, name: Any) -> str:
     """Validate the name of a meta.json below the folder."""
     if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quote(name)}; expected a {META} in a folder below; export it again")
@@ -143,10 +143,10 @@ def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
 
 
 def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> None:
-    count, declared = sum(count for leaves in runs.values() for _, count in leaves), meta["counts"][level]
-    if count != declared:
+    count, expected = sum(count for leaves in runs.values() for _, count in leaves), meta["counts"][level]
+    if count != expected:
         raise DataError(
-            f"{path}: declares {quote(declared)} splats of level {level}, but its leaves have {count}; export it again"
+            f"{path}: declares {quote(expected)} splats of level {level}, but its leaves have {count}; export it again"
         )
 
 

@@ -378,16 +378,16 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
     center = np.median(means, axis=0) if center is None else center
     radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), QUANTILE))
     directions = fibonacci(count)
-    across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
-    added: dict[str, NDArray[Any]] = {
+    log_scale = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
+    sky_tables: dict[str, NDArray[Any]] = {
         "means": center + radius * directions,
         "quats": _rotations_to(directions),
-        "log_scales": np.tile([across, across, across + np.log(FLAT)], (count, 1)),
+        "log_scales": np.tile([log_scale, log_scale, log_scale + np.log(FLAT)], (count, 1)),
         "logit_opacity": np.full((count, 1), LOGIT),
         "sh_base": (np.clip(sample_texels(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
         "sh_rest": np.zeros((count, model.sh_rest.shape[1])),
     }
-    tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in added.items()}
+    tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in sky_tables.items()}
     if model.motion is not None:
         tables["motion"] = np.concatenate([model.motion, static_motion(count, model.motion.shape[1])])
     notes = {**model.rendering.notes, "sky": "splats"}
@@ -399,8 +399,8 @@ def fibonacci(count: int) -> NDArray[np.float64]:
     number = np.arange(count)
     z = 1 - (2 * number + 1) / count
     angle = number * np.pi * (3 - np.sqrt(5))
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
 def _rotations_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ class Deferred:
         self._lanes = int(device.tuning["LANES"])
         self._factors = device.zeros((max_updates, 2))
         self._visible = device.zeros(self._lanes, np.uint32)  # replaces the depth keys of a view, for all blocks
-        self._done = device.zeros(self._blocks, np.uint32)  # updates applied to each block
+        self._updates = device.zeros(self._blocks, np.uint32)  # updates applied to each block
 
     @property
     def _blocks(self) -> int:
@@ -58,7 +58,7 @@ class Deferred:
             on_host = self.gaussians.on_host
             for _ in on_host.parts() if on_host else [None]:
                 self._replay(self._visible, every=0xFFFFFFFF)
-            self._done.fill(0)
+            self._updates.fill(0)
             self.updates = 0
 
     def prepare(self, degree: int) -> None:
@@ -69,8 +69,8 @@ class Deferred:
         if self.updates == self.max_updates or degree != self._degree:
             self.flush()
         self._degree = degree
-        if self._done.shape != (self._blocks,):  # rearranged since the last flush
-            self._done = self.gaussians.device.zeros(self._blocks, np.uint32)
+        if self._updates.shape != (self._blocks,):  # rearranged since the last flush
+            self._updates = self.gaussians.device.zeros(self._blocks, np.uint32)
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
         """Record an update that visible blocks have already received; factors: rate and correction2 of adam.h.
@@ -81,7 +81,7 @@ class Deferred:
             items=-(-self.gaussians.count // self._lanes),
             depth_key=depth_key,
             factors=self._factors,
-            done=self._done,
+            done=self._updates,
             rate=factors[0],
             correction2=factors[1],
             update=self.updates,
@@ -99,7 +99,7 @@ class Deferred:
             **slot_arguments(self.gaussians),
             depth_key=depth_key,
             factors=self._factors,
-            done=self._done,
+            done=self._updates,
             every=every,
             updates=self.updates,
             components=3 * (sh_coefficients(self._degree) - 1),

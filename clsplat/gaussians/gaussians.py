@@ -302,7 +302,7 @@ def visibility_arguments(model: DeviceModel, view: int | None, mask: Array) -> d
 
     view: the index of a training view with hidden Gaussians; mask: [S], written if the model has a dropout.
     """
-    hidden = _hidden(model.gaussians, view)
+    hidden = _hidden_arguments(model.gaussians, view)
     if model.dropout is None:
         return {**hidden, "opacity_factor": 1.0}
     gaussians, dropout = model.gaussians, model.dropout
@@ -319,7 +319,7 @@ def visibility_arguments(model: DeviceModel, view: int | None, mask: Array) -> d
     return {"hidden": mask, "hidden_plane": 0, "hidden_bit": 1, "opacity_factor": dropout.opacity_factor}
 
 
-def _hidden(gaussians: Gaussians, view: int | None) -> dict[str, Any]:
+def _hidden_arguments(gaussians: Gaussians, view: int | None) -> dict[str, Any]:
     if view is None or HIDDEN not in gaussians.tables:
         any_table = gaussians["filter_variance"]  # its bits are masked out
         return {"hidden": any_table, "hidden_plane": 0, "hidden_bit": 0}

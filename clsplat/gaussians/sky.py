@@ -29,10 +29,10 @@ def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
     """Map directions, [..., 3], to texel coordinates, [..., 2] from -0.5; texel centers are integers."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
-    below = np.minimum(directions[..., 2:], 0)
-    folded = directions[..., :2] - sign[..., :2] * below
-    inside = folded / np.abs(directions).sum(axis=-1, keepdims=True)
-    return np.asarray((inside + 1) * (side / 2) - 0.5, np.float64)
+    negative_z = np.minimum(directions[..., 2:], 0)
+    folded = directions[..., :2] - sign[..., :2] * negative_z
+    square = folded / np.abs(directions).sum(axis=-1, keepdims=True)
+    return np.asarray((square + 1) * (side / 2) - 0.5, np.float64)
 
 
 def texel_directions(side: int) -> Floats:
@@ -50,10 +50,10 @@ def texel_indices(i: Integers, j: Integers, side: int) -> Integers:
 
     Beyond an edge, the map continues at the mirrored position of the same edge.
     """
-    beyond = (i < 0) | (i >= side)
-    i, j = np.clip(i, 0, side - 1), np.where(beyond, side - 1 - j, j)
-    beyond = (j < 0) | (j >= side)
-    i, j = np.where(beyond, side - 1 - i, i), np.clip(j, 0, side - 1)
+    is_outside = (i < 0) | (i >= side)
+    i, j = np.clip(i, 0, side - 1), np.where(is_outside, side - 1 - j, j)
+    is_outside = (j < 0) | (j >= side)
+    i, j = np.where(is_outside, side - 1 - i, i), np.clip(j, 0, side - 1)
     return j * side + i
 
 

@@ -43,10 +43,10 @@ class Grow(Rule):
 
     def condition(self, edit: Edit) -> dict[str, Any]:
         """Return the rule's condition, and whether opacity is shared, as arguments of `Edit.mark`."""
-        above = edit.at(self.gradient_above)
+        threshold = edit.at(self.gradient_above)
         if self.as_many_as:
-            above = edit.matching_threshold(self.statistic, self.as_many_as, above)
-        return {"statistic": self.statistic, "gradient_above": above, "shared": self.opacity == "shared"}
+            threshold = edit.matching_threshold(self.statistic, self.as_many_as, threshold)
+        return {"statistic": self.statistic, "gradient_above": threshold, "shared": self.opacity == "shared"}
 
 
 class Clone(Grow):

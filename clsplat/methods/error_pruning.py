@@ -16,7 +16,7 @@ from clsplat.losses.base import ViewGradients
 from clsplat.losses.image import view_error
 from clsplat.methods.mini_splatting import sampled_weights
 from clsplat.opencl.device import Array
-from clsplat.render.painter import inside
+from clsplat.render.painter import crop
 from clsplat.scene.view import View
 
 HIDDEN = -40.0  # logit of an invisible opacity
@@ -27,8 +27,8 @@ def squared_error(survey: Survey, views: list[View]) -> float:
     """Return the squared error of the renders, summed over unmasked pixels."""
     total = 0.0
     for render in survey.render(views):
-        difference = inside(render.frame, render.frame.image.get()) - render.photograph.image() / np.float32(255)
-        total += float((difference[render.counted()].astype(np.float64) ** 2).sum())
+        difference = crop(render.frame, render.frame.image.get()) - render.photograph.image() / np.float32(255)
+        total += float((difference[render.counted_pixels()].astype(np.float64) ** 2).sum())
     return total
 
 
@@ -71,7 +71,7 @@ class PruneRedundant(Rule):
 
     def mark(self, edit: Edit) -> None:
         survey, gaussians = edit.survey, edit.gaussians
-        order = np.argsort(survey.cached(sampled_weights).total, kind="stable")
+        order = np.argsort(survey.compute_once(sampled_weights).total, kind="stable")
         views = survey.sample_views(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 

@@ -29,7 +29,7 @@ def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongP
     sampled = survey.sample_views(views)
     total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
     for render in survey.render(sampled):
-        error, counted = render.error().astype(np.float64), render.counted()
+        error, counted = render.error().astype(np.float64), render.counted_pixels()
         is_wrong = counted & (normalize(error, counted) > error_above)
         pixels = render.sum(BLENDED, is_wrong).astype(np.int64)  # integers below 2^24: exact in float32
         total += pixels
@@ -49,7 +49,7 @@ class ByWrongPixels(Rule):
 
     def count_wrong_pixels(self, edit: Edit) -> WrongPixels:
         """Return the counts for the Gaussians before the edit."""
-        return edit.survey.cached(count_wrong_pixels, self.views, self.error_above)
+        return edit.survey.compute_once(count_wrong_pixels, self.views, self.error_above)
 
 
 class RevertGrowth(ByWrongPixels):

@@ -27,7 +27,7 @@ def edge_map(render: RenderedView) -> Floats:
     """Return the magnitude of the gradient of the photograph's luminance (Sobel), from 0 to 1, [height, width]."""
     gray = render.photograph.image().mean(axis=2, dtype=np.float64)
     edges = np.hypot(*(scipy.ndimage.sobel(gray, axis, mode="nearest") for axis in (0, 1)))
-    return normalize(edges, render.counted())
+    return normalize(edges, render.counted_pixels())
 
 
 def edge_scores(survey: Survey, views: int) -> Floats:
@@ -70,7 +70,7 @@ class SplitLongAxis(Rule):
         gaussians = edit.gaussians
         chosen = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.rows() == 1)
         if edit.room is not None and edit.room < chosen.sum():
-            order = sampling_order(chosen, edit.survey.cached(edge_scores, self.views), edit.random())
+            order = sampling_order(chosen, edit.survey.compute_once(edge_scores, self.views), edit.random())
             chosen = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
         rows = np.flatnonzero(chosen)
         means, quats, log_scales, logits = (

@@ -98,9 +98,9 @@ class SplitTextured(Subdivide):
 
     def mark(self, edit: Edit) -> None:
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
-        above = edit.threshold(self.texture, self.texture_above)
+        threshold = edit.threshold(self.texture, self.texture_above)
         is_seen = edit.gaussians.get(SEEN)[:, 0] > 0
-        candidates = is_seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
+        candidates = is_seen & (texture >= threshold) & (gradient >= edit.at(self.gradient_above))
         self.subdivide(edit, candidates, texture)
 
 
@@ -203,8 +203,8 @@ class MergeNeighbors(Rule):
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
         distances, neighbors = scipy.spatial.cKDTree(means).query(means, k=2)
-        other = np.where(neighbors[:, 0] == rows, 1, 0)  # with equal means, a row may be its own second neighbor
-        distance, nearest = distances[rows, other], neighbors[rows, other]
+        column = np.where(neighbors[:, 0] == rows, 1, 0)  # with equal means, a row may be its own second neighbor
+        distance, nearest = distances[rows, column], neighbors[rows, column]
         is_mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
         is_close = distance < edit.at(self.distance_below) * (size + size[nearest])

@@ -63,7 +63,7 @@ class PruneUseless(Rule):
     """Fraction of the weight in all views that is kept; the smallest weights are removed."""
 
     def mark(self, edit: Edit) -> None:
-        weights = edit.survey.cached(sampled_weights, self.weight_per_view, self.views)
+        weights = edit.survey.compute_once(sampled_weights, self.weight_per_view, self.views)
         keep = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
         edit.choose(~keep, copies=0, old_rows=0)
 

@@ -24,7 +24,7 @@ def normalize_by_median(values: NDArray[np.floating]) -> Floats:
 
 def pixel_weights(render: RenderedView) -> Floats:
     """Return the error of a view's pixels plus the edges of its photograph, each scaled to [0, 1], [height, width]."""
-    counted = render.counted()
+    counted = render.counted_pixels()
     edges = np.abs(scipy.ndimage.laplace(render.photograph.image().mean(axis=2), mode="nearest"))
     return normalize(render.error().astype(np.float64), counted) + normalize(edges, counted)
 
@@ -41,7 +41,7 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
         radius = render.radius()
         row = view.world_to_camera[2]
         depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
-        pixels = render.sum(BLENDED, pixel_weights(render)), render.sum(BLENDED, np.ones(render.counted().shape))
+        pixels = render.sum(BLENDED, pixel_weights(render)), render.sum(BLENDED, np.ones(render.counted_pixels().shape))
         values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, render.sum(WEIGHT))
         loss = render.loss(LOSSES) * (radius > 0)
         losses += loss
@@ -63,7 +63,7 @@ class ByScore(Rule):
 
     def score(self, edit: Edit) -> Floats:
         """Return the scores, [N], 0 or more."""
-        gaussians, (losses, terms) = edit.gaussians, edit.survey.cached(view_scores, self.views)
+        gaussians, (losses, terms) = edit.gaussians, edit.survey.compute_once(view_scores, self.views)
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         volume = np.exp(gaussians.get("log_scales").astype(np.float64).sum(axis=1))
         values = (25, edit.stats.mean("screen_grad")), (100, opacity), (25, volume)
@@ -89,10 +89,10 @@ class GrowScored(ByScore):
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
         # first the clones, which keep the original, with their part of the room; then the splits with the remainder
-        for kind, part in ((keep, (is_undone & keep).sum() / is_undone.sum()), (~keep, 1.0)):
+        for kind, fraction in ((keep, (is_undone & keep).sum() / is_undone.sum()), (~keep, 1.0)):
             order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
-            grows = added <= round(part * room)
+            grows = added <= round(fraction * room)
             is_undone[order[grows]] = False
             room -= int(added[grows][-1]) if grows.any() else 0
         edit.undo_growth(is_undone)

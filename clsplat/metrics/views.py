@@ -347,7 +347,7 @@ def measure(
         if finite:
             require_finite(floats, view)
         rendered = to_8_bits(floats)
-        image, mask = photograph.image(), photograph.counted()
+        image, mask = photograph.image(), photograph.counted_pixels()
         color = color_metrics(floats, image, mask, colors) if colors else {}
         still = flicker_meter.add(view, rendered, image, mask)
         if mask is None:

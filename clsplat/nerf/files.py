@@ -117,13 +117,13 @@ def load_field(path: str | Path) -> FieldModel:
     if not path_exists(path):
         raise DataError(f"{path}: not found; expected a file of the stage export_field")
     try:
-        return _checked(*archive.read(path))
+        return _parse_field(*archive.read(path))
     except (DataError, ValueError) as error:
         reason = shorten(one_line(error))
         raise DataError(f"{path}: {reason}; expected an intact file of the stage export_field") from error
 
 
-def _checked(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
+def _parse_field(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
     """Return the field that a file contains.  Raises DataError or ValueError."""
     if notes.get("format") != FORMAT or "shape" not in notes:
         raise DataError(f"has the format {quote(str(notes.get('format')))}, or is not a field")

@@ -45,7 +45,7 @@ class Network:
         skip, width = self.shape.skip, self.shape.width
         if skip is None:
             return self._table("position", tiles, self.shape.position_rows), 0
-        return self._hidden(skip, tiles), width
+        return self._trunk_outputs(skip, tiles), width
 
     def direction(self, tiles: int) -> tuple[Array, int]:
         """Return the table with the encoded direction, as `position` does."""
@@ -57,7 +57,7 @@ class Network:
         until the next call."""
         x = _Table(*self.position(tiles))
         for i, layer in enumerate([self._first, *self._trunk]):
-            outputs = self._hidden(i, tiles)
+            outputs = self._trunk_outputs(i, tiles)
             self._apply(layer, parameters, x, outputs, RELU)
             x = _Table(outputs)
         densities = self._table("densities", tiles, COLOR_ROWS)
@@ -75,28 +75,28 @@ class Network:
         Returns the gradient of the grid's features, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
         tiles, width = grad_colors.shape[0], self.shape.width
-        last, direction = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.direction(tiles)[0])
+        last, direction = _Table(self._trunk_outputs(self.shape.depth - 1, tiles)), _Table(self.direction(tiles)[0])
         conditioned = _Table(self._table("conditioned", tiles, self.shape.color_width))
         grad_conditioned = self._table("by conditioned", tiles, self.shape.color_width)
         grad_direction, grad_x = self._table("by direction", tiles, width), self._table("by hidden", tiles, width)
         self._sum(self._color, conditioned, grad_colors)
-        self._derive(self._color, parameters, grad_colors, conditioned, grad_conditioned, RELU)
+        self._differentiate(self._color, parameters, grad_colors, conditioned, grad_conditioned, RELU)
         self._sum(self._condition, direction, grad_conditioned)
-        self._derive(self._condition, parameters, grad_conditioned, direction, grad_direction, NO_LIMIT)
+        self._differentiate(self._condition, parameters, grad_conditioned, direction, grad_direction, NO_LIMIT)
         self._sum(self._density, last, grad_densities)
         self._sum(self._bottleneck, last, grad_direction)
-        self._derive(self._density, parameters, grad_densities, last, grad_x, NO_LIMIT)
-        self._derive(self._bottleneck, parameters, grad_direction, last, grad_x, RELU, kept=1)
+        self._differentiate(self._density, parameters, grad_densities, last, grad_x, NO_LIMIT)
+        self._differentiate(self._bottleneck, parameters, grad_direction, last, grad_x, RELU, kept=1)
         for i in range(len(self._trunk), 0, -1):
-            inputs, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
+            inputs, layer = _Table(self._trunk_outputs(i - 1, tiles)), self._trunk[i - 1]
             self._sum(layer, inputs, grad_x)
             if i - 1 == self.shape.skip:
-                self._derive_grid(layer, parameters, grad_x, self.shape.width, kept=0)
+                self._grid_gradient(layer, parameters, grad_x, self.shape.width, kept=0)
             grad_inputs = self._table(f"by hidden {i % 2}", tiles, width)
-            self._derive(layer, parameters, grad_x, inputs, grad_inputs, RELU)
+            self._differentiate(layer, parameters, grad_x, inputs, grad_inputs, RELU)
             grad_x = grad_inputs
         self._sum(self._first, _Table(*self.position(tiles)), grad_x)
-        grad_grid = self._derive_grid(self._first, parameters, grad_x, 0, kept=int(self.shape.skip is not None))
+        grad_grid = self._grid_gradient(self._first, parameters, grad_x, 0, kept=int(self.shape.skip is not None))
         count = self.shape.network_parameters
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
@@ -107,14 +107,14 @@ class Network:
         )
         return grad_grid
 
-    def _derive_grid(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, kept: int) -> Array:
+    def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, kept: int) -> Array:
         """Compute the gradient of the grid's features, which a layer reads starting at a row."""
         tiles = grad_outputs.shape[0]
         position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
-        self._derive(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, kept, row)
+        self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, kept, row)
         return grad_grid
 
-    def _hidden(self, i: int, tiles: int) -> Array:
+    def _trunk_outputs(self, i: int, tiles: int) -> Array:
         """Return the outputs of layer i of the trunk, with room for the encoded position if it is appended there."""
         extra = self.shape.position_rows if i == self.shape.skip else 0
         return self._table(f"hidden {i}", tiles, self.shape.width + extra)
@@ -144,7 +144,7 @@ class Network:
             count=count,
         )
 
-    def _derive(
+    def _differentiate(
         self,
         layer: DenseLayer,
         parameters: Array,

@@ -42,7 +42,7 @@ class GridShape(Settings):
     """Side of the cube, in units of `unit`."""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "GridShape":
+    def _check_levels(self) -> "GridShape":
         if self.finest < self.coarsest:
             raise ValueError(f"'finest' must be at least 'coarsest', {self.coarsest}; got {self.finest}")
         if self.levels == 1 and self.finest != self.coarsest:
@@ -150,7 +150,7 @@ class FieldShape(Settings):
     """Number of frequencies of the direction's encoding."""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "FieldShape":
+    def _check_depths(self) -> "FieldShape":
         if self.far <= self.near:
             raise ValueError(f"'far' must be larger than 'near', {self.near:g}; got {self.far:g}")
         if self.skip is not None and self.skip >= self.depth - 1:
@@ -254,7 +254,7 @@ class FieldShape(Settings):
         return layers
 
 
-def _with_all_keys(value: Any) -> Any:
+def _require_all_keys(value: Any) -> Any:
     """Return a shape from a file, in scene units if it has no unit.  Raises ValueError if another key is missing, since
     defaults may have changed, or if the unit is not a number."""
     written = {"unit": 1.0, "unit_auto": None, **value} if isinstance(value, dict) and value else {}
@@ -269,4 +269,4 @@ def _with_all_keys(value: Any) -> Any:
     return written or value
 
 
-WrittenShape = Annotated[FieldShape, BeforeValidator(_with_all_keys)]  # the shape in a file
+WrittenShape = Annotated[FieldShape, BeforeValidator(_require_all_keys)]  # the shape in a file

@@ -257,7 +257,7 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
     corner, side = np.array(cube.corner), cube.side
     if not any(_intersect(corner + side * CORNERS, _corners(view, shape.near, shape.far, unit)) for view in views):
         fault = f"no training view sees its cube at depths from {shape.near:g} to {shape.far:g}"
-    elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64) / unit).any():
+    elif points and len(points) and not _is_in_cube(cube, np.asarray(points.positions, np.float64) / unit).any():
         fault = f"none of the scene's {len(points):,} points is in its cube"
     else:
         return
@@ -268,7 +268,7 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
     )
 
 
-def _inside(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
+def _is_in_cube(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
     """Return which points, [M, 3], are in a cube."""
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 

@@ -428,16 +428,16 @@ class Kernel:
     def _check(self, values: dict[str, Any]) -> list[Any]:
         if len(values) != len(self.arguments):
             self._raise_argument_error(values)
-        checked = []
+        result = []
         for argument in self.arguments:
             value = values.get(argument.name)
             if not argument.pointer and value is not None:
-                checked.append(value)
+                result.append(value)
             elif isinstance(value, Array) and (argument.dtype is None or value.dtype == argument.dtype):
-                checked.append(value.buffer)
+                result.append(value.buffer)
             else:
                 self._raise_argument_error(values)
-        return checked
+        return result
 
     def _raise_argument_error(self, values: dict[str, Any]) -> NoReturn:
         expected = {a.name: a for a in self.arguments}

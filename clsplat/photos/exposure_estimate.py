@@ -76,10 +76,10 @@ def complete_exposures(measured: Exposures, exif: Exposures) -> Exposures:
     """
     if not measured.log_gains:
         return exif
-    both, new = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
-    if not both or not new:
+    shared, new = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
+    if not shared or not new:
         return measured
-    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in both], axis=0)
+    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in shared], axis=0)
     combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in new}}
     mean = np.mean(list(combined.values()), axis=0)
     source = f"{measured.source}, those of {len(new)} {exif.source}"

@@ -41,7 +41,7 @@ class Photograph:
         """Return the colors on the host, [height, width, 3]."""
         return np.asarray(self.colors.get().transpose(1, 2, 0))
 
-    def counted(self) -> Mask | None:
+    def counted_pixels(self) -> Mask | None:
         """Return the mask of unmasked pixels, [height, width]; None if there is no mask."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 

@@ -154,5 +154,5 @@ class Sampler:
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.view_at(self._pool, step), self.settings.divisor(step)
-        small = view.resized(view.downscale * divisor)
-        return Sample(small, view, self._numbers[id(view)], self.settings.transforms, step)
+        resized = view.resized(view.downscale * divisor)
+        return Sample(resized, view, self._numbers[id(view)], self.settings.transforms, step)

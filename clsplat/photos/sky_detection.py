@@ -110,9 +110,9 @@ def sky_mask(image: Image, points: NDArray[np.floating], unmasked: Mask) -> Mask
     spread = np.sqrt(np.maximum(_blur(brightness**2, unmasked) - mean**2, 0))
     blue = (values[..., 2] > values[..., 0] + MIN_BLUE_MINUS_RED) & (values[..., 2] > MIN_BLUE)
     sky = ((brightness > MIN_BRIGHTNESS) | blue) & (spread < MAX_DEVIATION) & _far_from_points(points, brightness.shape)
-    joined = (sky & unmasked) | np.logical_and.accumulate(~unmasked, axis=0)
-    _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
-    return np.asarray(sky & unmasked & np.isin(parts, parts[0][joined[0]]))
+    connected = (sky & unmasked) | np.logical_and.accumulate(~unmasked, axis=0)
+    _, parts = cv2.connectedComponents(connected.astype(np.uint8), connectivity=4)
+    return np.asarray(sky & unmasked & np.isin(parts, parts[0][connected[0]]))
 
 
 def _blur(values: NDArray[np.float32], unmasked: Mask) -> NDArray[np.float32]:

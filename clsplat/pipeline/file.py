@@ -137,13 +137,13 @@ class RasterizerSettings(Settings):
 STAGE_LISTS = ("prepare", "stages")
 
 
-def _folder_name(name: str) -> str:
+def _check_folder_name(name: str) -> str:
     if fault := invalid_name_reason(name):
         raise ValueError(f"expected the name of a folder: {fault}")
     return name
 
 
-Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_folder_name)]  # not only dots
+Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_check_folder_name)]  # not only dots
 
 
 class PipelineFile(Settings):

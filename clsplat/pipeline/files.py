@@ -16,7 +16,7 @@ SHORT = "_7k"  # ending of the names of short pipelines
 HAS_SHORT = re.compile(rb"^short\s*:", re.MULTILINE)
 
 
-def shipped() -> dict[str, Path]:
+def shipped_pipelines() -> dict[str, Path]:
     """Return the paths of the shipped pipelines by name, sorted."""
     files = list(resource_dir("pipelines").glob("*.yaml"))
     files += [file.with_stem(file.stem + SHORT) for file in files if HAS_SHORT.search(file.read_bytes())]
@@ -45,7 +45,7 @@ def find(name: str) -> Path:
         if origin(path) != path:
             return path
         raise ConfigError(f"{path}: no such pipeline file")
-    files = shipped()
+    files = shipped_pipelines()
     if name in files:
         return files[name]
     if is_run:

@@ -95,10 +95,10 @@ def load(name: str, overrides: list[str] | None = None) -> Pipeline:
     Raises ConfigError with file, line, key and the nearest match.
     """
     path = find(name)
-    return checked(path, read_yaml(path), overrides or [])
+    return check_document(path, read_yaml(path), overrides or [])
 
 
-def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
+def check_document(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
     """Check a document with overrides, without changing it.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")

@@ -30,7 +30,7 @@ from clsplat.pipeline.execution import Execution, LocalExecution
 from clsplat.pipeline.explanation import explain, key_path_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
-from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.loading import Pipeline, check_document
 from clsplat.pipeline.stretching import stretch_to_steps
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
@@ -180,7 +180,7 @@ def _bases(path: Path, document: Document, matrix: Matrix) -> list[_Base]:
         try:
             file = find(name)
             base = _Base(file.stem, file, read_yaml(file))
-            checked(base.path, base.document)
+            check_document(base.path, base.document)
         except ConfigError as error:
             line = document.line(("matrix", "pipelines", i))
             raise ConfigError(f"{path}:{line}: matrix.pipelines[{i}]: {error}") from error
@@ -215,7 +215,7 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
     parts = [base.label, *(choice.label for choice in choices)]
     name = re.sub(r"[^\w.=+-]+", "_", "-".join(part for part in parts if part))
     try:
-        pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
+        pipeline = check_document(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
     except OverrideError as error:
         raise ConfigError(f"{base.path}: cell '{shorten(name)}' of the matrix: {error.reason}") from error
     return Cell(name, pipeline)
@@ -229,10 +229,10 @@ def _check_choices(
     path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
 ) -> None:
     """Check each value of the matrix separately.  Raises ConfigError with the key of the first invalid one."""
-    checked(base.path, base.document, list(overrides))
+    check_document(base.path, base.document, list(overrides))
     for choice in itertools.chain(*axes):
         try:
-            checked(base.path, base.document, [*overrides, choice.override])
+            check_document(base.path, base.document, [*overrides, choice.override])
         except OverrideError as error:
             key_path, line = key_path_text(choice.key_path), document.line(choice.key_path)
             raise ConfigError(f"{path}:{line}: {key_path}: {error.reason}") from error

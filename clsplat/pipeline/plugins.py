@@ -73,7 +73,7 @@ def load_installed() -> None:
             _loaded[entry.name] = _load_entry(entry)
 
 
-def loaded() -> list[Plugin]:
+def loaded_plugins() -> list[Plugin]:
     """Return the plug-ins that are imported."""
     return list(_loaded.values())
 
@@ -87,7 +87,7 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
     bases = {base for kind in kinds for base in kind.__mro__}
     return {
         plugin.name: plugin.digest
-        for plugin in loaded()
+        for plugin in loaded_plugins()
         if not plugin.installed or any(kind in bases or not issubclass(kind, Settings) for kind in plugin.kinds)
     }
 

@@ -12,7 +12,7 @@ from clsplat.core.settings import Settings, needs_settings, variants
 from clsplat.core.text_table import text_table
 from clsplat.pipeline.execution import LocalExecution
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.files import find, origin, shipped
+from clsplat.pipeline.files import find, origin, shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix
 from clsplat.pipeline.overrides import Key, list_keys
@@ -35,12 +35,13 @@ def summary(path: Path) -> str:
 
 def summaries() -> list[dict[str, str]]:
     """Return the name, summary and path of each shipped pipeline."""
-    return [{"name": name, "summary": summary(path), "path": str(origin(path))} for name, path in shipped().items()]
+    files = shipped_pipelines()
+    return [{"name": name, "summary": summary(path), "path": str(origin(path))} for name, path in files.items()]
 
 
 def summaries_text(pipelines: list[dict[str, str]]) -> str:
     """Return `summaries` as a table."""
-    return text_table(((pipeline["name"], pipeline["summary"]) for pipeline in pipelines), left=2)
+    return text_table(((pipeline["name"], pipeline["summary"]) for pipeline in pipelines), left_columns=2)
 
 
 def manual(name: str) -> dict[str, Any]:

@@ -46,7 +46,7 @@ class Document:
         return self.lines.get(key_path, 1)
 
 
-class _NotAllowed(Exception):
+class _BadValue(Exception):
     """A value that is not allowed in a file of settings, and its line."""
 
     def __init__(self, node: Any, complaint: str) -> None:
@@ -67,7 +67,7 @@ class _Bounded(Composer):
         self._count += 1
         if self._depth > DEPTH_LIMIT or self._count > NODE_LIMIT:
             depth, count = "lists and maps are nested too deeply", f"more than {NODE_LIMIT} values"
-            raise _NotAllowed(self.parser.peek_event(), depth if self._depth > DEPTH_LIMIT else count)
+            raise _BadValue(self.parser.peek_event(), depth if self._depth > DEPTH_LIMIT else count)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -95,9 +95,9 @@ def _short(text: str, path: Path, file: Path) -> str:
     root = YAML(typ="safe", pure=True).compose(text)
     key, short = next(pair for pair in root.value if pair[0].value == "short")
     root.value.remove((key, short))  # the keys inside it cannot be set
-    above = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
+    comment = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
     values = {key_path.value: text[value.start_mark.index : value.end_mark.index] for key_path, value in short.value}
-    edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
+    edits = [(key.start_mark.index - len(comment), short.end_mark.index, "")]
     for key_path, value in {"name": path.stem, **values}.items():
         if not (node := _node(root, key_path)):
             line = f"{file}:{document.line(('short', key_path))}: short"
@@ -105,7 +105,7 @@ def _short(text: str, path: Path, file: Path) -> str:
         edits.append((node.start_mark.index, node.end_mark.index, value))
     for first, last, new in sorted(edits, reverse=True):
         text = text[:first] + new + text[last:]
-    return f"{above}#\n{text}"
+    return f"{comment}#\n{text}"
 
 
 def _node(root: Node, key_path: str) -> Node | None:
@@ -156,7 +156,7 @@ def _parse(text: str, name: str) -> Document:
     try:
         root = yaml.compose(text)
         return _Reader(yaml).document(root)
-    except _NotAllowed as error:
+    except _BadValue as error:
         line, complaint = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
@@ -185,7 +185,7 @@ class _Reader:
     def _plain(self, node: Node, key_path: KeyPath) -> Any:
         self._remaining -= 1
         if self._remaining < 0:
-            raise _NotAllowed(node, f"more than {NODE_LIMIT} values")
+            raise _BadValue(node, f"more than {NODE_LIMIT} values")
         if isinstance(node, MappingNode) and node.tag == f"{CORE}map":
             return self._map(node, key_path)
         if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
@@ -196,7 +196,7 @@ class _Reader:
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
         tag = shorten(str(node.tag).replace(CORE, "!!"))
-        raise _NotAllowed(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
+        raise _BadValue(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
     def _map(self, node: MappingNode, key_path: KeyPath) -> dict[str, Any]:
         data: dict[str, Any] = {}
@@ -207,11 +207,11 @@ class _Reader:
                 continue
             key = self._plain(key_node, key_path) if isinstance(key_node, ScalarNode) else None
             if not isinstance(key, str):
-                raise _NotAllowed(
+                raise _BadValue(
                     key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
                 )
             if key in data:
-                raise _NotAllowed(key_node, f"duplicate key {quote(key)}")
+                raise _BadValue(key_node, f"duplicate key {quote(key)}")
             self._lines[*key_path, key] = key_node.start_mark.line + 1
             data[key] = self._plain(value, (*key_path, key))
         for part in merged:
@@ -221,7 +221,7 @@ class _Reader:
     def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
         """Return the map that `<<` refers to; the line of a key that the outer map also has does not change."""
         if not isinstance(node, MappingNode):
-            raise _NotAllowed(node, "expected a map after '<<'")
+            raise _BadValue(node, "expected a map after '<<'")
         outer, self._lines = self._lines, {}
         data: dict[str, Any] = self._plain(node, key_path)
         self._lines, inner = outer, self._lines
@@ -234,7 +234,7 @@ class _Reader:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
             kind = str(node.tag).removeprefix(CORE)
-            raise _NotAllowed(node, f"{quote(node.value)} cannot be read as {kind}") from None
+            raise _BadValue(node, f"{quote(node.value)} cannot be read as {kind}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
-            raise _NotAllowed(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
+            raise _BadValue(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
         return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)

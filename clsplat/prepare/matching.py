@@ -144,15 +144,15 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
                 "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", invalid[0]
             )
             images = [image for image in images if not _has_space(image.name)]
-        wanted = [image.name in unplaced for image in images]
+        targets = [image.name in unplaced for image in images]
         candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
-            if (wanted[i] or wanted[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
+            if (targets[i] or targets[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(candidates) > max_pairs:
             similarities = similarity(_descriptors(rows, images))
-            candidates = _closest(candidates, similarities, wanted, max(1, max_pairs // sum(wanted)))
+            candidates = _closest(candidates, similarities, targets, max(1, max_pairs // sum(targets)))
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 

@@ -34,12 +34,12 @@ def render_layers(
 ) -> Layers:
     """Render a view.  background: [3]; depth: render it too, in a second pass."""
     frame = rasterizer.forward(model, camera, background)
-    image = inside(frame, frame.image.get())
-    alpha = inside(frame, 1 - np.abs(frame.transmittance.get()[None]))[:, :, 0]
+    image = crop(frame, frame.image.get())
+    alpha = crop(frame, 1 - np.abs(frame.transmittance.get()[None]))[:, :, 0]
     return Layers(image, alpha, _depth(rasterizer, model, camera) if depth else None)
 
 
-def inside(frame: Frame, planes: Floats) -> Floats:
+def crop(frame: Frame, planes: Floats) -> Floats:
     """Crop planes, [channels, rows, stride], to the image; return [height, width, channels]."""
     return np.ascontiguousarray(planes[:, : frame.camera.height, : frame.camera.width].transpose(1, 2, 0))
 
@@ -47,7 +47,7 @@ def inside(frame: Frame, planes: Floats) -> Floats:
 def _depth(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> Floats:
     black = rasterizer.device.upload(np.zeros(3, np.float32))
     frame = rasterizer.forward(model, camera, black, "depth")
-    planes = inside(frame, frame.image.get())
+    planes = crop(frame, frame.image.get())
     weight = planes[:, :, 1]
     return np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
 

@@ -47,25 +47,25 @@ class Failures(dict[str, ClsplatError]):
 
 
 @contextmanager
-def recording_failures(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
+def recording_failures(status: StatusFile, reraise: bool = False) -> Iterator[None]:
     """Turn any failure of the block into a ClsplatError, and write it to status.json.
 
-    as_raised: re-raise the original exception instead.
+    reraise: re-raise the original exception instead.
     """
     try:
         yield
     except BaseException as error:
-        is_interrupt = isinstance(error, KeyboardInterrupt) and not as_raised
-        failure = _interrupted(status) if is_interrupt else as_clsplat_error(error)
+        is_interrupt = isinstance(error, KeyboardInterrupt) and not reraise
+        failure = _interrupted_error(status) if is_interrupt else as_clsplat_error(error)
         with suppress(OutputError):  # the failure itself is more important
             state: Literal["interrupted", "failed"] = "interrupted" if isinstance(failure, Interrupted) else "failed"
             status.end(state, failure.exit_code, one_line(failure))
-        if failure is error or as_raised:
+        if failure is error or reraise:
             raise
         raise failure from error
 
 
-def _interrupted(status: StatusFile) -> Interrupted:
+def _interrupted_error(status: StatusFile) -> Interrupted:
     """Return the error of a run that a signal ended at once, with advice on how to continue."""
     now, resume = status.now, f"`clsplat resume {shell_quote(status.out)}`"
     if not (status.has_run and now.step):  # the folder is unchanged

@@ -49,22 +49,22 @@ from clsplat.viewer.video.plan import parse_times, require_motion
 
 # Models on the host: Gaussians, or a field.
 
-Loaded = Model | FieldModel
+AnyModel = Model | FieldModel
 
 
-def read(file: Path) -> Loaded:
+def read(file: Path) -> AnyModel:
     """Read a model file or a field file.  Raises DataError if it is missing, damaged or another file."""
     return load_field(file) if is_field(file) else load(file)
 
 
-def make_painter(loaded: Loaded, device: Device, background: Background) -> Painter:
+def make_painter(loaded: AnyModel, device: Device, background: Background) -> Painter:
     """Return a painter of a model on a device.  background: for Gaussians; a field has its own."""
     if isinstance(loaded, FieldModel):
         return loaded.upload(device)
     return SplatPainter(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
 
 
-def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
+def points_of(loaded: AnyModel, scene: Scene | None) -> NDArray[np.float32]:
     """Return points of the content, [M, 3]: the means of Gaussians, or the points of the scene, if any, for a field."""
     if isinstance(loaded, Model):
         return loaded.scene_means
@@ -72,12 +72,12 @@ def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
     return np.zeros((0, 3), np.float32) if points is None else points.positions
 
 
-def is_moving(loaded: Loaded) -> bool:
+def is_moving(loaded: AnyModel) -> bool:
     """Return whether a model has motion."""
     return isinstance(loaded, Model) and loaded.motion is not None
 
 
-def size_of(loaded: Loaded) -> dict[str, int | None]:
+def size_of(loaded: AnyModel) -> dict[str, int | None]:
     """Return the number of Gaussians or of network parameters, with the keys of metrics.json."""
     if isinstance(loaded, Model):
         return {"gaussians": len(loaded)}
@@ -98,15 +98,15 @@ class ModelSource:
     alpha: Alpha | None = None  # None: as the model file says
 
     @classmethod
-    def of(cls, model: Path, scene: Path | None) -> "ModelSource":
+    def from_model(cls, model: Path, scene: Path | None) -> "ModelSource":
         """Find the photos of a run folder, or of a file that a run exported; other files need `scene`.
 
         `scene`, a dataset folder or run folder, replaces the photos of the model's run.  Raises DataError if a file is
         missing, and ConfigError if the scene is unknown.
         """
         run = find_run(model)
-        trained = scene if scene is not None and has_pipeline(scene) else run
-        if trained is None and scene is None:
+        folder = scene if scene is not None and has_pipeline(scene) else run
+        if folder is None and scene is None:
             if model.is_dir() and not model_file(model).is_file():
                 raise _missing_model_error(model)
             if not model.exists():
@@ -114,7 +114,7 @@ class ModelSource:
             raise ConfigError(
                 f"{model}: a model file does not name its scene; give the folder of the scene, or a run folder"
             )
-        settings = load_pipeline(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
+        settings = load_pipeline(str(folder / PIPELINE)).settings.scene if folder is not None else SceneSettings()
         file = trained_file(model) if run == model else model
         if run == model and not file.is_file():
             raise _missing_model_error(model, file.name)
@@ -333,7 +333,7 @@ class ModelFile:
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
         """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
-        self.source = ModelSource.of(model, scene)
+        self.source = ModelSource.from_model(model, scene)
         loaded = read(self.source.file)
         self.device = open_verified(device)
         original = self.source.scene(loaded)
@@ -401,7 +401,7 @@ def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "n
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; expected a folder to write into")
     if isinstance(scene, Path) and has_pipeline(scene):
-        source = ModelSource.of(scene, None)
+        source = ModelSource.from_model(scene, None)
         resolved = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
     else:
         resolved = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)

@@ -78,10 +78,10 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     rehearsal = rehearse_enough(pipeline, run, minutes, until)
     steps, planned = pipeline.settings.training.steps, rehearsal.steps_in(until - time.perf_counter())
     if planned < min_steps_of(pipeline):
-        raise _too_short(minutes, pipeline)
+        raise _too_short_error(minutes, pipeline)
     reason = f"--minutes {minutes:g}: {planned:,} steps instead of {steps:,}, by a rehearsal"
     LOG.info("%s", reason)
-    plan = replace(pipeline, settings=_reporting(stretch(pipeline.settings, Fraction(planned, steps))), reason=reason)
+    plan = replace(pipeline, settings=_add_reports(stretch(pipeline.settings, Fraction(planned, steps))), reason=reason)
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
         planned, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
@@ -155,14 +155,14 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
     """
     LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
     short = stretch(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
-    short_pipeline, started = replace(pipeline, settings=_reporting(short)), time.perf_counter()
+    short_pipeline, started = replace(pipeline, settings=_add_reports(short)), time.perf_counter()
     reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
 
     def check_time() -> None:
         # the first report may include the building of kernels
         step_time = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0
         if time.perf_counter() + min_steps_of(pipeline) * step_time > until:
-            raise _too_short(minutes, pipeline)
+            raise _too_short_error(minutes, pipeline)
 
     def show(report: Progress) -> None:
         run.status.count("steps", report.step, report.steps)
@@ -206,7 +206,7 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
     return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **reset, **changes)
 
 
-def _reporting(settings: PipelineFile) -> PipelineFile:
+def _add_reports(settings: PipelineFile) -> PipelineFile:
     """Return settings with a minimum of REPORTS reports per training."""
 
     def with_reports(training: Training) -> Training:
@@ -228,7 +228,7 @@ def _require_one_training(pipeline: Pipeline) -> None:
         )
 
 
-def _too_short(minutes: float, pipeline: Pipeline) -> ConfigError:
+def _too_short_error(minutes: float, pipeline: Pipeline) -> ConfigError:
     return ConfigError(
         f"--minutes {minutes:g}: too short: this scene needs at least {min_steps_of(pipeline)} steps on this device; "
         "use more minutes, or smaller images (--set scene.downscale=2)"

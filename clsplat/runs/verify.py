@@ -27,7 +27,7 @@ from clsplat.gaussians.model import load as load_model
 from clsplat.gaussians.validate import examine, is_model
 from clsplat.nerf.files import is_field, load_field
 from clsplat.pipeline import plugins
-from clsplat.pipeline.files import origin, shipped
+from clsplat.pipeline.files import origin, shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import read_note
@@ -247,11 +247,11 @@ def check(pipeline: str) -> dict[str, Any]:
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):
         return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.parameter_count}
     state = RunState.read(Path(pipeline))
-    if not state.phase and pipeline not in shipped() and is_model(Path(pipeline)):
+    if not state.phase and pipeline not in shipped_pipelines() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if len(Path(pipeline).parts) > 1 and not path_exists(origin(Path(pipeline))):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
-    if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped()):
+    if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped_pipelines()):
         return verify(state)
     if experiment := load_experiment(pipeline):
         return {

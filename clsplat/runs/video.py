@@ -24,7 +24,7 @@ from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.model_file import (
     KINDS,
-    Loaded,
+    AnyModel,
     ModelSource,
     find_run,
     is_moving,
@@ -41,7 +41,7 @@ from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import BUDGET, Page, Which, is_viewer, view_entries
+from clsplat.viewer.page import BUDGET, IncludedPhotos, Page, is_viewer, view_entries
 from clsplat.viewer.video.frames import Canvas, Image, letterbox
 from clsplat.viewer.video.paths import Floats, nearest_view
 from clsplat.viewer.video.plan import Side, VideoPlan, VideoRequest, layer_files, plan_video, render_video
@@ -114,18 +114,20 @@ def make_video(
     }
 
 
-def _read(model: Path) -> Loaded:
+def _read(model: Path) -> AnyModel:
     """Read the model of a file or a run folder, without its photos."""
     file = trained_file(model) if has_pipeline(model) else model
     return read(file if is_field(file) else model)
 
 
-def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, is_required: bool) -> Scene | None:
+def _scene(
+    model: Path, scene: Path | None, loaded: AnyModel, downscale: float | None, is_required: bool
+) -> Scene | None:
     """Return the scene of a model at the image size of its run; None if it is unknown and not required."""
     if not is_required and scene is None and not has_pipeline(model):
         return None
     try:
-        source = ModelSource.of(model, scene)
+        source = ModelSource.from_model(model, scene)
     except DataError as error:
         if is_required or scene is not None:
             raise
@@ -170,7 +172,7 @@ def view(
     scene: Path | None = None,
     out: Path = Path("viewer.html"),
     *,
-    photographs: Which = "test",
+    photographs: IncludedPhotos = "test",
     photograph_budget: float = BUDGET,
     splats: int | None = None,
 ) -> Path:
@@ -192,7 +194,7 @@ def view(
         raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected a finite number of MB, 0 or more")
     for path in models:
         require_model(path)
-    source = next((ModelSource.of(path, scene) for path in models if scene is not None or find_run(path)), None)
+    source = next((ModelSource.from_model(path, scene) for path in models if scene is not None or find_run(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
     _warn_of_different_scenes(models, source)

@@ -235,10 +235,10 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
     return named
 
 
-def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
+def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", overwrite: bool = False) -> list[Path]:
     """Write the cameras of a scene and, with `images="copy"`, copies of the photographs and their exposures.
 
-    Returns the camera files.  The views have the size of the dataset.  over: whether to replace existing files.
+    Returns the camera files.  The views have the size of the dataset.  overwrite: whether to replace existing files.
     Raises ConfigError for an unknown format and for an existing file, DataError if the format cannot hold the scene.
     """
     for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
@@ -253,7 +253,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         )
     copies = image_files(named.views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
-    for path in () if over else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
+    for path in () if overwrite else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     files = WRITERS[format_](out, named)

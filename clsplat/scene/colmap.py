@@ -332,13 +332,13 @@ class ColmapReader(Reader):
         cameras = read_cameras(model)
         images, files, masks = self._files(path, images)
         views = [make_view(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
-        views = sorted((views[i] for i in files.existing(path, self.missing)), key=lambda view: view.name)
+        views = sorted((views[i] for i in files.existing_indices(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
         original = [view for view in views if view.image_path not in files.downscaled_files]
         points, tracks = (table.cloud(), make_tracks(images, table, original)) if table else (None, None)
         views = [fit_to_photograph(view) if view.image_path in files.downscaled_files else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
-        tracks = tracks and tracks.shifted(scene.origin).on_faces(scene.views)
+        tracks = tracks and tracks.shifted(scene.origin).split_by_face(scene.views)
         return replace(scene, tracks=tracks, skipped=files.skipped)
 
     def list_parts(self, parts: Parts) -> None:
@@ -415,8 +415,8 @@ def image_folder(path: Path, root: Path | None = None) -> Path:
     Without that folder, return the first `images` above it that is not above `root`.
     """
     folder = next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path)
-    above = [folder, *(parent for parent in folder.parents if root and parent.is_relative_to(root))]
-    return next((parent / "images" for parent in above if (parent / "images").is_dir()), above[-1] / "images")
+    folders = [folder, *(parent for parent in folder.parents if root and parent.is_relative_to(root))]
+    return next((parent / "images" for parent in folders if (parent / "images").is_dir()), folders[-1] / "images")
 
 
 def make_view(

@@ -127,7 +127,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
     unread = f"; {text}" if (text := unread_cameras(path)) else ""
     if any(is_image(file) for file in path.iterdir()):
-        above = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
+        parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {above}: give that folder" if above else remedy
         raise DataError(f"{path}: photographs without cameras; {remedy}{unread}")

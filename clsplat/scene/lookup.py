@@ -149,17 +149,17 @@ class FileLookup:
             parts = parts[len(parts) - parts[::-1].index("..") :]
         elif not path.anchor and self.folder.is_relative_to(self.root):
             parts = self.folder.relative_to(self.root).parts + parts
-        return tuple(map(_comparable, parts))
+        return tuple(map(_normalize, parts))
 
     @cached_property
     def _files(self) -> dict[str, list[tuple[Parts, Path]]]:
         """The image files below `root` and the comparable parts of their paths, by the comparable stem."""
         files, real = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
         for folder, names in walk_folders(self.root, MAX_DEPTH):
-            parts = tuple(map(_comparable, folder.relative_to(self.root).parts))
+            parts = tuple(map(_normalize, folder.relative_to(self.root).parts))
             for path in (folder / name for name in names if name[0] != "." and is_image(PurePath(name))):
                 if os.path.isfile(path) and Path(os.path.realpath(path)).is_relative_to(real):
-                    files[_stem(path.name)].append(((*parts, _comparable(path.name)), path))
+                    files[_stem(path.name)].append(((*parts, _normalize(path.name)), path))
         return files
 
     def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
@@ -189,8 +189,8 @@ class FileLookup:
     def _rank(self, dataset_name: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return how well a file fits a name, or None if it does not."""
         length, name = _common_end(target, parts), PureWindowsPath(dataset_name)
-        above = {*parts[:-length]}
-        is_other = any(map(OTHER_CONTENT.search, above)) or (SPLITS & above and SPLITS.intersection(target))
+        parents = {*parts[:-length]}
+        is_other = any(map(OTHER_CONTENT.search, parents)) or (SPLITS & parents and SPLITS.intersection(target))
         if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
             return None
         is_equal = parts[-1] == target[-1], path.name == name.name, path.stem == name.stem
@@ -207,7 +207,7 @@ class FileLookup:
             return f"{count} matched by {criterion}, such as {file} for {quote(self.listing[i])}{scaling}"
         return ""
 
-    def existing(self, source: Path, missing: Missing) -> list[int]:
+    def existing_indices(self, source: Path, missing: Missing) -> list[int]:
         """Return the indices of the files that exist.
 
         Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are.
@@ -235,21 +235,21 @@ class FileLookup:
             return f" ({first_few(fit)} fit {quote(self.listing[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
-        matched = {*self.paths}
-        free = {_stem(path.name): name for path, name in relative.items() if path not in matched}
+        used = {*self.paths}
+        free = {_stem(path.name): name for path, name in relative.items() if path not in used}
         similar = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
         nearest = f"the nearest file is {free[similar[0]].as_posix()}, " if similar else ""
         folders = Counter(path.parent.as_posix() for path in relative.values())
         return f" ({nearest}searched: {first_few([folder for folder, _ in folders.most_common()])})"
 
 
-def _comparable(text: str) -> str:
+def _normalize(text: str) -> str:
     return unicodedata.normalize("NFC", unquote(text)).strip().casefold()
 
 
 def _stem(name: str) -> str:
     """Return the comparable name of an image without its suffix."""
-    path = PureWindowsPath(_comparable(name))
+    path = PureWindowsPath(_normalize(name))
     return path.stem if is_image(path) or CONVERTED.fullmatch(path.suffix) else path.name
 
 

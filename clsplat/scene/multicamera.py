@@ -132,8 +132,8 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
         if name is None:
             continue
         if name in cameras:
-            both = f"{cameras[name].name} and {view.name}"
-            raise DataError(f"{path}: {both} are both poses of camera {name}; expected one pose per camera: remove one")
+            pair = f"{cameras[name].name} and {view.name}"
+            raise DataError(f"{path}: {pair} are both poses of camera {name}; expected one pose per camera: remove one")
         cameras[name] = view
     if unposed := sorted(set(frames) - set(cameras)):
         raise DataError(

@@ -40,7 +40,7 @@ class Tracks:
         """Return the tracks in coordinates whose zero is at `origin`, [3] in the current coordinates."""
         return replace(self, positions=self.positions - origin) if origin.any() else self
 
-    def on_faces(self, views: Iterable["View"]) -> "Tracks":
+    def split_by_face(self, views: Iterable["View"]) -> "Tracks":
         """Return the tracks with the points of wide photographs divided among the views of their faces."""
         by_view = dict(self.rows)
         for view in views:
@@ -300,9 +300,9 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     center = centers.mean(axis=0)
     if not share_center(centers):
         return 1.1 * float(np.linalg.norm(centers - center, axis=1).max())
-    around = np.zeros((0, 3)) if points is None else points.astype(np.float64)
-    around = around[np.isfinite(around).all(axis=1)]
-    distances = np.linalg.norm(around - center, axis=1) if len(around) else np.abs([views[0].world_to_camera[2, 3]])
+    finite = np.zeros((0, 3)) if points is None else points.astype(np.float64)
+    finite = finite[np.isfinite(finite).all(axis=1)]
+    distances = np.linalg.norm(finite - center, axis=1) if len(finite) else np.abs([views[0].world_to_camera[2, 3]])
     return float(np.median(distances)) or 1.0
 
 

@@ -128,7 +128,7 @@ class FrameFiles(FileLookup):
         for key in self.masks:
             names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
             files = FileLookup(self.root, self.folder, [*names.values()], strict=True, excluded=self.paths)
-            files.existing(source, "refuse")
+            files.existing_indices(source, "refuse")
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
     def views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
@@ -136,7 +136,7 @@ class FrameFiles(FileLookup):
 
         Raises DataError for damaged numbers and missing files.
         """
-        rows = self.existing(source, missing)
+        rows = self.existing_indices(source, missing)
         self.find_masks(source, rows)
         return [self.view(i, clock) for i in rows]
 

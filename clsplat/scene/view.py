@@ -94,13 +94,13 @@ class View:
 
         Raises ValueError when the target is at the position or in the direction of `up`.
         """
-        center, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
-        if not center.shape == point.shape == above.shape == (3,):
+        center, point, up_vector = (np.asarray(vector, np.float64) for vector in (position, target, up))
+        if not center.shape == point.shape == up_vector.shape == (3,):
             raise ValueError(f"{quote(name)}: expected a position, a target and `up` of 3 numbers each")
         forward = point - center
-        right = np.cross(forward, above)
+        right = np.cross(forward, up_vector)
         axes = np.stack([right, np.cross(forward, right), forward])
-        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
+        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up_vector):
             raise ValueError(f"{quote(name)}: expected a target away from the position and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
@@ -420,12 +420,12 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
         if view.image_path == NO_FILE:
             exposures.append(None)
             continue
-        candidates = (sidecars(folder).get(name) for folder, name in _below(view))
+        candidates = (sidecars(folder).get(name) for folder, name in _parent_folders(view))
         exposures.append(next(filter(None, candidates), None) or read_exif_exposure(view.image_path))
     return exposures
 
 
-def _below(view: View) -> Iterator[tuple[Path, str]]:
+def _parent_folders(view: View) -> Iterator[tuple[Path, str]]:
     """Yield the folders that contain the image, up to the one that its view's name starts from, and its path below."""
     parts = PurePosixPath(view.name if view.lens is None else photograph_name(view.name)).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):

@@ -20,12 +20,12 @@ from clsplat.scene.view import photograph_name
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
 ExcludedBy = Literal["holdout", "train", "missing"]
-Excluded = Mapping[ExcludedBy, Sequence[str]]  # names that cannot be selected, by reason: a setting, or missing files
-NONE: Excluded = {}
+ExcludedNames = Mapping[ExcludedBy, Sequence[str]]  # names to exclude, by reason: a setting, or missing files
+NONE: ExcludedNames = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 
-def _text(value: Any) -> Any:
+def _require_text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
     if not value.strip():
@@ -48,7 +48,7 @@ class ViewSelection(Settings):
     """Every n-th view, in order of name."""
     offset: Annotated[int, Field(ge=0)] = 0
     """Index of the first view, counted from 0."""
-    names: Annotated[list[Annotated[str, BeforeValidator(_text)]], Field(min_length=1)] | None = None
+    names: Annotated[list[Annotated[str, BeforeValidator(_require_text)]], Field(min_length=1)] | None = None
     """Names of the views."""
     file: InputPath | None = None
     """Text file with one name per line; a relative path is relative to the folder of the dataset."""
@@ -81,7 +81,7 @@ class ViewSelection(Settings):
         path = super().input_path(key, scene)
         return path and Path(scene or "") / path
 
-    def select(self, names: Sequence[str], folders: Sequence[Path], excluded: Excluded = NONE) -> set[int]:
+    def select(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> set[int]:
         """Return the indices of the selected `names`.
 
         folders: where to look for a relative file, in order.  excluded: names that must not be selected, and names with
@@ -101,7 +101,7 @@ class ViewSelection(Settings):
             LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(count, "name"))
         return {i for name, matches in matches_of.items() for i in _only_match(name, matches, names, source)}
 
-    def check(self, names: Sequence[str], folders: Sequence[Path], excluded: Excluded = NONE) -> list[str]:
+    def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> list[str]:
         """Return the listed names, some of which may be left out later; empty for every n-th view.
 
         excluded: names that must not be selected.  Raises DataError for a name that matches none, or only such names.
@@ -155,9 +155,9 @@ class _NameIndex:
         names = self._names = list(self._views)
         paths = [PurePosixPath(name) for name in names]
         stems = [path.with_suffix("") for path in paths]
-        self._at = {name: i for i, name in reversed([*enumerate(names)])}
-        self._ends, self._stems = _group(_ends_of(paths)), _group(_ends_of(stems))
-        self._whole = _group((stem.parts, i) for i, stem in enumerate(stems))
+        self._indices = {name: i for i, name in reversed([*enumerate(names)])}
+        self._endings, self._stems = _group(_ends_of(paths)), _group(_ends_of(stems))
+        self._full_stems = _group((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, name: str) -> list[int]:
         """Return the indices of the names that end with a listed name, with or without its suffix.
@@ -167,11 +167,11 @@ class _NameIndex:
         return [i for match in self._matches_of(name) for i in self._views[self._names[match]]]
 
     def _matches_of(self, name: str) -> list[int]:
-        if name in self._at:
-            return [self._at[name]]
+        if name in self._indices:
+            return [self._indices[name]]
         parts = PurePosixPath(name.replace("\\", "/"))
         stem = (parts.with_suffix("") if is_image(parts) else parts).parts
-        return self._ends.get(parts.parts) or self._whole.get(stem) or self._stems.get(stem, [])
+        return self._endings.get(parts.parts) or self._full_stems.get(stem) or self._stems.get(stem, [])
 
 
 def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
@@ -320,7 +320,7 @@ def _select_training(
     """Return the indices of the selected training views; key: the setting that selects them."""
     names = [scene.views[i].name for i in scene.train]
     test_names = [scene.views[i].name for i in scene.test]
-    excluded: Excluded = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
+    excluded: ExcludedNames = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
     return {scene.train[i] for i in _select(scene, key, choice, names, folders, excluded)}
 
 
@@ -330,7 +330,7 @@ def _select(
     choice: int | ViewSelection,
     names: Sequence[str],
     folders: Sequence[Path],
-    excluded: Excluded = NONE,
+    excluded: ExcludedNames = NONE,
 ) -> set[int]:
     """Return the indices of the selected names; a number n selects every n-th, starting with the first, and 0 none.
 

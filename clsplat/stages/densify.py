@@ -65,7 +65,7 @@ class Densify(Scheduled):
         return {name for rule in self.rules for name in rule.tables}
 
     @model_validator(mode="after")
-    def _with_known_statistics(self) -> "Densify":
+    def _require_known_statistics(self) -> "Densify":
         statistics = variants(Statistic)
         for rule in self.rules:
             if unknown := sorted(rule.statistics - statistics.keys()):
@@ -76,13 +76,13 @@ class Densify(Scheduled):
         return self
 
     @model_validator(mode="after")
-    def _with_an_end(self) -> "Densify":
+    def _require_stop(self) -> "Densify":
         if self.budget and self.stop is None:
             raise ValueError("'budget' needs 'stop', the step at which the budget is reached")
         return self
 
     @model_validator(mode="after")
-    def _with_growth(self) -> "Densify":
+    def _require_growth_rule(self) -> "Densify":
         if self.per_pixel is not None and not any(rule.grows for rule in self.rules):
             raise ValueError(
                 "'per_pixel' limits growth, and no rule here grows; set it to null, or add a rule that clones or splits"

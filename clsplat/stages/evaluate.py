@@ -21,7 +21,7 @@ LOG = logging.getLogger("clsplat")
 Downscale = Annotated[float, Field(ge=1)]
 
 
-def _inside(text: str) -> str:
+def _check_output_path(text: str) -> str:
     if fault := invalid_output_reason(text):
         raise ValueError(f"expected a path inside the run folder: {fault}")
     return text
@@ -60,12 +60,12 @@ class Evaluate(Scheduled):
     """ONNX file of LPIPS, which `clsplat data lpips` writes."""
     lpips_input: InputRange = "-1..1"
     """Range of the values that LPIPS gets; the tables of 3DGS and Mip-Splatting use 0..1 and the network vgg."""
-    file: Annotated[str, AfterValidator(_inside)] | None = None
+    file: Annotated[str, AfterValidator(_check_output_path)] | None = None
     """Model file in the run folder to measure; default: the model in training."""
 
     @field_validator("metrics")
     @classmethod
-    def _with_psnr_and_ssim(cls, metrics: list[Metric]) -> list[Metric]:
+    def _require_psnr_and_ssim(cls, metrics: list[Metric]) -> list[Metric]:
         if not {"psnr", "ssim"} <= set(metrics):
             raise ValueError("'psnr' and 'ssim' are required, since every metrics.json has them; add them")
         return metrics

@@ -46,7 +46,7 @@ class Export(Scheduled):
     `sidecar`, only a file next to the model, which clsplat reads."""
 
     @model_validator(mode="after")
-    def _quality_of_its_format(self) -> "Export":
+    def _check_quality(self) -> "Export":
         if self.quality != "balanced" and not writing_format(Path(self.file)).has_quality:
             raise ValueError(
                 f"'quality' applies to SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"
@@ -117,7 +117,7 @@ class Cameras(Stage):
 
     def run(self, run: Run) -> None:
         for name in self.formats:
-            for path in write_cameras(learned_scene(run), run.out / self.folder, name, over=True):
+            for path in write_cameras(learned_scene(run), run.out / self.folder, name, overwrite=True):
                 LOG.info("cameras written to %s", path)
 
 

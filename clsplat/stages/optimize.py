@@ -55,7 +55,7 @@ class ValidatedTraining(Training):
     """With `keep: best`: train again from the start for the best number of steps, on the validation views too."""
 
     @model_validator(mode="after")
-    def _by_validation(self) -> "ValidatedTraining":
+    def _require_keep_best(self) -> "ValidatedTraining":
         if self.keep != "best" and (self.patience or self.refit):
             raise ValueError(f"'{'patience' if self.patience else 'refit'}' needs 'keep: best'; set both or neither")
         if self.keep != "best" and any(getattr(stage, "patience", None) for stage in self.during):
@@ -261,14 +261,14 @@ class Optimize(ValidatedTraining):
 
     @field_validator("losses")
     @classmethod
-    def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
+    def _require_image_loss(cls, losses: list[Loss]) -> list[Loss]:
         if not any(isinstance(loss, ImageLoss) and loss.reads_photograph for loss in losses):
             raise ValueError("at least one loss must compare images, such as l1")
         return losses
 
     @field_validator("modules")
     @classmethod
-    def _in_order(cls, modules: list[TrainingModule]) -> list[TrainingModule]:
+    def _check_modules(cls, modules: list[TrainingModule]) -> list[TrainingModule]:
         check_list(modules)
         return modules
 

@@ -196,9 +196,9 @@ class VisibleError:
         products = self.gradient(rest)
         points = self._points(products)
         for _ in range(ROUNDS):
-            labels = nearest(points, _with_squares(vectors))
+            labels = nearest(points, _append_products(vectors))
             vectors = self._minima(products, labels, vectors)
-        return vectors, nearest(points, _with_squares(vectors))
+        return vectors, nearest(points, _append_products(vectors))
 
     def _points(self, products: Floats) -> NDArray[np.float32]:
         """Return the points whose dot products `nearest` compares, [N, 3 K + K(K+1)/2]."""
@@ -228,7 +228,7 @@ class VisibleError:
         return minima
 
 
-def _with_squares(vectors: Floats) -> NDArray[np.float32]:
+def _append_products(vectors: Floats) -> NDArray[np.float32]:
     """Return vectors, followed by the products of their coefficients that the form multiplies, summed over channels."""
     table = vectors.reshape(len(vectors), -1, 3)
     i, j = np.triu_indices(table.shape[1])
@@ -301,7 +301,7 @@ class RoundTables(Stage):
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
-        tables = {name: gaussians.get(name) for name in self._changed()}
+        tables = {name: gaussians.get(name) for name in self._rounded_tables()}
         if self.means:
             params = {name: gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
             tables["means"] = round_means(params["means"], params["log_scales"], log_weights(params), self.means)
@@ -315,7 +315,7 @@ class RoundTables(Stage):
             gaussians.set(name, table)
         run.refresh_filter()
 
-    def _changed(self) -> Collection[str]:
+    def _rounded_tables(self) -> Collection[str]:
         steps = {
             "means": self.means,
             "quats": self.quats,

@@ -77,7 +77,7 @@ class PruneLeast(Scheduled):
     2025)."""
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> "PruneLeast":
+    def _check_fraction(self) -> "PruneLeast":
         if (self.keep is None) == (self.remove is None):
             raise ValueError("give either 'keep' or 'remove', a fraction of the Gaussians")
         return self

@@ -20,7 +20,7 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model, sky_center
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import BUDGET, MAX_SIZE, Page, Which, view_entries
+from clsplat.viewer.page import BUDGET, MAX_SIZE, IncludedPhotos, Page, view_entries
 
 LOG = logging.getLogger("clsplat")
 
@@ -76,7 +76,7 @@ class Viewer(Stage):
 
     file: Annotated[str, path_in_run(".html")] = "viewer.html"
     """Path inside the run folder."""
-    photographs: Which = "test"
+    photographs: IncludedPhotos = "test"
     """Views whose photos are in the page; all views have a thumbnail."""
     photograph_budget: Annotated[float, Field(gt=0, le=MAX_SIZE)] = BUDGET
     """MB of photos; with more, only every second, third, … is in the page."""

@@ -43,7 +43,7 @@ DOTTED = 2  # index into DASHES
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, Gaussians and times over the steps."""
     train = run.records.read("train")
-    measured, trial = _measured(run), _measured(run, trial=True)
+    measured, trial = _psnr_lines(run), _psnr_lines(run, trial=True)
     dash = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
     psnr = list(zip([r["step"] for r in train], moving_average([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
@@ -61,7 +61,7 @@ def training_charts(run: Run) -> list[Markup]:
     )
 
 
-def _measured(run: Run, trial: bool = False) -> list[Line]:
+def _psnr_lines(run: Run, trial: bool = False) -> list[Line]:
     """Return the measured PSNR of each split over steps; of a step that was measured twice, the last one.
 
     trial: whether to return that of the training before a refit.
@@ -136,13 +136,13 @@ def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
     for split in ("validation", "test"):
         measured = [line for line in lines if line["split"] == split]
-        train = _training(run, lines, measured[-1]["step"]) if measured else None
+        train = _training_psnr(run, lines, measured[-1]["step"]) if measured else None
         if train is not None:
             return split, Scores(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
     return "", None
 
 
-def _training(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
+def _training_psnr(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
     """Return the PSNR at training views, dB, as measured at a step, or else as logged up to it."""
     measured = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
     reports = [line["psnr"] for line in run.records.read("train") if line["step"] <= step]
@@ -248,14 +248,14 @@ class HtmlReport(Stage):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        advised = advice(run, is_overfit(run))
+        sentences = advice(run, is_overfit(run))
         page = render(
             "report.html.j2",
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_headline(run),
             overfitting_note=overfitting_note(run),
-            advice=advised,
+            advice=sentences,
             photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
@@ -269,7 +269,7 @@ class HtmlReport(Stage):
         )
         write_text(run.out / self.file, page)
         LOG.debug("report written to %s", run.out / self.file)  # the summary of the run names its files
-        for text in advised:
+        for text in sentences:
             LOG.info("advice: %s", text)
 
 

@@ -63,7 +63,7 @@ class TrainField(Training):
     """Steps between lines of metrics.jsonl."""
 
     @model_validator(mode="after")
-    def _same_rays(self) -> "TrainField":
+    def _check_rays(self) -> "TrainField":
         if self.rays % self.photographs:
             raise ValueError(f"'rays' must be a multiple of 'photographs', {self.photographs}; got {self.rays}")
         if any(stage.edits for stage in self.during):

@@ -47,7 +47,7 @@ class Snapshot(Scheduled):
 
     @field_validator("size")
     @classmethod
-    def _even(cls, size: str | None) -> str | None:
+    def _check_size(cls, size: str | None) -> str | None:
         return None if size is None else validate_size(size)
 
     def check_run(self, run: Run) -> None:
@@ -131,7 +131,7 @@ class Video(Stage):
 
     @field_validator("size")
     @classmethod
-    def _even(cls, size: str | None) -> str | None:
+    def _check_size(cls, size: str | None) -> str | None:
         return None if size is None else validate_size(size)
 
     def input_path(self, key: str, scene: str | None) -> Path | None:

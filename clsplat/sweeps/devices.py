@@ -23,7 +23,7 @@ from clsplat.core.manifest import hash_values
 from clsplat.core.reading import read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.opencl.runtimes import no_device_error
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.sweeps.cell import code_digest
 
 LOG = logging.getLogger("clsplat")
@@ -110,7 +110,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError if the run fails.
     """
-    key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
+    key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped_pipelines()[PIPELINE])
     cache_file = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         values = read_json(cache_file)
@@ -128,7 +128,8 @@ def _hash_fixed_run(device: str) -> str:
         scene, out = Path(name, "scene"), Path(name, "run")
         settings = [word for setting in SETTINGS for word in ("--set", setting)]
         _run_command(device, "data", "synthetic", str(scene), *SCENE_OPTIONS)
-        words = ("run", str(shipped()[PIPELINE]), "--scene", str(scene), "--out", str(out), "--device", device)
+        run = "run", str(shipped_pipelines()[PIPELINE])
+        words = (*run, "--scene", str(scene), "--out", str(out), "--device", device)
         _run_command(device, *words, *settings)
         return sha256(out / "point_cloud.ply")[:CLASS_DIGITS]
 

@@ -161,10 +161,10 @@ class Dispatcher:
 
     def _fits(self, pending: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
         """Return whether a cell may run on a device: in its class, and larger than devices that were too small."""
-        allowed = self._allowed(pending, slots)
+        allowed = self._allowed_slots(pending, slots)
         return slot in ([other for other in allowed if other.memory > pending.too_small] or allowed)
 
-    def _allowed(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
+    def _allowed_slots(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """Return the devices on which a cell may run; a started cell stays in its class while devices are available."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
@@ -186,7 +186,7 @@ class Dispatcher:
             raise BitsMismatch(outcome.message)
         larger = replace(pending, too_small=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
-            other.memory > slot.memory for other in self._allowed(larger, self.engine.slots())
+            other.memory > slot.memory for other in self._allowed_slots(larger, self.engine.slots())
         ):
             LOG.warning("cell %s: %s; trying a larger device", cell.name, outcome.message)
             self._requeue(larger, slot, waiting)

@@ -55,7 +55,7 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
         return {**facts, "state": "published", **values, **_figures(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
     alive = [item for item in attempts if item.exit_code is None and now - item.last_beat < NO_BEAT_S]
-    if (failed := folder.failed()) and not alive:
+    if (failed := folder.failure()) and not alive:
         return {**facts, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
     last = (alive or attempts)[-1:]
     return {**facts, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}

@@ -311,7 +311,7 @@ class CellFolder:
                 return values
         return None
 
-    def published(self) -> dict[str, Any] | None:
+    def verified_manifest(self) -> dict[str, Any] | None:
         """Return the manifest of the result after verifying the hashes of its files, or None without a result.
 
         A damaged result is moved back to the attempts, so that the cell continues from its checkpoint.
@@ -383,7 +383,7 @@ class CellFolder:
         text = json.dumps({"exit_code": exit_code, "message": message, "exit_codes": codes}, indent=1)
         write_text(self.path / FAILED, text + "\n")
 
-    def failed(self) -> dict[str, Any] | None:
+    def failure(self) -> dict[str, Any] | None:
         """Return the content of failed.json, or None."""
         with suppress(DataError):
             values = read_json(self.path / FAILED)
@@ -446,7 +446,7 @@ class Store:
         """The folder of the output of `prepare`."""
         return without_links(self.root, PREPARED)
 
-    def undistorted(self, scene: str, code: str) -> Path:
+    def undistorted_folder(self, scene: str, code: str) -> Path:
         """Return the folder of a scene's undistorted photos.  Both arguments are fingerprints, as in a cell's key."""
         return without_links(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
 

@@ -71,7 +71,7 @@ def _run_cell(
         return is_stopped() or store.is_cancelled((cell.key, options.sweep), options.since)
 
     while True:
-        if manifest := folder.published():
+        if manifest := folder.verified_manifest():
             store.log_event("skip", cell=cell.key, worker=options.worker)
             folder.collect(store.now())
             return Outcome("published", str(manifest["bits"]))
@@ -92,7 +92,7 @@ def _run_cell(
                 return _publish(store, folder, attempt)
             message = attempt.message(code)
         except LeaseLost:
-            if folder.published():  # by another process, while this one was frozen
+            if folder.verified_manifest():  # by another process, while this one was frozen
                 continue
             raise
         except BitsMismatch:
@@ -113,7 +113,7 @@ def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: C
     Where links are not possible, each cell makes these files itself.  Raises OutputError.
     """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
-    shared = {UNDISTORTED: store.undistorted(cell.spec["scene"], cell.spec["code"])}
+    shared = {UNDISTORTED: store.undistorted_folder(cell.spec["scene"], cell.spec["code"])}
     if cell.spec["pipeline"].get("prepare"):
         shared[PREPARED] = store.prepared
     for name, target in shared.items():

@@ -40,7 +40,7 @@ class MemoryPlan:
     allocation: int  # of a single buffer
     host: int = 0  # for each Gaussian, in the memory of the host
 
-    def needed(self, gaussians: int) -> int:
+    def required_bytes(self, gaussians: int) -> int:
         """Return the bytes for a number of Gaussians, with room for growth and for moving one table."""
         return self.fixed + int(gaussians * self._per_gaussian)
 
@@ -61,9 +61,9 @@ class MemoryPlan:
         mib = 2**20
         on_host = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
         return (
-            f"memory: {self.needed(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} bytes each "
-            f"and {self.pair} per pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} fit in "
-            f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
+            f"memory: {self.required_bytes(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} "
+            f"bytes each and {self.pair} per pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} "
+            f"fit in {self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 
     def check(self, gaussians: int, more: str = "") -> None:

@@ -150,9 +150,9 @@ def _are_integers(values: Sequence[float]) -> bool:
 
 def _ticks(low: float, high: float, integers: bool = False) -> list[float]:
     """Return three to six round numbers between low and high, or fewer if only integers are allowed."""
-    rough = max((high - low) / 4, 1.0 if integers else 0.0)
-    power = 10 ** math.floor(math.log10(rough))
-    step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
+    min_step = max((high - low) / 4, 1.0 if integers else 0.0)
+    power = 10 ** math.floor(math.log10(min_step))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= min_step)
     first = math.ceil(low / step - 1e-9)
     return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
 

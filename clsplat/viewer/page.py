@@ -166,7 +166,7 @@ def style() -> str:
 
 # The views of a page: cameras, thumbnails, and photos within a budget of bytes.
 
-Which = Literal["none", "test", "all"]  # views whose photos are in the page
+IncludedPhotos = Literal["none", "test", "all"]  # views whose photos are in the page
 THUMBNAIL, LARGEST = 128, 1000  # px, the longer side
 BUDGET = 4.0  # MB of photos
 Image = NDArray[np.uint8]
@@ -175,7 +175,7 @@ Image = NDArray[np.uint8]
 def view_entries(
     scene: Scene,
     read: Callable[[View], Image],
-    which: Which,
+    included: IncludedPhotos,
     budget: float = BUDGET,
     progress: Callable[[Iterable[View]], Iterable[View]] = lambda views: views,
 ) -> list[dict[str, Any]]:
@@ -188,7 +188,7 @@ def view_entries(
     views: list[dict[str, Any]] = []
     for view in progress(scene.views):
         pixels, split = read(view), "test" if view.name in test else "train"
-        is_included = which == "all" or which == split
+        is_included = included in ("all", split)
         photograph = data_url(shrink(pixels, LARGEST)) if is_included else None
         thumbnail = data_url(shrink(pixels, THUMBNAIL))
         views.append(

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import divide, schedule_values
 from clsplat.gaussians.model import MODEL
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.loading import Pipeline, check_document
 from clsplat.pipeline.stretching import map_trainings, stretch
 from clsplat.pipeline.yaml_file import Document
 from clsplat.stages.densify import Densify
@@ -70,7 +70,7 @@ def block_pipeline(
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
     changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
     changed["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
-    block_file = checked(pipeline.path, Document(changed))
+    block_file = check_document(pipeline.path, Document(changed))
     return (
         block_file if fraction == 1 else replace(block_file, settings=_with_fewer_steps(block_file.settings, fraction))
     )
@@ -80,14 +80,14 @@ def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
     """Return a pipeline that starts from the merged model and runs the stages after training, or only exports it."""
     data, last = pipeline.resolved(), _count_until_last_edit(pipeline)
     stages = [*_with_start(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
-    return checked(pipeline.path, Document({**data, "stages": stages}))
+    return check_document(pipeline.path, Document({**data, "stages": stages}))
 
 
 def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     """Return the pipeline of the coarse model with the scene, filters, and seed of the block pipeline."""
     data = pipeline.resolved()
     shared = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
-    return checked(coarse.path, Document({**coarse.resolved(), **shared}))
+    return check_document(coarse.path, Document({**coarse.resolved(), **shared}))
 
 
 def without_start(pipeline: Pipeline) -> Pipeline:

@@ -26,7 +26,7 @@ from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.files import find
-from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.loading import Pipeline, check_document
 from clsplat.pipeline.stretching import stretch
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.render.painter import SplatPainter
@@ -60,7 +60,7 @@ class Tuning:
         chosen = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
         document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
-        pipeline = checked(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
+        pipeline = check_document(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
             return pipeline
         first = next(stage for stage in data["stages"] if _has_name(stage, TRAINING))[TRAINING]["steps"]

@@ -40,8 +40,8 @@ class PartitionCell:
     def extended(self, fraction: float) -> Box:
         """Return the box extended on each side by half of `fraction` of the cell's size."""
         step = 0.5 * fraction * self.size
-        low = [None if b is None else _round(b - by) for b, by in zip(self.box.low, step, strict=True)]
-        high = [None if b is None else _round(b + by) for b, by in zip(self.box.high, step, strict=True)]
+        low = [None if b is None else _round(b - margin) for b, margin in zip(self.box.low, step, strict=True)]
+        high = [None if b is None else _round(b + margin) for b, margin in zip(self.box.high, step, strict=True)]
         return Box(low=low, high=high)
 
 
@@ -162,7 +162,7 @@ def view_coverage(render: RenderedView, owner: NDArray[np.int64], blocks: int) -
     owner: the block of each Gaussian, [N].  Masked pixels do not count.
     """
     weight = render.sum(WEIGHT)
-    pixels = max(int(render.counted().sum()), 1)
+    pixels = max(int(render.counted_pixels().sum()), 1)
     return np.bincount(owner, weight.astype(np.float64), blocks) / pixels, weight > 0
 
 
@@ -312,4 +312,4 @@ class Partitioner:
         cached = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
         motion = self.model.motion
         tables = table_widths(self.model.sh_degree, 0 if motion is None else motion.shape[1])
-        return plan(self.device.info, tables, cached, max(sizes) // 4).needed(gaussians)
+        return plan(self.device.info, tables, cached, max(sizes) // 4).required_bytes(gaussians)

@@ -14,7 +14,7 @@ import pytest
 from clsplat.cli.app import ORDER, SYNONYMS
 from clsplat.core.errors import DataError
 from clsplat.core.resources import full_version
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.overrides import list_keys
 from clsplat.pipeline.recipes import copy, manual, summaries, summary
@@ -150,10 +150,10 @@ def test_stdout_holds_only_json(run, arguments, finished, tiny_scene, tmp_path):
 
 def test_pipelines_lists_every_recipe_on_a_line():
     lines = clsplat("pipelines").stdout.splitlines()
-    assert [line.split()[0] for line in lines] == list(shipped())
+    assert [line.split()[0] for line in lines] == list(shipped_pipelines())
     assert all(line.endswith(".") for line in lines)
-    assert summary(shipped()["splat"]).endswith("the constants of the 2023 release.")
-    assert summary(shipped()["splat_7k"]).endswith("in 7,000 steps: a good scene in minutes.")
+    assert summary(shipped_pipelines()["splat"]).endswith("the constants of the 2023 release.")
+    assert summary(shipped_pipelines()["splat_7k"]).endswith("in 7,000 steps: a good scene in minutes.")
 
 
 def test_pipelines_prints_keys_in_set_notation():
@@ -172,7 +172,7 @@ def test_pipelines_prints_keys_in_set_notation():
 
 def test_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
     clsplat("pipelines", "smoke", "--copy", tmp_path / "mine.yaml")
-    assert (tmp_path / "mine.yaml").read_text() == shipped()["smoke"].read_text()
+    assert (tmp_path / "mine.yaml").read_text() == shipped_pipelines()["smoke"].read_text()
     (tmp_path / "mine.yaml").write_text("mine")
     refused = clsplat("pipelines", "splat", "--copy", tmp_path / "mine.yaml", expect=2)
     assert "mine.yaml: exists; choose another name" in refused.stderr

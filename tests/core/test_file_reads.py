@@ -37,7 +37,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/viewer/video/encoding.py:open_video": "syncs what it has written",
     "clsplat/viewer/video/encoding.py:count_frames": "decodes what was written before",
     "clsplat/viewer/video/encoding.py:fix_track_ids": "changes what was written before",
-    "clsplat/pipeline/files.py:shipped": "reads files of the package",
+    "clsplat/pipeline/files.py:shipped_pipelines": "reads files of the package",
     "clsplat/viewer/page.py": "reads files of the package",
     "clsplat/runs/live/server.py": "reads files of the package",
     "clsplat/conformance/quick.py:_hash_files": "reads files of the package",
@@ -126,7 +126,7 @@ def test_pipe_is_refused_at_once(name, pipe):
 def test_records_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
     with failing("the reader waits", seconds=20):
         pipe.rename(tmp_path / ".manifest.jsonl")
-        assert not Manifest(tmp_path).lists(tmp_path / "x.png")
+        assert not Manifest(tmp_path).has_entry(tmp_path / "x.png")
         os.mkfifo(tmp_path / "known.txt")
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()

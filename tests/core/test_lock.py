@@ -327,7 +327,7 @@ def test_run_that_wakes_up_notices_the_takeover(tmp_path, monkeypatch):
         first = lock.lock_folder(tmp_path)
         require_lock = first.__enter__()
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": time.time() - 61}))
-    lock._held.clear()
+    lock._locked_files.clear()
     with lock.lock_folder(tmp_path) as second:
         with pytest.raises(OutputError, match=f"replaced while .* process {os.getpid()} on .* holds it now"):
             require_lock()

@@ -139,7 +139,7 @@ def test_errors_and_losses_use_counted_pixels_only(device, rng, masked):
     truth = look.photograph.image().transpose(2, 0, 1) / 255
     np.testing.assert_allclose(look.error(), np.abs(image - truth).mean(axis=0), atol=1e-6)
     counted = np.ones((17, 33)) if mask is None else mask
-    np.testing.assert_array_equal(look.counted(), counted > 0)
+    np.testing.assert_array_equal(look.counted_pixels(), counted > 0)
     expected = 0.8 * ref.l1(image * counted, truth * counted)[0] + 0.2 * ref.dssim(image * counted, truth * counted)[0]
     before = look.sum(WEIGHT)
     assert look.loss([L1(weight=0.8), Dssim(weight=0.2)]) == pytest.approx(expected, rel=1e-5)
@@ -169,5 +169,5 @@ def test_rules_share_cached_results():
         asked.append((given, number))
         return number + 1
 
-    assert [survey.cached(found, number) for number in (1, 2, 1)] == [2, 3, 2]
+    assert [survey.compute_once(found, number) for number in (1, 2, 1)] == [2, 3, 2]
     assert asked == [(survey, 1), (survey, 2)]

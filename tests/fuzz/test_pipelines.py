@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.pipeline.overrides import list_keys
@@ -43,7 +43,7 @@ LINES = b'{"step": 1, "kind": "train", "loss": 0.5}\n{"step": 2, "kind": "densif
 
 
 def test_damaged_pipeline_is_valid_or_refused(folder):
-    seeds = [shipped()[name].read_bytes() for name in ("smoke", "splat", "photos", "micro_splatting")]
+    seeds = [shipped_pipelines()[name].read_bytes() for name in ("smoke", "splat", "photos", "micro_splatting")]
     seeds += [load("smoke").text().encode(), load("mip_splatting").text().encode()]
 
     @fuzzed(data=damaged(seeds, YAML))

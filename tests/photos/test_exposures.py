@@ -66,7 +66,7 @@ class Photograph:
     def image(self) -> np.ndarray:
         return self.pixels
 
-    def counted(self) -> None:
+    def counted_pixels(self) -> None:
         return None
 
 

@@ -20,7 +20,7 @@ from clsplat.stages.optimize import Optimize
 from tests.support.pipelines import KINDS, flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SHIPPED = list(files.shipped())
+SHIPPED = list(files.shipped_pipelines())
 SMALL = """\
 name: small
 stages:
@@ -310,7 +310,7 @@ def test_invalid_short_value_is_refused_with_its_location(tmp_path, short, words
 
 
 def test_short_keys_are_set_keys():
-    full = {name: read_yaml(path).data.get("short") for name, path in files.shipped().items()}
+    full = {name: read_yaml(path).data.get("short") for name, path in files.shipped_pipelines().items()}
     for name, values in full.items():
         given = [f"{place}={json.dumps(value)}" for place, value in (values or {}).items()]
         assert not values or load(name, [f"name={name}_7k", *given]).resolved() == load(f"{name}_7k").resolved()

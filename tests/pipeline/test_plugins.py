@@ -160,7 +160,7 @@ def test_missing_file_and_duplicate_name_are_refused(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     plugins.load_file(write(tmp_path / "a", "mine", ""))
-    assert plugins.load_file(tmp_path / "a" / "mine.py") in plugins.loaded(), "the same file twice is fine"
+    assert plugins.load_file(tmp_path / "a" / "mine.py") in plugins.loaded_plugins(), "the same file twice is fine"
     with pytest.raises(ConfigError, match=r"another plug-in named 'mine' is loaded, from"):
         plugins.load_file(write(tmp_path / "b", "mine", ""))
 
@@ -265,11 +265,11 @@ def test_installed_plugin_error_names_file_and_line(install, text, reason):
 def test_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
     install({"my/__init__.py": "", "my/register.py": "", "my/late.py": "x = 1"}, first="my.register")
     plugins.load_installed()
-    (before,) = plugins.loaded()
+    (before,) = plugins.loaded_plugins()
     plugins._loaded.clear()
     install({"my/late.py": "x = 2"}, first="my.register")
     plugins.load_installed()
-    assert plugins.loaded()[0].digest != before.digest
+    assert plugins.loaded_plugins()[0].digest != before.digest
 
 
 def test_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypatch):
@@ -281,7 +281,7 @@ def test_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypat
         write(tmp_path, "a_helper", text)
         write(tmp_path, "not_imported", text)
         plugins.load_file(file)
-        digests.add(plugins.loaded()[0].digest)
+        digests.add(plugins.loaded_plugins()[0].digest)
         write(tmp_path, "not_imported", f"{text}0")
         plugins.load_file(file)
         write(tmp_path, "a_helper", f"{text}0")

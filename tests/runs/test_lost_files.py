@@ -210,7 +210,7 @@ def test_matrix_cells_with_lost_files_run_again(tiny_scene, tmp_path):
 @pytest.mark.parametrize("content", [None, b"", b"ply\n"])
 def test_candidate_without_its_model_is_trained_again(content, few_steps, info, tmp_path):
     """Otherwise `compress` and `lod` would publish a damaged model."""
-    source = ModelSource.of(few_steps, None)
+    source = ModelSource.from_model(few_steps, None)
     model = load_model(source.file)
     tuning = Tuning("rungs", source, model, 3, Device(info))
     pipeline = tuning.pipeline(("init", "optimize"), {"init.file": str(source.file.resolve())})

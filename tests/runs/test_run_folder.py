@@ -9,7 +9,7 @@ import pytest
 from clsplat import cli
 from clsplat.core import files
 from clsplat.core.errors import ConfigError
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.runs import outputs
 from clsplat.runs.run_folder import Start, check_run_folder
@@ -135,11 +135,11 @@ def test_impossible_run_folder_is_one_sentence(out, tiny_scene, tmp_path, monkey
 @pytest.mark.parametrize("start", get_args(Start))
 def test_run_does_not_replace_a_users_file(tiny_scene: Path, tmp_path: Path, start):
     own = tmp_path / "pipeline.yaml"
-    own.write_bytes(shipped()["smoke"].read_bytes())
+    own.write_bytes(shipped_pipelines()["smoke"].read_bytes())
     for act in (lambda job: job.describe(), lambda job: job.run()):
         with pytest.raises(ConfigError, match=r"pipeline.yaml: was not written by a run.*use another folder"):
             act(Job.open(str(own), tiny_scene, tmp_path, start=start))
-    assert own.read_bytes() == shipped()["smoke"].read_bytes()
+    assert own.read_bytes() == shipped_pipelines()["smoke"].read_bytes()
     assert list(tmp_path.iterdir()) == [own]
 
 

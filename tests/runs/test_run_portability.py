@@ -40,14 +40,14 @@ def test_run_folder_is_a_model(done):
 
 def test_model_of_a_run_has_its_scene(done, tiny_scene):
     for model in (done, done / "models/last.ply"):
-        source = ModelSource.of(model, None)
+        source = ModelSource.from_model(model, None)
         assert (source.file.name, source.folder, source.settings.downscale) == ("last.ply", tiny_scene, 2)
     copy = done.parent / "copy.ply"
     shutil.copy(done / "models/last.ply", copy)
     with pytest.raises(ConfigError, match="does not name its scene"):
-        ModelSource.of(copy, None)
-    assert ModelSource.of(copy, done).settings.downscale == 2, "as the run read it"
-    assert ModelSource.of(copy, tiny_scene).settings.downscale == 1
+        ModelSource.from_model(copy, None)
+    assert ModelSource.from_model(copy, done).settings.downscale == 2, "as the run read it"
+    assert ModelSource.from_model(copy, tiny_scene).settings.downscale == 1
 
 
 def test_run_folder_is_a_scene(done, tiny_scene, tmp_path):

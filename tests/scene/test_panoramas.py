@@ -186,7 +186,7 @@ def test_undistorted_faces_equal_those_read(panoramas: Path, tmp_path: Path) -> 
 def test_points_belong_to_the_faces_that_show_them(panoramas: Path) -> None:
     scene = read_scene(panoramas, 8)
     positions = scene.views[0].position + np.array([[3.0, 0, 0], [0, 0, 3], [0, 0, -3], [0, 3, 0]])
-    tracks = Tracks(positions, {"IMG_0000.jpg": np.arange(4)}).on_faces(scene.views)
+    tracks = Tracks(positions, {"IMG_0000.jpg": np.arange(4)}).split_by_face(scene.views)
     shown = {Path(name).stem: rows.tolist() for name, rows in tracks.rows.items() if len(rows) and "/" in name}
     assert shown == {"cube_right": [0], "cube_front": [1], "cube_back": [2], "cube_down": [3]}
 

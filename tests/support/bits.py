@@ -32,7 +32,7 @@ import numpy as np
 import yaml  # type: ignore[import-untyped]
 
 from clsplat.data_tools.synthetic import write_dataset
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image, write_image
@@ -162,7 +162,7 @@ NAMED = {
 def cases() -> dict[str, Case]:
     """Return all cases by name."""
     recipes = {}
-    for name, path in shipped().items():
+    for name, path in shipped_pipelines().items():
         stages = yaml.safe_load(read_pipeline(path))["stages"]
         text = json.dumps(stages)
         needs_model = '"source": "model"' in text
@@ -288,7 +288,7 @@ class Place:
         for name, lens in {"lens": LENS, "fisheye": FISHEYE}.items():
             self._write_lens(name, lens)
         self._write_masks()
-        for path in shipped().values():
+        for path in shipped_pipelines().values():
             short = shorten(yaml.safe_load(read_pipeline(path)))
             (self.folder / path.name).write_text(yaml.safe_dump(short, sort_keys=False))
         if "model" in str(list(chosen.values())):

@@ -145,7 +145,7 @@ def test_unwritable_result_counts_as_a_failure(store, options, monkeypatch, time
         return
     assert (outcome.state, outcome.exit_code, event_names(store).count("start")) == ("failed", 7, 3)
     assert "cannot be written (No space left on device)" in outcome.message
-    assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
+    assert store.folder(CELL.key).failure()["exit_codes"] == [7] * 3
 
 
 def test_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, options):

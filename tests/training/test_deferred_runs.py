@@ -89,8 +89,8 @@ def test_too_large_plan_suggests_the_host(spread, tiny_scene, tmp_path):
     count, own = run.model.gaussians.count, run.memory_plan()
     assert run.model.gaussians.on_host is None
     other = run.memory_plan(harmonics="host")
-    between = (other.needed(count) + own.needed(count)) // 2
-    assert other.needed(count) < between < own.needed(count)
+    between = (other.required_bytes(count) + own.required_bytes(count)) // 2
+    assert other.required_bytes(count) < between < own.required_bytes(count)
     assert "MiB on the host" in other.text(count)
     assert "on the host" not in own.text(count)
     replace(other, memory=between).check(count)
@@ -115,7 +115,7 @@ def test_offloading_is_suggested_only_if_it_helps(more, told, tiny_scene, tmp_pa
 def small(spread, tiny_scene, info, tmp_path_factory):
     """Devices with memory of their own that hold about so many Gaussians in these runs."""
     plan = train(tiny_scene, tmp_path_factory.mktemp("runs") / "first", *spread, "optimize.steps=1").memory_plan()
-    return lambda held: replace(info, memory=plan.needed(held), unified=False)
+    return lambda held: replace(info, memory=plan.required_bytes(held), unified=False)
 
 
 def test_harmonics_move_to_the_host_if_the_device_is_full(spread, at_once, tiny_scene, tmp_path, small, caplog):
@@ -170,7 +170,7 @@ def test_harmonics_stay_on_the_device_if_views_see_all(tiny_scene, tmp_path, inf
     """They would need more of the device than they do now; the estimate of the host does not know that."""
     run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.steps=1")
     own = run.memory_plan()
-    run.device.info = replace(info, memory=own.needed(run.model.gaussians.count), unified=False)
+    run.device.info = replace(info, memory=own.required_bytes(run.model.gaussians.count), unified=False)
     held = run.memory_plan(harmonics="device").limit
     assert run.harmonics == "auto"
     assert device_capacity(run) == held < run.memory_plan(harmonics="host").limit

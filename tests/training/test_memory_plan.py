@@ -33,7 +33,7 @@ def test_planned_bytes_match_the_tables(device, rng):
 
 
 def test_limit_is_exact():
-    assert SMALL.needed(SMALL.limit) <= SMALL.memory < SMALL.needed(SMALL.limit + 1)
+    assert SMALL.required_bytes(SMALL.limit) <= SMALL.memory < SMALL.required_bytes(SMALL.limit + 1)
     SMALL.check(SMALL.limit)
     with pytest.raises(MemoryLimitError, match=r"fit in 95 MiB.*start from fewer points"):
         SMALL.check(SMALL.limit + 1)

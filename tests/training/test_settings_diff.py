@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import pytest
 
 from clsplat.core.settings import rebuild_models, resume_effect, variants
-from clsplat.pipeline.loading import checked
+from clsplat.pipeline.loading import check_document
 from clsplat.pipeline.overrides import CADENCE
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.stages.evaluate import Evaluate
@@ -27,7 +27,7 @@ def pipeline(tmp_path):
 
     def made(stages: str, *overrides: str):
         file.write_text(f"name: changes\nstages:{stages}")
-        return checked(file, read_yaml(file), overrides)
+        return check_document(file, read_yaml(file), overrides)
 
     return made
 

@@ -12,7 +12,7 @@ import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.progress import listening
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.runs.video import names
 from clsplat.scene.detect import read_scene
@@ -91,7 +91,7 @@ def test_stage_and_command_write_the_same_page(run, tmp_path):
 
 
 def test_every_shipped_pipeline_ends_with_a_viewer_and_a_report():
-    for name in shipped().keys() - {"blocks_coarse"}:  # a model to cut, which is not for looking at
+    for name in shipped_pipelines().keys() - {"blocks_coarse"}:  # a model to cut, which is not for looking at
         checked = load(name)
         if "train_field" in checked.names:  # a field has no splats
             assert checked.names[-1] == "report"

@@ -295,7 +295,7 @@ def test_candidate_is_trained_with_the_models_render_settings(few_steps, tmp_pat
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
-    ladder = Ladder(tmp_path, Tuning("compress", ModelSource.of(few_steps, None), mip, 20, None))
+    ladder = Ladder(tmp_path, Tuning("compress", ModelSource.from_model(few_steps, None), mip, 20, None))
     settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
     screen = settings.model.screen_filter
     assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
@@ -308,7 +308,7 @@ def test_candidate_is_trained_with_the_models_render_settings(few_steps, tmp_pat
 def test_palette_averages_start_midway_through_training(steps, lengths, starts, few_steps, tmp_path):
     """Their steps count from the first stage that is run, not from that of the recipe."""
     model = clsplat.load(few_steps / "point_cloud.ply")
-    tuning = Tuning("compress", ModelSource.of(few_steps, None), model, steps, None)
+    tuning = Tuning("compress", ModelSource.from_model(few_steps, None), model, steps, None)
     settings = tuning.pipeline(SOG_STAGES, {"init.file": str(few_steps / "point_cloud.ply")}).settings
     trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
     assert tuple(training.steps for training in trainings) == lengths

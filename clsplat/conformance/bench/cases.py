@@ -149,7 +149,7 @@ class BenchCase:
         self, device: Device, parameters: Parameters, photograph: Photograph, background: str, settings: PipelineFile
     ) -> None:
         self.device, self.photograph, optimize = device, photograph, settings.optimize
-        self._before = device.peak = device.allocated
+        self._initial_bytes = device.peak = device.allocated
         gaussians = Gaussians(device, parameters)
         for name in sorted(optimize.tables):
             gaussians.add(name, 1)
@@ -177,7 +177,7 @@ class BenchCase:
             self.step(record=False)
         self.step(record=False, stale=PARAMETERS)  # as at a step with an edit: gradients are written to memory
         self.edit()
-        self.memory = device.peak - self._before
+        self.memory = device.peak - self._initial_bytes
 
     def step(self, record: bool, stale: Collection[str] = ()) -> None:
         """Do one training step.  record: keep its times.  stale: parameters that are not updated."""
@@ -228,7 +228,7 @@ class BenchCase:
         gaussians = self.trainer.model.gaussians
         pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
         info, components = gaussians.device.info, gaussians.components
-        return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).needed(gaussians.count)
+        return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).required_bytes(gaussians.count)
 
     def _work(self) -> Work:
         assert self.frame is not None

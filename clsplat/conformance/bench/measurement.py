@@ -95,7 +95,7 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
         comparison = (f"{before[stage]:.2f}", f"{ms / before[stage]:.2f}") if before.get(stage, 0) > 0 else ()
         cells.append([stage, f"{ms:.2f}", *ratio, *comparison])
     memory = f"memory {result.memory / mib:,.0f} MiB at peak; training plans {result.planned / mib:,.0f} MiB"
-    return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
+    return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left_columns=1)}\n{memory}", "  ")
 
 
 @dataclass(frozen=True)

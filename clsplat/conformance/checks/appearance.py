@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import SUM, Checks, Results, compare_max, match
-from clsplat.conformance.checks.images import SIZES, make_camera, outside, to_planes
+from clsplat.conformance.checks.images import SIZES, blank_image, make_camera, to_planes
 from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import unclamped_grid_colors
 from clsplat.opencl.device import Device
@@ -74,14 +74,14 @@ def check_grid(
     colors = grids.transform(workspace, camera, planes, 1).get()
     expected = ref.apply_color_grid(exact, grid)
     yield compare_max("color_grid_forward", f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield match("color_grid_forward", f"pixels outside the image, {label}", outside(camera, colors[:3]), 0.0)
+    yield match("color_grid_forward", f"pixels outside the image, {label}", blank_image(camera, colors[:3]), 0.0)
     gradients = grids.differentiate(workspace, camera, planes, uploaded, 1)
     grad_image, grad_grid = (array.get() for array in gradients)
     expected_image, expected_grid = ref.color_grid_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(expected_image).max()), 1.0)
     actual, kernel = grad_image[:3, :height, :width], "color_grid_backward"
     yield compare_max(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=largest)
-    yield match(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
+    yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
         actual = photograph_grid(grids, grad_grid)
@@ -152,13 +152,13 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     exact = image[:3].astype(np.float64)
     expected = ref.apply_color_matrix(exact, matrix)
     yield compare_max("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield match("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+    yield match("colors_forward", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
     uploaded = to_planes(device, camera, gradient)
     grad_image, wait_for_matrix = color_gradients(workspace, camera, planes, matrix, uploaded)
     expected, grad_matrix = ref.color_matrix_backward(exact, matrix, gradient[:3].astype(np.float64))
     grad = grad_image.get()
     yield compare_max("colors_backward", f"gradient, {label}", grad[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield match("colors_backward", f"gradient outside the image, {label}", outside(camera, grad), 0.0)
+    yield match("colors_backward", f"gradient outside the image, {label}", blank_image(camera, grad), 0.0)
     floor, actual_matrix = float(np.sqrt(gradient.size)), wait_for_matrix()
     yield compare_max(
         "colors_backward", f"gradient by the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
@@ -193,11 +193,11 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     exact, upstream = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.apply_response(exact, row, center)
     yield compare_max(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield match(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
+    yield match(kernel, f"pixels outside the image, {label}", blank_image(camera, actual[:3]), 0.0)
     expected, grad_row = appearance.apply_response_backward(exact, row, center, upstream)
     largest = max(float(np.abs(expected).max()), 1.0)
     yield compare_max(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
-    yield match(kernel, f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
+    yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
     yield compare_max(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
     if channels > 3:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, check_image, compare, compare_max, match
-from clsplat.conformance.checks.images import SIZES, make_camera, make_comparison, outside, to_planes
+from clsplat.conformance.checks.images import SIZES, blank_image, make_camera, make_comparison, to_planes
 from clsplat.conformance.scenes import Case, random_case, safe_case, sums_to_gradients
 from clsplat.density.statistics import ABS_X
 from clsplat.density.survey import BLENDED, SQUARE, WEIGHT
@@ -311,7 +311,7 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
     yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for output in (composite, behind):
-        yield match("lay_over", f"pixels outside the image, {label}", outside(camera, output), 0.0)
+        yield match("lay_over", f"pixels outside the image, {label}", blank_image(camera, output), 0.0)
     grad_both = to_planes(device, camera, gradient)
     look_behind(workspace, frame, grad_both)
     expected = ref.gradient_behind(exact, gradient)

@@ -35,7 +35,7 @@ def to_planes(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Arra
     return device.upload(planes)
 
 
-def outside(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
+def blank_image(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
     """Return the planes with the image itself set to zero."""
     border = planes.copy()
     border[..., : camera.height, : camera.width] = 0
@@ -72,7 +72,7 @@ def check_loss(
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     largest = max(float(np.abs(weight * gradient).max()), 1e-30)
     yield Deviation(kernel, f"gradient of {label}", float(error) / largest, LOSS_GRADIENT)
-    yield match(kernel, f"gradient outside the image, {label}", outside(camera, planes), 0.0)
+    yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, planes), 0.0)
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
@@ -121,7 +121,7 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
         counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
         actual = colors.get()
         yield compare_max("unpack_pixels", f"colors, {label}", actual[:, :height, :width], pixels / 255, 1e-6)
-        yield match("unpack_pixels", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+        yield match("unpack_pixels", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
         yield match("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
         apply_mask(workspace, camera, colors, counted)
         yield match("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
@@ -147,7 +147,7 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
             expected = ref.blur(image.astype(np.float64), sigma, mask)
             label = f"sigma {sigma:g}, {width} x {height} px"
             yield compare_max("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
-            yield match("blur_columns", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+            yield match("blur_columns", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
 
 
 def check_haar(
@@ -166,7 +166,7 @@ def check_haar(
     actual, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
     expected = ref.haar_filter(exact, taps, mask)
     yield compare_max("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
-    yield match("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+    yield match("haar_forward", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
     derivatives = filter_gradients(planes, numbers, to_planes(device, camera, gradient))()
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
     grad_both = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
@@ -203,7 +203,7 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
                 expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
             kernel = "image_gradient" if counted is None else "hide_masked"
             yield compare_max(kernel, f"texture, {label}", actual[:height, :width], expected, 1e-6, floor=1)
-            yield match(kernel, f"texture outside the image, {label}", outside(camera, actual), 0.0)
+            yield match(kernel, f"texture outside the image, {label}", blank_image(camera, actual), 0.0)
 
 
 SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside of the histogram's range

@@ -215,7 +215,7 @@ def _random_positions(rng: np.random.Generator, tiles: int, ends: tuple[float, f
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
 
 
-def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
+def _flatten_samples(table: NDArray[np.float32]) -> NDArray[np.float64]:
     """Reshape [tiles, rows, SAMPLES] to [S, rows]."""
     return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
 
@@ -238,8 +238,8 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
     actual, *others = gradients
     for parts, gradient in zip((1, 3), others, strict=True):
         yield match("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
-    by_sample = _by_sample(grad_features)
-    means, variances = np.split(_by_sample(positions), [3], axis=1)
+    by_sample = _flatten_samples(grad_features)
+    means, variances = np.split(_flatten_samples(positions), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))

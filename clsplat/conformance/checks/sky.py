@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import SUM, Checks, Results, compare, compare_max, match
-from clsplat.conformance.checks.images import outside, to_planes
+from clsplat.conformance.checks.images import blank_image, to_planes
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
@@ -48,7 +48,7 @@ class SkyView:
     def planes(self, image: NDArray[Any]) -> Array:
         return to_planes(self.camera.array.device, self.camera, np.asarray(image, np.float32))
 
-    def inside(self, planes: NDArray[Any]) -> NDArray[Any]:
+    def crop(self, planes: NDArray[Any]) -> NDArray[Any]:
         return planes[..., : self.camera.height, : self.camera.width]
 
 
@@ -65,8 +65,8 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
     expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
     actual = planes.get()
-    yield compare_max("sky_forward", f"image, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
-    yield match("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
+    yield compare_max("sky_forward", f"image, {label}", view.crop(actual), expected, 5 * NEAR, floor=1.0)
+    yield match("sky_forward", f"pixels outside the image, {label}", blank_image(view.camera, actual), 0.0)
     grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
     shown = view.skies.runs(view.camera, side).shown.get()
@@ -92,8 +92,8 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
     loss, grad_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
         expected = view.left * grad_left
-        yield compare_max(kernel, f"T dL/dT, {label}", view.inside(actual), expected, NEAR, floor=scale)
-    yield match("sky_cover", f"T dL/dT outside the image, {label}", outside(view.camera, actual[None]), 0.0)
+        yield compare_max(kernel, f"T dL/dT, {label}", view.crop(actual), expected, NEAR, floor=scale)
+    yield match("sky_cover", f"T dL/dT outside the image, {label}", blank_image(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])
     yield compare_max("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
 

@@ -74,14 +74,14 @@ def training(device: Device, rng: np.random.Generator) -> Results:
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
     start["sh_base"] *= 0  # gray
     values, tables = train(device, case, start, STEPS)
-    again, again_tables = train(device, case, start, len(values))
+    repeated, again_tables = train(device, case, start, len(values))
     count, label = len(tables["means"]), f"{len(values)} steps"
     yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
-    yield match("training", f"losses of {label}, a second time", np.array(again), np.array(values[: len(again)]))
+    yield match("training", f"losses of {label}, a second time", np.array(repeated), np.array(values[: len(repeated)]))
     for name, table in tables.items():
         if table.shape != again_tables[name].shape:
-            difference, where = abs(len(again_tables[name]) - count), f"rows of {name} after {label}, a second time"
-            yield Deviation("training", where, difference, 0, counts=True)
+            difference, row_label = abs(len(again_tables[name]) - count), f"rows of {name} after {label}, a second time"
+            yield Deviation("training", row_label, difference, 0, counts=True)
         else:
             bits = again_tables[name].view(np.uint32), table.view(np.uint32)
             yield match("training", f"{name} after {label}, a second time", *bits)
@@ -97,25 +97,25 @@ def memory(device: Device, rng: np.random.Generator) -> Results:
 
     A failed allocation is not counted as a failure: other programs may use memory, which OpenCL does not report.
     """
-    promised, free = device.info.allocation, available_memory()
+    max_allocation, free = device.info.allocation, available_memory()
     budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free is None else free))
-    limit = min(promised, budget) // 64 * 64  # allocations are rounded up to 64
+    limit = min(max_allocation, budget) // 64 * 64  # allocations are rounded up to 64
     largest, size = 0, min(FIRST_BUFFER, limit)
-    stopped = "more was not tried, because too little memory is free"
+    end_reason = "more was not tried, because too little memory is free"
     while size > largest:
-        started = time.perf_counter()
+        start = time.perf_counter()
         try:
             yield from _check_buffer(device, size)
         except MemoryLimitError:
-            stopped = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {IN_USE}"
+            end_reason = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {IN_USE}"
             break
         largest, size = size, min(2 * size, limit)
-        if 2 * (time.perf_counter() - started) > MAX_TOUCH_S and size > largest:
-            stopped = "more was not tried, because it would take too long"
+        if 2 * (time.perf_counter() - start) > MAX_TOUCH_S and size > largest:
+            end_reason = "more was not tried, because it would take too long"
             break
-    if largest == promised // 64 * 64:
-        stopped = "the largest size works"
-    yield Note("memory", {"promised": promised, "held": largest, "free": free, "stopped": stopped})
+    if largest == max_allocation // 64 * 64:
+        end_reason = "the largest size works"
+    yield Note("memory", {"promised": max_allocation, "held": largest, "free": free, "stopped": end_reason})
 
 
 def _check_buffer(device: Device, size: int) -> Results:

@@ -69,12 +69,12 @@ def box_response(covariance: Floats, dx: Floats, dy: Floats) -> Floats:
 def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats, ...]:
     """Return the derivatives with respect to dx, dy, xx, xy, yy by central differences on one side of xx = yy."""
 
-    def change(size: float, **by: float) -> Floats:
-        ends = []
+    def change(size: float, **unit: float) -> Floats:
+        values = []
         for sign in (1, -1):
-            v = covariance + sign * size * np.array([by.get("xx", 0), by.get("xy", 0), by.get("yy", 0)])
-            ends.append(box_response(v, dx + sign * size * by.get("x", 0), dy + sign * size * by.get("y", 0)))
-        return (ends[0] - ends[1]) / (2 * size)
+            v = covariance + sign * size * np.array([unit.get("xx", 0), unit.get("xy", 0), unit.get("yy", 0)])
+            values.append(box_response(v, dx + sign * size * unit.get("x", 0), dy + sign * size * unit.get("y", 0)))
+        return (values[0] - values[1]) / (2 * size)
 
     xx, xy, yy = covariance
     distance = STEP * np.sqrt(xx - xy * xy / yy)

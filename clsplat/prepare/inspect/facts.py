@@ -327,8 +327,8 @@ def measure_dataset(parts: Parts) -> Facts:
         train=len(parts.scene.train) if parts.scene else None,
         test=len(parts.scene.test) if parts.scene else None,
         on_disk=len(parts.on_disk),
-        missing=[_relative(file, parts) for file in missing],
-        unregistered=[_relative(file, parts) for file in parts.on_disk if file not in known_files],
+        missing=[_relative_path(file, parts) for file in missing],
+        unregistered=[_relative_path(file, parts) for file in parts.on_disk if file not in known_files],
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
@@ -345,8 +345,8 @@ def measure_dataset(parts: Parts) -> Facts:
         timestamps=len(distinct_times(views)),
         moving_cameras=len(group_by_camera(views)) if distinct_times(views) else 0,
         same_center=len(views) > 1 and share_center(centers),
-        same_pose=_repeated(names, [(v.time, v.downscale, *_pose(v, extent)) for v in views]),
-        same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
+        same_pose=_equal_groups(names, [(v.time, v.downscale, *_pose(v, extent)) for v in views]),
+        same_but_case=[group for group in _equal_groups(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,
         hint=parts.hint,
         notes=parts.notes,
@@ -367,7 +367,7 @@ def distortion(lens: Lens) -> float | None:
     return displacement if np.isfinite(displacement) else None
 
 
-def _relative(file: Path, parts: Parts) -> str:
+def _relative_path(file: Path, parts: Parts) -> str:
     return os.path.relpath(file, parts.path).replace(os.sep, "/")
 
 
@@ -376,7 +376,7 @@ def _pose(view: View, extent: float | None) -> tuple[float, ...]:
     return tuple((view.world_to_camera / [1, 1, 1, extent or 1]).ravel().round(9))
 
 
-def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
+def _equal_groups(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
     """Return the groups of two or more names with equal keys."""
     groups = defaultdict(list)
     for name, key in zip(names, keys, strict=True):

@@ -309,12 +309,12 @@ class Inspection:
     def verdict(self) -> str:
         """The findings in one sentence: the first error or warning, and the number of others."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
-        worst, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
-        more = f" (and {pluralize(len(worst) - 1, f'more {kind}')})" if len(worst) > 1 else ""
+        findings, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
+        more = f" (and {pluralize(len(findings) - 1, f'more {kind}')})" if len(findings) > 1 else ""
         if self.next_step:
-            but = f", and {worst[0]}{more}" if worst else ""
+            but = f", and {findings[0]}{more}" if findings else ""
             return f"cameras are not known yet{but}; next: {self.next_step}"
-        return f"{start}{worst[0]}{more}" if worst else "ready to train"
+        return f"{start}{findings[0]}{more}" if findings else "ready to train"
 
     def data(self) -> dict[str, Any]:
         """Return the verdict, findings and facts as plain data for JSON."""
@@ -333,15 +333,15 @@ MAX_CAMERAS = 4  # those with the most views
 
 def summarize(facts: Facts) -> dict[str, str]:
     """Return the main facts as text, by name."""
-    none = "photographs without cameras" if facts.unplaced else "none found"
-    lines = {"dataset": facts.kind if facts.kind != "none" else none, "images": _images(facts)}
+    fallback = "photographs without cameras" if facts.unplaced else "none found"
+    lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _images(facts)}
     if capture := facts.capture:
         lines["sizes"] = _counts(capture.sizes)
         lines["cameras by EXIF"] = _counts(capture.cameras)
         lines["GPS positions"] = f"{capture.located}" if capture.located else "none"
-        compared = facts.comparison
-        lines["comparison"] = f"{len(compared.blurred)} blurred, {len(compared.same)} duplicates"
-        lines["comparison"] += f", {len(compared.jumps)} exposure jumps"
+        comparison = facts.comparison
+        lines["comparison"] = f"{len(comparison.blurred)} blurred, {len(comparison.same)} duplicates"
+        lines["comparison"] += f", {len(comparison.jumps)} exposure jumps"
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if facts.timestamps:

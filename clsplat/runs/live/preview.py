@@ -182,7 +182,7 @@ class Credit:
     def __init__(self, rate: float, limit: float, clock: Callable[[], float] = time.monotonic) -> None:
         """rate: credit per second; limit: maximum credit, which limits bursts after a pause."""
         self.rate, self.limit, self.spent = rate, limit, 0.0
-        self._clock, self._credit, self._at = clock, 0.0, clock()
+        self._clock, self._credit, self._updated = clock, 0.0, clock()
         self._lock = threading.Lock()
 
     @property
@@ -200,12 +200,12 @@ class Credit:
     def skip(self) -> None:
         """Add no credit for the time since the last update."""
         with self._lock:
-            self._at = self._clock()
+            self._updated = self._clock()
 
     def _update(self) -> float:
         now = self._clock()
-        self._credit = min(self.limit, self._credit + self.rate * (now - self._at))
-        self._at = now
+        self._credit = min(self.limit, self._credit + self.rate * (now - self._updated))
+        self._updated = now
         return self._credit
 
 

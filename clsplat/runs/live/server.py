@@ -261,14 +261,14 @@ class Handlers:
         return Response.json(state)
 
     def _scene(self, request: Request) -> Response:
-        return Response.json(self._shown().scene)
+        return Response.json(self._require_scene().scene)
 
     def _frame(self, request: Request) -> Response:
         """Return a preview of a `view`, or from a `camera` as camera.js writes it, at a `time` if given.
 
         The status is 204 if the preview is not ready yet.
         """
-        live, shown = self.live, self._shown()
+        live, shown = self.live, self._require_scene()
         pace = request.query.get("pace", "")
         if pace not in get_args(Pace):
             raise RequestError(400, f"pace: expected one of {', '.join(get_args(Pace))}")
@@ -286,7 +286,7 @@ class Handlers:
         return Response(200, preview.picture.jpeg, "image/jpeg", {"X-Step": str(preview.picture.step)})
 
     def _picture(self, request: Request, kind: Kind) -> Response:
-        shown = self._shown()
+        shown = self._require_scene()
         index = request.number("view", 0, len(shown.views) - 1)
         if request.query.get("scene") != str(shown.number):  # of an earlier run of a matrix
             raise RequestError(404, "not found")
@@ -303,7 +303,7 @@ class Handlers:
             self.live.pause(paused)
         return Response.json({"paused": self.live.paused})
 
-    def _shown(self) -> ShownRun:
+    def _require_scene(self) -> ShownRun:
         if self.live.shown is None:
             raise RequestError(503, "no scene yet")
         return self.live.shown

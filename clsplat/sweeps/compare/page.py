@@ -101,7 +101,7 @@ def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics],
 def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
     """Return the metrics of all other sizes and views, one table per split, so that each fits on the page."""
     by_split: dict[str, list[Group]] = {}
-    for split, downscale in _measured(rows):
+    for split, downscale in _measured_sizes(rows):
         if (split, downscale) != ("test", rows[0].downscale):
             by_split.setdefault(split, []).append(_group(rows, split, downscale))
     return [_table(rows, groups) for groups in by_split.values()]
@@ -142,7 +142,7 @@ def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
         values = {str(value) for average in averages if (value := getattr(average, key, None)) is not None}
         if len(values) > 1:
             yield f"The {name} differs between runs ({', '.join(sorted(values))})."
-    for split, downscale in _measured(rows):
+    for split, downscale in _measured_sizes(rows):
         measured = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
         counts = {mean.color_views for mean in measured if mean is not None and mean.figure("psnr_color") is not None}
         if len(counts) > 1:
@@ -150,7 +150,7 @@ def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
             yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
 
 
-def _measured(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
+def _measured_sizes(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
     """Return the splits and size divisors at which any row was measured."""
     return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 

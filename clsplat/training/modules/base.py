@@ -163,7 +163,7 @@ class TrainingModule(Settings):
         return self.family or self.type
 
     @classmethod
-    def implied(cls, run: Run, stage: Any) -> "TrainingModule | None":
+    def implied_module(cls, run: Run, stage: Any) -> "TrainingModule | None":
         """Return the module if the run's model or the stage's losses imply it."""
         return None
 
@@ -258,7 +258,7 @@ def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
     """Return the modules implied by the model and the losses of a stage.  stage: None for the current one."""
     stages = getattr(run.settings, "stages", ())
     stage = stages[run.stage_index] if stage is None and run.stage_index < len(stages) else stage
-    return [module for kind in implicit_modules().values() if (module := kind.implied(run, stage))]
+    return [module for kind in implicit_modules().values() if (module := kind.implied_module(run, stage))]
 
 
 def implicit_modules() -> dict[str, type[TrainingModule]]:

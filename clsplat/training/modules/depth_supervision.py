@@ -20,7 +20,7 @@ class DepthSupervision(TrainingModule):
     losses: list[Any]
 
     @classmethod
-    def implied(cls, run: Run, stage: Any) -> "DepthSupervision | None":
+    def implied_module(cls, run: Run, stage: Any) -> "DepthSupervision | None":
         losses = [loss for loss in getattr(stage, "losses", ()) if isinstance(loss, InverseDepth)]
         return cls(type=cls.implicit_type, losses=losses) if losses else None
 

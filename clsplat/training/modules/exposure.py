@@ -375,7 +375,7 @@ def estimate_exposures(run: Run) -> Exposures:
 
         def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
             photograph = run.photographs.get(view)
-            return photograph.image(), photograph.counted()
+            return photograph.image(), photograph.counted_pixels()
 
         counted = run.status.counted(views, "photographs", len(views))
         measured = measure_exposures(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN

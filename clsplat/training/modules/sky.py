@@ -27,7 +27,7 @@ class SkyModule(TrainingModule):
     order: ClassVar[int] = -20
 
     @classmethod
-    def implied(cls, run: Run, stage: Any) -> "SkyModule | None":
+    def implied_module(cls, run: Run, stage: Any) -> "SkyModule | None":
         has_sky = SKY in run.modules if run.has_model else run.model_settings.sky
         return cls(type=SKY) if has_sky else None
 

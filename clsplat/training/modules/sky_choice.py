@@ -125,4 +125,4 @@ def _evidence(run: Run, scene: Scene) -> list[SkyEvidence]:
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     counted = run.status.counted(views, "photographs", len(views))
     photographs = ((view, run.photographs.get(view)) for view in counted)
-    return list(detect_sky(scene, ((view, photo.image(), photo.counted()) for view, photo in photographs)))
+    return list(detect_sky(scene, ((view, photo.image(), photo.counted_pixels()) for view, photo in photographs)))

@@ -39,8 +39,8 @@ def fix_track_ids(path: Path) -> None:
 def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
     """Yield the offset and size of each UID in EBML data."""
     while start + 2 <= end:
-        kind, start = _number(data, start, marked=True)
-        size, start = _number(data, start, marked=False)
+        kind, start = _number(data, start, keep_marker=True)
+        size, start = _number(data, start, keep_marker=False)
         if kind == CLUSTER or start > end:
             return
         if kind in UIDS and start + size <= end:
@@ -50,11 +50,11 @@ def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
         start += size
 
 
-def _number(data: bytes, start: int, marked: bool) -> tuple[int, int]:
+def _number(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
     """Read an EBML variable-length number, with or without its length marker; return it and the offset of its end."""
     length = 9 - data[start].bit_length() if start < len(data) else 1
     value = int.from_bytes(data[start : start + length], "big")
-    return (value if marked else value & ((1 << (7 * length)) - 1)), start + length
+    return (value if keep_marker else value & ((1 << (7 * length)) - 1)), start + length
 
 
 Image = NDArray[np.uint8]

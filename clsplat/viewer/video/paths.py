@@ -336,7 +336,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     )
 
 
-def through(rig: Rig, frames: int, size: Size) -> list[View]:
+def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
     """Fly along the views on a smooth curve, by name or from neighbor to neighbor, whichever is shorter."""
     order = tour_order(rig)
     distance = float(np.median(rig.depths))
@@ -353,25 +353,25 @@ def views(rig: Rig, frames: int, size: Size) -> list[View]:
     ]
 
 
-def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
+def stay_at_center(rig: Rig, frames: int, size: Size) -> list[View]:
     """Stay at the most central camera, for moving scenes."""
     center = np.median(rig.positions, axis=0)
-    return stay(rig.views[int(np.linalg.norm(rig.positions - center, axis=1).argmin())], frames, size)
+    return repeat_view(rig.views[int(np.linalg.norm(rig.positions - center, axis=1).argmin())], frames, size)
 
 
-def stay(view: View, frames: int, size: Size) -> list[View]:
+def repeat_view(view: View, frames: int, size: Size) -> list[View]:
     """Repeat a view for all frames, without its timestamp."""
-    still = replace(view, camera=fit_inside(view.camera, size), lens=None, mask_path=None, time=None)
-    return [replace(still, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
+    frame = replace(view, camera=fit_inside(view.camera, size), lens=None, mask_path=None, time=None)
+    return [replace(frame, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
 
 
 PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
     "ellipse": ellipse,
     "spiral": spiral,
     "orbit": orbit,
-    "through": through,
+    "through": fly_through,
     "views": views,
-    "fixed": fixed,
+    "fixed": stay_at_center,
 }
 
 

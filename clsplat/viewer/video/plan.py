@@ -23,8 +23,8 @@ from clsplat.viewer.video.paths import (
     check_frames,
     check_size,
     even_size,
+    repeat_view,
     same_area,
-    stay,
 )
 
 # Timestamps of the frames, for moving scenes.
@@ -169,7 +169,7 @@ def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Fl
     if SEPARATOR in request.path:
         names = [view.name for view in scene.views]
         (chosen,) = ViewSelection(names=[request.path.partition(SEPARATOR)[2]]).select(names, [])
-        return VideoPlan(stay(scene.views[chosen], request.frames or FRAMES, size), request.fps or FPS)
+        return VideoPlan(repeat_view(scene.views[chosen], request.frames or FRAMES, size), request.fps or FPS)
     return VideoPlan(PATHS[request.path](rig, request.frames or FRAMES, size), request.fps or FPS)
 
 
