@@ -11,7 +11,7 @@ from python_pages import python_pages
 from clsplat.cli import app
 from clsplat.cli.data import app as tools
 from clsplat.core import errors
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.yaml_file import read_pipeline
 
 OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` shows it; please report it."}
@@ -75,7 +75,7 @@ def pipelines_page() -> str:
     """Return the shipped pipelines: their headers and their files."""
     text = "# Shipped pipelines\n\nRun one with `clsplat run NAME --scene DIR`. To make a variant, copy a file with "
     text += "`clsplat pipelines NAME --copy FILE`.\n\n"
-    for name, file in shipped().items():
+    for name, file in shipped_pipelines().items():
         lines = read_pipeline(file).splitlines()
         count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
         header = "\n".join(line.lstrip("# ") for line in lines[:count]).replace(".\n", ".\n\n")
