@@ -15,7 +15,7 @@ TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.conformance.doctor": {"check_html_path", "write_page"},
     "clsplat.core.text_table": {"text_table"},
     "clsplat.gaussians.validate": {"lines", "verdict"},
-    "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
+    "clsplat.pipeline.files": {"shipped_pipelines"},  # for completion, which must be fast
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.prepare.inspect.findings": {"show"},
     "clsplat.runs.status": {"status_text", "summary"},
