@@ -129,7 +129,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
     if any(is_image(file) for file in path.iterdir()):
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
-        remedy = f"the cameras are in {above}: give that folder" if above else remedy
+        remedy = f"the cameras are in {parent}: give that folder" if parent else remedy
         raise DataError(f"{path}: photographs without cameras; {remedy}{unread}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {formats}{unread}")
