@@ -255,7 +255,7 @@ def blocks(
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
-        typer.Option(metavar="FRACTION", help="A block gets the views of which it covers a larger fraction."),
+        typer.Option(metavar="FRACTION", help="Fraction of a view that a block must cover to train on it."),
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],

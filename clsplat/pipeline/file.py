@@ -42,12 +42,12 @@ class SceneSettings(Settings):
     downscale: Annotated[float, Field(ge=1)] = 1
     """Divisor of the image size."""
     levels: Annotated[int, Field(ge=1, le=8)] = 1
-    """Number of image sizes in training: at `downscale`, and at twice, four times, … that."""
+    """Number of image sizes in training: `downscale`, and twice, four times, … as much."""
     alpha: Alpha = "transparency"
     """Alpha channel of images: blended with the background, or a mask of the pixels that count."""
     masks: InputPath | None = None
-    """Folder of masks for a dataset without: `a.png` or `a.jpg.png` for the image a.jpg, of the same size, white where
-    pixels count.  All pixels count in an image without a mask."""
+    """Folder of masks, if the dataset has none: `a.png` or `a.jpg.png` for the image a.jpg, of the same size, white
+    where pixels count.  All pixels count in an image without a mask."""
     background: Literal["auto", "black", "white"] = "auto"
     """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
@@ -62,7 +62,7 @@ class SceneSettings(Settings):
     with the fifth, and at least two."""
     extent: Annotated[float, Field(gt=0)] | None = None
     """Radius of the scene, scene units, to which sizes and rates are relative; default: that of the training cameras.
-    To train a part of a scene, set the extent of the whole scene."""
+    To train part of a scene, set the extent of the whole scene."""
     missing: Missing = "refuse"
     """Images that the dataset names but does not have: refuse the scene, or skip them."""
 

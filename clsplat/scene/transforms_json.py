@@ -94,7 +94,7 @@ class Transforms:
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
         if len(frames) > MAX_FRAMES:
-            raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
+            raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: split the scene")
         self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
 
     def moments(self) -> list[tuple[str, float | None]]:

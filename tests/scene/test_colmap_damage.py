@@ -123,7 +123,7 @@ def test_camera_wider_than_any_image(tmp_path: Path, kind: str, width: int) -> N
 
 def test_tiny_focal_length(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     camera = replace(PINHOLE, model="OPENCV_FISHEYE", params=(5e-324, 50.0, 32.0, 24.0, 0.1, 0.0, 0.0, 0.0))
-    assert "focal lengths from 0.001 on" in refusal(
+    assert "focal lengths of at least 0.001" in refusal(
         read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
     )
     assert not recwarn.list

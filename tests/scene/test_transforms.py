@@ -190,7 +190,7 @@ def test_null_camera_model_is_refused(tmp_path: Path) -> None:
 def test_too_many_frames_are_refused_before_they_are_read(tmp_path: Path, monkeypatch) -> None:
     write(tmp_path, **LENS, frames=frames("a.png", "b.png", "c.png"))
     monkeypatch.setattr("clsplat.scene.transforms_json.MAX_FRAMES", 2)
-    assert "has 3 frames; expected at most 2: divide the scene" in refusal(read_scene, tmp_path)
+    assert "has 3 frames; expected at most 2: split the scene" in refusal(read_scene, tmp_path)
 
 
 def test_shared_values_are_not_copied_per_frame(tmp_path: Path) -> None:
