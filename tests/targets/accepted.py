@@ -4,8 +4,6 @@ from collections.abc import Iterable
 
 ACCEPTED = {
     "tgllp: blend_wide.cl (wide, PIXEL_BOX 1) does not compile: ocloc ended with -6": "no GPU uses *wide* by default",
-    "pvc project_backward spills registers (26)": "training on Ponte Vecchio",
-    "pvc project_backward (TILE 8) spills registers (26)": "the same",
     "pvc project_backward (PIXEL_BOX 1) spills registers (12)": "only the recipes `box` and `box_7k`",
     "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (12)": "only the recipes `box` and `box_7k`",
     "pvc blend_backward (PIXEL_BOX 1, PIXEL_SUMS 13) spills registers (30)": "only the box filter with texture sums",
