@@ -127,7 +127,7 @@ def edit_of(device: Device, rng, count: int, wrong: WrongPixels, sizes=0.01, opa
     stats = SplatStats(gaussians)
     for name in ("stats/seen", "stats/screen_grad"):
         gaussians.set(name, np.ones((count, 1)))
-    survey = SimpleNamespace(cached=lambda function, *arguments: wrong)
+    survey = SimpleNamespace(compute_once=lambda function, *arguments: wrong)
     return Edit(gaussians, stats, SceneScale(1.0), step=600, seed=3, survey=survey)
 
 

@@ -28,7 +28,7 @@ def edit_of(device, rng, count: int, scores: np.ndarray, seed: int = 3) -> Edit:
     stats = SplatStats(gaussians, {"screen_grad_abs"})
     gaussians.set(SEEN, np.ones((count, 1)))
     gaussians.set("stats/screen_grad_abs", np.where(np.arange(count) < count // 2, 1.0, 0.0)[:, None])
-    survey = SimpleNamespace(cached=lambda function, views: scores)
+    survey = SimpleNamespace(compute_once=lambda function, views: scores)
     return Edit(gaussians, stats, SceneScale(1.0), step=600, seed=seed, survey=survey)
 
 

@@ -92,7 +92,7 @@ def test_heaviest_gaussians_reach_the_fraction(weight, share, expected):
 def test_rarely_needed_and_light_gaussians_are_pruned(device, rng):
     gaussians = random_case(rng, 5).model(device).gaussians
     found = Weights(np.array([500.0, 300, 200, 0.5, 0.4]), np.array([3, 1, 2, 3, 4]))
-    survey = SimpleNamespace(cached=lambda function, *arguments: found)
+    survey = SimpleNamespace(compute_once=lambda function, *arguments: found)
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
     edit.mark(copies=2, old_rows=1)
     PruneUseless(views_below=2, weight_total=0.999).mark(edit)

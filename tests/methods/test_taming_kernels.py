@@ -79,7 +79,7 @@ def edit_of(device, rng, sizes, opacity=0.5, losses=1.0, gradient=1.0) -> Edit:
     stats = SplatStats(gaussians)
     gaussians.set("stats/seen", np.ones((count, 1)))
     gaussians.set("stats/screen_grad", np.broadcast_to(gradient, count)[:, None].astype(np.float32))
-    survey = SimpleNamespace(cached=lambda function, views: (np.broadcast_to(losses, count), np.zeros(count)))
+    survey = SimpleNamespace(compute_once=lambda function, views: (np.broadcast_to(losses, count), np.zeros(count)))
     return Edit(gaussians, stats, SceneScale(1.0), step=600, seed=3, survey=survey)
 
 
