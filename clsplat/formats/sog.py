@@ -177,7 +177,7 @@ class _Sog:
         version = 1 if self.old else meta.get("version")
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
-        self.count = self._whole_number("count", first[0] if self.old and first else meta.get("count"))
+        self.count = self._require_count("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
 
@@ -228,8 +228,8 @@ class _Sog:
         if self.old:
             degree = self._degree_of_width(files[0])
         else:
-            entries = self._whole_number("shN.count", self._part("shN").get("count", used_entries), MAX_PALETTE)
-            degree = self._whole_number("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
+            entries = self._require_count("shN.count", self._part("shN").get("count", used_entries), MAX_PALETTE)
+            degree = self._require_count("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
         size = sh_coefficients(degree) - 1
         if used_entries > entries:
             raise DataError(
@@ -307,7 +307,7 @@ class _Sog:
             )
         return np.array(value, np.float64)
 
-    def _whole_number(self, key_path: str, value: Any, limit: int = packing.MAX_SIDE**2) -> int:
+    def _require_count(self, key_path: str, value: Any, limit: int = packing.MAX_SIDE**2) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= limit:
             raise DataError(
                 f"{self.path}: {key_path} is {quote(value)}; expected a whole number from 1 to {limit}; export it again"
@@ -422,17 +422,17 @@ class Harmonics:
         rest: NDArray[np.float32],
         quality: Quality,
         weights: NDArray[np.float64],
-        better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
+        refine: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
         """Fit a small palette to SH [N, c], for training; writing a model with its `values` does not change them.
 
-        weights: weights of errors, [N].  better: refines a palette [E, c] and returns it with the label of each splat.
+        weights: weights of errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
         step: rounding of codebook numbers, used if few enough remain.
         """
         vectors, labels = palette(rest, _training_entries(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
-            vectors, labels = better(vectors)
+            vectors, labels = refine(vectors)
         return cls.from_vectors(vectors, labels, step)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Find the built kernels that pyopencl and PoCL cache, and remove damaged ones."""
+"""Check the kernel caches of pyopencl and PoCL, and remove damaged entries."""
 
 import logging
 import os

@@ -62,7 +62,7 @@ class DepthMaps:
             values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
         return np.asarray(values)
 
-    def at(
+    def sample(
         self, name: str, size: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp], inverse: Floats
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats] | None:
         """Return rows, columns and inverse depths at an even grid of pixels of a photograph of size (width, height).
@@ -78,8 +78,8 @@ class DepthMaps:
         step = math.ceil(math.sqrt(values.size / MAX_PIXELS))
         y, x = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)
         depths = fit[0] * values[y, x] + fit[1]
-        near = depths > 0  # others are beyond the range of the map
-        return y[near], x[near], depths[near]
+        is_in_range = depths > 0
+        return y[is_in_range], x[is_in_range], depths[is_in_range]
 
 
 def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
@@ -151,7 +151,7 @@ class PointDepths:
         weights = np.minimum(1.0, self._counts[rows[order]] / FULL_WEIGHT_VIEWS)
         if self.maps and camera.view is not None:
             pixels = indices // camera.stride, indices % camera.stride
-            samples = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
+            samples = self.maps.sample(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
             if samples is None:
                 return None
             indices, inverse, weights = samples[0] * camera.stride + samples[1], samples[2], np.ones(len(samples[2]))

@@ -98,8 +98,8 @@ def _map_value(value: Any, scene: str | None, change: Change) -> Any:
     if isinstance(value, Settings):
         changes = {}
         for key in type(value).model_fields:
-            before, path = getattr(value, key), value.input_path(key, scene)
-            changes[key] = _map_value(before, scene, change) if path is None else change(before, path)
+            setting, path = getattr(value, key), value.input_path(key, scene)
+            changes[key] = _map_value(setting, scene, change) if path is None else change(setting, path)
         return value.model_copy(update=changes)
     if isinstance(value, list | tuple):
         return type(value)(_map_value(item, scene, change) for item in value)

@@ -114,7 +114,7 @@ class RunFolder:
         chosen = (line for line in lines if all(line.get(key) == value for key, value in conditions.items()))
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
 
-    def by_cpu_seconds(self, points: Points) -> Points:
+    def over_cpu_seconds(self, points: Points) -> Points:
         """Convert points (step, figure) to points (CPU seconds of training, figure); empty without CPU times."""
         times = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
         if len(times) == 1:

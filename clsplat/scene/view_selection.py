@@ -99,7 +99,7 @@ class ViewSelection(Settings):
                 del matches_of[name]
         if count := len({*lines}) - len(matches_of):
             LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(count, "name"))
-        return {i for name, matches in matches_of.items() for i in _only_match(name, matches, names, source)}
+        return {i for name, matches in matches_of.items() for i in _require_one_match(name, matches, names, source)}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> list[str]:
         """Return the listed names, some of which may be left out later; empty for every n-th view.
@@ -187,7 +187,7 @@ def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ..
     return groups
 
 
-def _only_match(name: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
+def _require_one_match(name: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
     """Return the views of the only photograph that matches.  Raises DataError for none or several."""
     if len({photograph_name(names[i]) for i in matches}) == 1:
         return matches

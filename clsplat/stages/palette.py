@@ -169,7 +169,7 @@ class VisibleError:
         return cls(weights, np.ascontiguousarray(mean.T), second)
 
     def gradient(self, rest: NDArray[np.floating]) -> Floats:
-        """Return A x for the coefficients x of three channels, [N, 3 K]."""
+        """Return the gradient A x of the error at coefficients x of three channels, [N, 3 K]; A is `form`."""
         table, products = (
             rest.reshape(len(rest), -1, 3).astype(np.float64),
             np.zeros((len(rest), self.mean.shape[1], 3)),

@@ -44,7 +44,6 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/opencl/device.py": "reads kernels, of the package and of plug-ins: code that is trusted",
     "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
     "clsplat/core/machine.py:available_memory": "reads what the kernel tells, which has no size",
-    "clsplat/scene/llff.py:read_poses": "NumPy reads its own format, of a file whose size was checked",
     "data_tools/video.py:decode_frames": "decodes what was hashed before",
     "data_tools/lpips.py:write_lpips": "unpacks a package whose hash was checked",
     "data_tools/fetch.py:_members": "unpacks what it has downloaded",

@@ -100,7 +100,7 @@ def test_costs_are_shown_if_recorded(make_run, tmp_path):
     assert "<td>57</td>" in page
     assert "test PSNR over CPU seconds of training, dB" in page
     run = RunFolder.read(new)
-    assert run.by_cpu_seconds(run.points("evaluate", "psnr")) == [(6.0, 50.0), (10.0, 70.0)], "between two reports"
+    assert run.over_cpu_seconds(run.points("evaluate", "psnr")) == [(6.0, 50.0), (10.0, 70.0)], "between two reports"
     alone = page_of(tmp_path, old)
     assert "CPU seconds" not in alone
     assert "device memory" not in alone

@@ -215,27 +215,27 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
         array.fill(-1.5)
         yield match("fill_words", f"{count} values", array.get(), -1.5)
     gaussians = random_case(rng, 65).model(device).gaussians
-    before, rows, values = _tables(gaussians), rng.permutation(65)[:17], rng.normal(size=(17, 45))
+    expected_tables, rows, values = _tables(gaussians), rng.permutation(65)[:17], rng.normal(size=(17, 45))
     gaussians.set_rows("sh_rest", rows, values)
-    before["sh_rest"][:, rows] = values.T.astype(np.float32)
+    expected_tables["sh_rest"][:, rows] = values.T.astype(np.float32)
     gaussians.zero_rows(["quats"], rows)
-    before["quats"][:, rows] = 0
+    expected_tables["quats"][:, rows] = 0
     for name, kernel in (("sh_rest", "set_rows"), ("quats", "zero_rows"), ("means", "set_rows")):
-        yield match(kernel, f"17 rows of {name}", gaussians[name].get(), before[name])
+        yield match(kernel, f"17 rows of {name}", gaussians[name].get(), expected_tables[name])
     source, fresh = rng.integers(0, 65, 150).astype(np.uint32), rng.integers(0, 2, 150).astype(np.uint32)
     gaussians.add("fresh", 2, zero_fresh=True)
     gaussians.set("fresh", rng.normal(size=(65, 2)))
-    old = {name: gaussians.get(name) for name in gaussians.tables}
+    tables = {name: gaussians.get(name) for name in gaussians.tables}
     gaussians.rearrange(device.upload(source), device.upload(fresh), 150)
-    for name, table in old.items():
+    for name, table in tables.items():
         expected = table[source] * (1 if name != "fresh" else 1 - fresh[:, None])
         yield match("gather_rows", f"150 rows of {name}", gaussians.get(name), expected)
     for value in (np.nan, np.inf, -np.inf):
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
         actual = case.model(device).gaussians.not_finite()
-        mistaken = {"quats", "sh_rest"} ^ set(actual)
-        yield Deviation("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
+        differing = {"quats", "sh_rest"} ^ set(actual)
+        yield Deviation("count_not_finite", f"tables with {value}", len(differing), 0, counts=True)
 
 
 # Deferred updates of harmonics, which wait until a view sees their Gaussians.

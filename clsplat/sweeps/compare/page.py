@@ -236,7 +236,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         curve(f"test PSNR over steps, dB{means}", lines(test_points)),
         curve(
             f"test PSNR over CPU seconds of training, dB{means}",
-            lines(lambda run: run.by_cpu_seconds(test_points(run))),
+            lines(lambda run: run.over_cpu_seconds(test_points(run))),
         ),
         curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(training_points)),
         curve(f"Gaussians over steps{means}", lines(lambda run: run.points("train", "gaussians"))),
