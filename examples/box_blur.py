@@ -12,7 +12,7 @@ class BoxBlur(PhotographTransform):
 
     type: Literal["box_blur"] = "box_blur"
     reach: NonNegative
-    """Pixels on each side of the center of the window, rounded; number by step."""
+    """Pixels on each side of the center of the window, rounded; may be scheduled."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         camera, reach = planes.camera, round(at_step(self.reach, step))

@@ -40,9 +40,9 @@ class CameraResponse(TrainingModule):
 
     type: Literal["lens_and_curves"] = "lens_and_curves"
     rate: NonNegative = 1e-3
-    """Learning rate (Adam) of the parameters; number by step. Trainings of a few hundred steps need 5e-3."""
+    """Learning rate (Adam) of the parameters; may be scheduled. Trainings of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; number by step. It makes the Gaussians learn
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It makes the Gaussians learn
     what all photos have in common."""
 
     def create_state(self, run: Run) -> ModuleState:
@@ -111,17 +111,17 @@ def row_gradient(row: Floats, sums: Floats) -> Floats:
     return np.concatenate([totals[:5], np.delete(grad_logs, 2, axis=1).ravel()])
 
 
-def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
+def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, grad: Array | None = None) -> Array:
     """Apply a camera's response to an image, [3 or 4, rows, stride].
 
-    back: the gradient of the result; if given, return the gradient of the image, and leave the sums over pixel rows in
+    grad: the gradient of the result; if given, return the gradient of the image, and leave the sums over pixel rows in
     the workspace.
     """
-    result = workspace.array("grad_response" if back else "response", image.shape)
+    result = workspace.array("grad_response" if grad else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
     numbers = workspace.device.upload(np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
-    arguments: dict[str, Any] = {"image": image, "gradient": back or image, "out": result, "row_sums": sums, **center}
-    arguments |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    arguments: dict[str, Any] = {"image": image, "gradient": grad or image, "out": result, "row_sums": sums, **center}
+    arguments |= {"numbers": numbers, "channels": image.shape[0], "back": int(grad is not None), "per_px": 1 / half}
     workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **arguments, **camera.plane_arguments())
     return result

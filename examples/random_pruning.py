@@ -12,9 +12,9 @@ class PruneAtRandom(Rule):
 
     type: Literal["prune_at_random"] = "prune_at_random"
     share: Positive = 0.5
-    """Fraction of the faint Gaussians to remove; number by step."""
+    """Fraction of the faint Gaussians to remove; may be scheduled."""
     opacity_below: Positive = 0.1
-    """Opacity below which a Gaussian is faint; number by step."""
+    """Opacity below which a Gaussian is faint; may be scheduled."""
 
     def mark(self, edit: Edit) -> None:
         opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
@@ -30,7 +30,7 @@ class CapSize(Scheduled):
     edits: ClassVar[bool] = True
 
     max_size: Positive = 0.1
-    """Largest standard deviation along an axis, as a fraction of the extent; number by step."""
+    """Largest standard deviation along an axis, as a fraction of the extent; may be scheduled."""
 
     def run(self, run: Run) -> None:
         log_scales = run.model.gaussians.get("log_scales")

@@ -46,7 +46,7 @@ def test_map_has_the_inverse_depths_of_the_points_in_any_unit(tmp_path, rng, bit
     rows, columns = rng.integers(0, 30, 50), rng.integers(0, 40, 50)
     told = inverse[rows, columns].copy()
     told[:5] *= 1.5  # wrong points
-    found = DepthMaps(tmp_path).at("deep/a.jpg", (40, 30), rows, columns, told)
+    found = DepthMaps(tmp_path).sample("deep/a.jpg", (40, 30), rows, columns, told)
     assert found is not None
     assert len(found[2]) == 1200
     np.testing.assert_allclose(found[2], inverse[found[0], found[1]], atol=2e-4 if bits == 16 else 1e-2)
@@ -61,18 +61,18 @@ def test_inconsistent_depth_maps_are_dropped_and_named(tmp_path, rng, caplog):
     write_map(tmp_path / "good.png", inverse)
     with caplog.at_level(logging.WARNING):
         for name in ("dark.jpg", "plain.jpg"):
-            assert DepthMaps(tmp_path).at(name, (40, 30), rows, columns, inverse[rows, columns]) is None
+            assert DepthMaps(tmp_path).sample(name, (40, 30), rows, columns, inverse[rows, columns]) is None
             assert f"{name}: ignoring the depth map, which does not fit the points" in caplog.text
     few = slice(0, MIN_POINTS - 1)
     assert fit_scale_and_offset(inverse[rows, columns][few], inverse[rows, columns][few]) is None
-    assert DepthMaps(tmp_path).at("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None
+    assert DepthMaps(tmp_path).sample("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None
 
 
 def test_large_map_is_compared_on_an_even_grid(tmp_path):
     inverse = np.linspace(0.1, 1.5, 400 * 300).reshape(300, 400)
     write_map(tmp_path / "a.png", inverse)
     rows, columns = np.arange(300), np.arange(300)
-    found = DepthMaps(tmp_path).at("a.jpg", (400, 300), rows, columns, inverse[rows, columns])
+    found = DepthMaps(tmp_path).sample("a.jpg", (400, 300), rows, columns, inverse[rows, columns])
     assert found is not None
     assert MAX_PIXELS / 2 < len(found[0]) <= MAX_PIXELS
     assert set(np.diff(np.unique(found[0]))) == set(np.diff(np.unique(found[1]))) == {2}

@@ -142,7 +142,7 @@ class Moving(SyntheticOptions):
         """Return the image files of a finished dataset, including static masks."""
         return [f"{_name(*frame)}.png" for frame in self.frames()] + [_static(i) for i in range(self.test)]
 
-    def fill(self, out: Path, workers: int) -> str:
+    def write_files(self, out: Path, workers: int) -> str:
         """Write images, static masks, cameras and points into `out`; return a summary."""
         frames, poses = self.frames(), self.poses()
         rng, points = np.random.default_rng(self.seed), list[tuple[Array, Array, Array]]()

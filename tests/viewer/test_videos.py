@@ -91,7 +91,7 @@ def test_frames_can_be_written_as_images(few_steps, tiny_scene, tmp_path):
 def test_failed_video_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
     clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=3, size=(16, 16))
     before = pictures(tmp_path / "out")
-    monkeypatch.setattr(Canvas, "layers", lambda *_: (_ for _ in ()).throw(NumericError("no picture")))
+    monkeypatch.setattr(Canvas, "render_layers", lambda *_: (_ for _ in ()).throw(NumericError("no picture")))
     with pytest.raises(NumericError, match="no picture"):
         clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=1, size=(16, 16))
     assert pictures(tmp_path / "out").keys() == before.keys()

@@ -159,14 +159,14 @@ def choices(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         gaussians = random_case(rng, count).model(device).gaussians
         edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), STEP, SEED)
-        copies, kept, shrink = np.ones(count), np.ones(count), np.ones(count)
+        copies, old_rows, shrink = np.ones(count), np.ones(count), np.ones(count)
         for factor in (0.5, 0.25):
             chosen, numbers = rng.random(count) < 0.7, rng.integers(0, 5, count)
             edit.choose(chosen, numbers, 3, factor)
             acts = chosen & ((numbers == 0) | (copies == 1))
-            copies[acts], kept[acts] = numbers[acts], np.minimum(numbers, 3)[acts]
+            copies[acts], old_rows[acts] = numbers[acts], np.minimum(numbers, 3)[acts]
             shrink[acts & (copies > 0)] = factor
-        for name, expected in (("copies", copies), ("kept", kept), ("shrink", shrink)):
+        for name, expected in (("copies", copies), ("old_rows", old_rows), ("shrink", shrink)):
             yield match("mark_chosen", f"{name} of {count} Gaussians", getattr(edit, name).get(), expected)
 
 
