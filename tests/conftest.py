@@ -154,9 +154,9 @@ def device(request: pytest.FixtureRequest) -> Device:
 def opened(name: str, tuning: str) -> Device:
     """A device with one of the settings; cases of a test take them in turn."""
     schedule, lanes = TUNINGS[tuning]
-    found = Device(choose(name or None), schedule)
-    found.tuning["LANES"] = lanes
-    return found
+    result = Device(choose(name or None), schedule)
+    result.tuning["LANES"] = lanes
+    return result
 
 
 @pytest.fixture(scope="session")

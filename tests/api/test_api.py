@@ -128,11 +128,11 @@ def test_pose_of_another_shape_is_refused():
 
 
 def test_views_are_comparable_and_hashable():
-    one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
-    assert one == one
-    assert one != other
-    assert len({one, other}) == 2
-    assert one in [other, one]
+    first, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
+    assert first == first
+    assert first != other
+    assert len({first, other}) == 2
+    assert first in [other, first]
 
 
 @on_one_setting
@@ -203,7 +203,7 @@ def test_metrics_refuse_images_of_unsupported_integers(metric, kind):
 def test_devices_are_context_managers():
     with clsplat.Device() as device:
         assert repr(device).startswith("Device('")
-    assert any(one["fault"] is None and one["schedule"] in ("wide", "simt") for one in clsplat.devices())
+    assert any(item["fault"] is None and item["schedule"] in ("wide", "simt") for item in clsplat.devices())
 
 
 @pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])

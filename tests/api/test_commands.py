@@ -82,7 +82,7 @@ def test_resume_and_dry_run(runs, tiny_scene, tmp_path):
     text = clsplat.describe_run("smoke", tiny_scene, tmp_path / "new", set=SET)
     shown = command("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "new", *SETS, "--dry-run")
     times = re.compile(r"\d[\d.]* (ms|min|to)\b")  # measured each time
-    told, printed = ([times.sub("", line) for line in one.splitlines()] for one in (text, shown))
+    told, printed = ([times.sub("", line) for line in item.splitlines()] for item in (text, shown))
     assert printed[-len(told) :] == told
     assert not (tmp_path / "new").exists()
 
@@ -157,10 +157,10 @@ def test_copies_of_pipelines(tmp_path):
 
 def test_measurements(runs, tiny_scene, tmp_path):
     model = {"model": runs[0] / "point_cloud.ply", "scene": tiny_scene}
-    found = clsplat.measure_speed([], **model, pipeline="smoke", repeats=1)
-    (tmp_path / "bench.json").write_text(json.dumps(found.data()))
-    assert clsplat.read_measurement(tmp_path / "bench.json", "smoke").keys() == found.data().keys()
-    assert "point_cloud" in found.text({})
+    measurement = clsplat.measure_speed([], **model, pipeline="smoke", repeats=1)
+    (tmp_path / "bench.json").write_text(json.dumps(measurement.data()))
+    assert clsplat.read_measurement(tmp_path / "bench.json", "smoke").keys() == measurement.data().keys()
+    assert "point_cloud" in measurement.text({})
 
 
 @pytest.mark.parametrize(

@@ -222,10 +222,10 @@ def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
     devices._open_default.cache_clear()
     with ThreadPoolExecutor(4) as pool:
         programs = list(pool.map(lambda _: device.program("fill.cl"), range(4)))
-        found = list(pool.map(lambda _: devices.default_device(), range(4)))
+        actual = list(pool.map(lambda _: devices.default_device(), range(4)))
     devices._open_default.cache_clear()
     assert (len(built), len(set(programs))) == (1, 1)
-    assert (len(opened), len(set(found))) == (1, 1)
+    assert (len(opened), len(set(actual))) == (1, 1)
 
 
 @on_one_setting

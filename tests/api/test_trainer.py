@@ -188,15 +188,15 @@ def test_custom_loss_matches_the_built_in_gradient(device, rng):
         difference = image - photograph
         return np.abs(difference).mean(), np.sign(difference) / difference.size
 
-    found = []
+    results = []
     for loss in (L1(weight=0.7), HostLoss(l1, 0.7)):
         gradient = device.zeros(planes.shape)
         comparison = Comparison(workspace, camera, *map(device.upload, images), gradient)
         before = Dssim(weight=0.3).add(comparison)  # a loss adds to what is there
         value = loss.add(comparison).value()
-        found.append((value, gradient.get()[inside], before.value()))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-6)
-    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-6 * np.abs(found[0][1]).max())
+        results.append((value, gradient.get()[inside], before.value()))
+    assert results[0][0] == pytest.approx(results[1][0], rel=1e-6)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-6 * np.abs(results[0][1]).max())
 
 
 def test_added_loss_acts_from_the_next_step(tiny_scene):
@@ -215,7 +215,7 @@ def test_added_loss_acts_from_the_next_step(tiny_scene):
     assert seen == [((40, 40, 3), np.float32, (40, 40, 3), True)] * 10
     assert "darkness" in [loss.name for loss in report.view.losses]
     plain.run()
-    images = [Renderer(one.model).render(one.scene.views[0]).image.mean() for one in (plain, dark)]
+    images = [Renderer(item.model).render(item.scene.views[0]).image.mean() for item in (plain, dark)]
     assert images[1] < images[0] - 0.02
 
 

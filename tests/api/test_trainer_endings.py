@@ -30,9 +30,9 @@ def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
     trainer.checkpoint()
     assert parse_status(tmp_path / "run")["state"] == "running"
     trainer.close()
-    found = parse_status(tmp_path / "run")
-    assert (found["state"], found["exit_code"], found["step"]) == ("interrupted", 130, 2)
-    assert found["message"] == "the trainer was closed before its last step"
+    status = parse_status(tmp_path / "run")
+    assert (status["state"], status["exit_code"], status["step"]) == ("interrupted", 130, 2)
+    assert status["message"] == "the trainer was closed before its last step"
     assert clsplat.status(tmp_path / "run")["state"] == "interrupted"
     again = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", start="resume")
     assert again.step().step == 3

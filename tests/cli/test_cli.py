@@ -68,8 +68,8 @@ def test_failed_start_is_in_the_status(tmp_path):
 def test_check_and_schema():
     assert "splat.yaml: valid; init, optimize" in clsplat("check", "splat").stdout
     assert json.loads(clsplat("check", "--schema").stdout)["properties"]["stages"]
-    found = json.loads(clsplat("check", "splat", "--json").stdout)
-    assert (found["name"], found["valid"]) == ("splat", True)
+    data = json.loads(clsplat("check", "splat", "--json").stdout)
+    assert (data["name"], data["valid"]) == ("splat", True)
 
 
 def test_devices():
@@ -171,15 +171,15 @@ def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, tmp_path, pipel
     cloud = tiny_scene / "points3d.ply"
     options = ("--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
     done = clsplat("bench", *options, "--pipeline", pipeline)
-    found = json.loads(done.stdout)["scenes"]["points3d"]
-    assert "statistics" in found["stages"]
-    assert "other" not in found["stages"]
+    actual = json.loads(done.stdout)["scenes"]["points3d"]
+    assert "statistics" in actual["stages"]
+    assert "other" not in actual["stages"]
     (tmp_path / "bench.json").write_text(done.stdout)
     again = ("bench", *options, "--against", tmp_path / "bench.json", "--pipeline")
     if pipeline == "splat":
-        assert json.loads(clsplat(*again, pipeline).stdout)["against"]["scenes"]["points3d"] == found
+        assert json.loads(clsplat(*again, pipeline).stdout)["against"]["scenes"]["points3d"] == actual
     refused = clsplat(*again, "absgs", expect=2)
     assert f"expected the pipeline 'absgs', got '{pipeline}'" in refused.stderr
-    assert found["work"]["gaussians"] > 100
-    assert set(found["floors"]) <= set(found["stages"])
-    assert 0 < found["memory"] < 2 * found["planned"]
+    assert actual["work"]["gaussians"] > 100
+    assert set(actual["floors"]) <= set(actual["stages"])
+    assert 0 < actual["memory"] < 2 * actual["planned"]

@@ -231,8 +231,8 @@ LONG = "x" * 300  # longer than a name of any file system
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows says that there is no such file")
 def test_too_long_input_name_is_reported_like_a_missing_file(arguments, code, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    found, errors = in_this_process(monkeypatch, capsys, *arguments)
-    assert found == code, errors
+    actual, errors = in_this_process(monkeypatch, capsys, *arguments)
+    assert actual == code, errors
     assert len(errors.splitlines()) == 1
     assert "File name too long" in errors or code == 2
     assert list(tmp_path.iterdir()) == []

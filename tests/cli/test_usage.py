@@ -161,13 +161,13 @@ def test_pipelines_prints_keys_in_set_notation():
     keys = [line.split("  ")[0] for line in lines[lines.index("Keys, as for --set:") + 1 :]]
     assert keys == [key.text for key in list_keys(load("splat_7k").settings)]
     assert {"optimize.steps=7000", "optimize.losses.0.weight=0.8", "densify.every=100"} <= set(keys)
-    found = manual("splat_7k")
-    assert next(key for key in found["keys"] if key["key_path"] == "optimize.steps") == {
+    actual = manual("splat_7k")
+    assert next(key for key in actual["keys"] if key["key_path"] == "optimize.steps") == {
         "key_path": "optimize.steps",
         "value": 7000,
         "description": ANY,
     }
-    assert found["stages"][:2] == ["init", "optimize"]
+    assert actual["stages"][:2] == ["init", "optimize"]
 
 
 def test_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
@@ -251,8 +251,8 @@ def test_damaged_records_are_reported_with_their_line(line, tmp_path, caplog):
     fault = r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"
     with pytest.raises(DataError, match=fault):
         Records(tmp_path).read()
-    found = run_status(RunState.read(tmp_path))
-    assert (found["state"], found["step"], found["last"]) == ("done", 7, None), "the state is told all the same"
+    status = run_status(RunState.read(tmp_path))
+    assert (status["state"], status["step"], status["last"]) == ("done", 7, None), "the state is told all the same"
     assert re.search(fault, caplog.text)
 
 
@@ -260,10 +260,10 @@ def test_status_reads_only_files(finished, tmp_path):
     text = clsplat("status", finished).stdout
     assert f"{finished}: done at step 50\n" in text
     assert "test 1/2: psnr " in text
-    found = json.loads(clsplat("status", finished, "--json").stdout)
-    assert (found["state"], found["step"], found["exit_code"]) == ("done", 50, 0)
-    assert found["metrics"] == json.loads((finished / "metrics.json").read_text())
-    assert found["last"]["step"] == 50
+    data = json.loads(clsplat("status", finished, "--json").stdout)
+    assert (data["state"], data["step"], data["exit_code"]) == ("done", 50, 0)
+    assert data["metrics"] == json.loads((finished / "metrics.json").read_text())
+    assert data["last"]["step"] == 50
     (tmp_path / "pipeline.yaml").write_text("")
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -282,6 +282,6 @@ def test_status_reads_only_files(finished, tmp_path):
 
 
 def test_recipe_descriptions_are_unique():
-    described = [one["summary"] for one in summaries()]
+    described = [item["summary"] for item in summaries()]
     assert len(set(described)) == len(described)
-    assert all("7,000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))
+    assert all("7,000 steps" in item["summary"] for item in summaries() if item["name"].endswith("_7k"))

@@ -23,21 +23,21 @@ def cases() -> list[Any]:
     """
     wide = [(check, setting) for check, setting in zip(KERNELS, itertools.cycle(("wide16", "wide8")), strict=False)]
     small = zip((*ESSENTIAL, *BITONIC), itertools.cycle(TUNINGS), strict=False)
-    found = [*wide, *((check, "simt") for check in KERNELS), *small]
+    actual = [*wide, *((check, "simt") for check in KERNELS), *small]
     return [
         pytest.param((name, setting), check, id=f"{name}-{setting}-{check.name.replace(' ', '_')}")
         for name in NAMES
-        for check, setting in found
+        for check, setting in actual
     ]
 
 
 @pytest.mark.usefixtures("cache_references")
 @pytest.mark.parametrize(("device", "check"), cases(), indirect=["device"])
 def test_check_passes(device, check):
-    found = list(check.deviations(device))
-    assert_within_bounds(one for one in found if not isinstance(one, Note))
+    actual = list(check.deviations(device))
+    assert_within_bounds(item for item in actual if not isinstance(item, Note))
     out, lines = io.StringIO(), queue.Queue()
-    worker._run(out, replace(check, run=lambda *_: iter(found)), lambda: device)
+    worker._run(out, replace(check, run=lambda *_: iter(actual)), lambda: device)
     worker._print(out, end=check.name, seconds=0.0)
     for line in out.getvalue().splitlines():
         lines.put(line)
@@ -45,8 +45,8 @@ def test_check_passes(device, check):
     assert supervision._read_result(told, lines, 1) is None
     assert told.failures == []
     assert (len(told.deviations), len(told.notes)) == (
-        sum(not isinstance(one, Note) for one in found),
-        len(found) - len(told.deviations),
+        sum(not isinstance(item, Note) for item in actual),
+        len(actual) - len(told.deviations),
     )
 
 
@@ -59,6 +59,6 @@ def test_every_kernel_was_launched(launched):
             if not path.stem.endswith(other)
             for name in parse_kernels(path.read_text())
         }
-        found = {label for one, label in launched if one == schedule}
-        assert not kernels - found, f"no kernel test launches {', '.join(sorted(kernels - found))}"
-        assert found == kernels
+        actual = {label for one, label in launched if one == schedule}
+        assert not kernels - actual, f"no kernel test launches {', '.join(sorted(kernels - actual))}"
+        assert actual == kernels

@@ -86,16 +86,16 @@ def test_memory_faults_are_reported_although_kernels_pass():
 def test_checks_continue_after_a_runtime_crashes(monkeypatch, info):
     worker(monkeypatch)
     results = list(run_checks(info, "simt", checks("first", "dies", "second", "leaves", "third")))
-    assert [one.name for one in results] == ["first", "dies", "second", "leaves", "third"]
-    assert [one.passes for one in results] == [True, False, True, False, True]
+    assert [item.name for item in results] == ["first", "dies", "second", "leaves", "third"]
+    assert [item.passes for item in results] == [True, False, True, False, True]
     assert results[1].fault == "the runtime crashes with SIGABRT (noise of a runtime)"
     assert results[3].fault == "the process exits with code 3 (noise of a runtime)"
 
 
 def test_hanging_runtime_is_stopped(monkeypatch, info):
     monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
-    (one,) = run_checks(info, "simt", checks("hangs"), 1)
-    assert one.fault == "gives no answer within 1 s"
+    (first,) = run_checks(info, "simt", checks("hangs"), 1)
+    assert first.fault == "gives no answer within 1 s"
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_worker_gets_time_to_exit(monkeypatch, info, end, fault):
     """Its output closes before the process ends."""
     monkeypatch.setattr(supervision, "EXIT_TIMEOUT_S", 5, raising=False)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
-    assert [one.fault for one in run_checks(info, "simt", checks("rows"))] == [fault]
+    assert [run_check.fault for run_check in run_checks(info, "simt", checks("rows"))] == [fault]
 
 
 def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
@@ -120,16 +120,16 @@ def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, inf
     )
     monkeypatch.setattr(supervision, "WORKER", ("-c", script))
     results = list(run_checks(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
-    assert [(one.fault, one.out_of_memory) for one in results] == [("opening it: no memory", True)] * 2
+    assert [(item.fault, item.out_of_memory) for item in results] == [("opening it: no memory", True)] * 2
 
 
 def test_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
     worker(monkeypatch)
     results = list(run_checks(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
-    assert [one.passes for one in results] == [True, True, True, True, False, False], (
+    assert [item.passes for item in results] == [True, True, True, True, False, False], (
         "nobody tries again without success"
     )
-    assert [one.damaged_cache for one in results] == [False, True, False, True, False, False]
+    assert [item.damaged_cache for item in results] == [False, True, False, True, False, False]
     verdict = judge("simt", {"simt": results[:4]}, [])
     assert verdict.usable
     assert verdict.text == "use it, after removing its damaged cache of built kernels"
@@ -174,8 +174,8 @@ def test_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path,
         (tmp_path / name).write_text("raise RuntimeError('of the user')")
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     monkeypatch.chdir(tmp_path)
-    (one,) = run_checks(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
-    assert one.passes, one.fault
+    (first,) = run_checks(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
+    assert first.passes, first.fault
     assert runtimes.probe_fault("key", *info.index) is None
 
 
@@ -204,9 +204,9 @@ def test_report_is_valid_json_for_any_value(info):
     data = json.loads(json.dumps(report.data(), allow_nan=False))
     assert data["schema"] == 2
     assert data["verdict"]["usable"] is False
-    found = data["schedules"]["wide"][0]["deviations"]
-    assert [one["value"] for one in found] == [0.03, None]
-    assert not any(one["passes"] for one in found)
+    actual = data["schedules"]["wide"][0]["deviations"]
+    assert [item["value"] for item in actual] == [0.03, None]
+    assert not any(item["passes"] for item in actual)
     assert data["device"]["name"] == info.name
     assert "blend_backward differs by 0.03" in report.text()
 
@@ -236,8 +236,8 @@ def memory_of(monkeypatch, largest: int, deviation: Deviation = RIGHT) -> tuple[
     monkeypatch.setattr(whole, "_check_buffer", buffer)
     monkeypatch.setattr(whole, "available_memory", lambda: 2**34)
     info = SimpleNamespace(memory=2**33, allocation=2**30 + 4)
-    found = list(whole.memory(SimpleNamespace(info=info), None))
-    deviations, notes = ([one for one in found if isinstance(one, kind)] for kind in (Deviation, Note))
+    actual = list(whole.memory(SimpleNamespace(info=info), None))
+    deviations, notes = ([item for item in actual if isinstance(item, kind)] for kind in (Deviation, Note))
     once = [CheckResult("memory", ("fill_words",), 1.0, deviations, notes)]
     return once[0].failures, DeviceReport(info, "wide", {"wide": result(RIGHT)}, once)
 

@@ -36,11 +36,11 @@ def test_frustum_moments_match_those_of_its_points(rng):
     means, variances = nerf.frustums(ray[None], np.array([[t0, t1]]))
     t = (t0**3 + rng.random(400_000) * (t1**3 - t0**3)) ** (1 / 3)  # sections grow with the square of the distance
     along = ray[3:6] / ray[7]
-    one = np.cross(along, [0.0, 0.6, 0.8])
-    one /= np.linalg.norm(one)
-    other = np.cross(along, one)
+    first = np.cross(along, [0.0, 0.6, 0.8])
+    first /= np.linalg.norm(first)
+    other = np.cross(along, first)
     angle, radius = rng.random(len(t)) * 2 * np.pi, ray[6] * t * np.sqrt(rng.random(len(t)))
-    across = (radius * np.cos(angle))[:, None] * one + (radius * np.sin(angle))[:, None] * other
+    across = (radius * np.cos(angle))[:, None] * first + (radius * np.sin(angle))[:, None] * other
     points = ray[:3] + t[:, None] * ray[3:6] + across
     np.testing.assert_allclose(points.mean(axis=0), means[0, 0], atol=5e-3)
     np.testing.assert_allclose(points.var(axis=0), variances[0, 0], atol=5e-3)
@@ -100,8 +100,8 @@ def test_field_gradient_matches_finite_differences(rng, skip):
     def loss() -> float:
         return float(((composite()[0].colors() - wanted) ** 2).sum())
 
-    found, inputs = composite()
-    grad_raw, grad_densities = found.backward(2 * (found.colors() - wanted))
+    actual, inputs = composite()
+    grad_raw, grad_densities = actual.backward(2 * (actual.colors() - wanted))
     gradient, _ = network.backward(weights, inputs, grad_raw.reshape(-1, 3), grad_densities.reshape(-1, 1))
     for own, expected in zip(weights, gradient, strict=True):
         for values, derivative in zip(own, expected, strict=True):
@@ -117,7 +117,7 @@ def test_field_gradient_matches_finite_differences(rng, skip):
 
 
 def test_ray_weights_and_transmittance_sum_to_one(rng):
-    found = nerf.Composite(rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5)), np.full((2, 5), 0.3), np.ones(3))
-    weights, left = found.weights()
+    result = nerf.Composite(rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5)), np.full((2, 5), 0.3), np.ones(3))
+    weights, left = result.weights()
     np.testing.assert_allclose(weights.sum(axis=1) + left[:, -1], 1)
-    np.testing.assert_allclose(found.samples[1], np.log1p(np.exp(found.raw_densities - 1)))
+    np.testing.assert_allclose(result.samples[1], np.log1p(np.exp(result.raw_densities - 1)))

@@ -41,7 +41,7 @@ def test_grid_and_network_gradient_matches_differences(rng, level):
         return float((colors * grad_colors).sum() + (densities * grad_densities).sum())
 
     _, grad_position = network.backward(weights, outputs()[2], grad_colors, grad_densities)
-    found = level.backward(grad_position[:, :2], at, variances)
+    result = level.backward(grad_position[:, :2], at, variances)
     numeric = np.zeros_like(table)
     for place in np.ndindex(table.shape):
         before = table[place]
@@ -51,7 +51,7 @@ def test_grid_and_network_gradient_matches_differences(rng, level):
         numeric[place] = (high - value()) / (2 * STEP)
         table[place] = before
     assert np.abs(numeric).max() > 0.1
-    np.testing.assert_allclose(found, numeric, atol=1e-7)
+    np.testing.assert_allclose(result, numeric, atol=1e-7)
 
 
 def test_interpolation_reproduces_a_linear_function(rng):
@@ -82,7 +82,7 @@ def test_levels_are_dense_while_corners_fit_and_are_contiguous():
 
 
 def test_grid_parameters_follow_the_networks_and_start_near_zero():
-    plain, gridded = (FieldShape(degrees=2, grid=one) for one in (None, GridShape(levels=2, entries=16)))
+    plain, gridded = (FieldShape(degrees=2, grid=item) for item in (None, GridShape(levels=2, entries=16)))
     assert gridded.position_rows == plain.position_rows + 2 * FEATURES
     first = gridded.initial_parameters(3)
     own = first[gridded.network_parameters : gridded.network_parameters + gridded.grid.parameter_count]

@@ -274,11 +274,11 @@ CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
 
 def kernel_names() -> set[str]:
     """Names of all kernels, with the schedule if each schedule has a separate kernel."""
-    found = set()
+    actual = set()
     for path in resource_dir("cl_kernels").glob("*.cl"):
         own = re.search("_(wide|simt)$", path.stem)
-        found |= {f"{name} {own[1]}" if own else name for name in parse_kernels(path.read_text())}
-    return found
+        actual |= {f"{name} {own[1]}" if own else name for name in parse_kernels(path.read_text())}
+    return actual
 
 
 def checked_by(checks: list[Check]) -> set[str]:

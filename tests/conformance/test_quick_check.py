@@ -43,16 +43,16 @@ def like(device, **changes):
     [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
 )
 def test_bitonic_is_checked_if_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
-    found = []
-    monkeypatch.setattr(quick, "run_checks", lambda info, schedule, checks, seconds: found.extend(checks) or [])
+    results = []
+    monkeypatch.setattr(quick, "run_checks", lambda info, schedule, checks, seconds: results.extend(checks) or [])
     device = like(Device(info), tuning={"TEAM": team})
     quick.ensure_correct(device, sort)
-    assert any("sort_tiles" in check.kernels for check in found) == bitonic
-    found.clear()
+    assert any("sort_tiles" in check.kernels for check in results) == bitonic
+    results.clear()
     quick.ensure_correct(device, sort)
-    assert not found
+    assert not results
     quick.ensure_correct(device, "bitonic")
-    assert bool(found) != bitonic
+    assert bool(results) != bitonic
 
 
 def test_checks_of_every_run_need_no_bitonic():

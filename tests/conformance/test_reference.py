@@ -706,9 +706,9 @@ def test_grid_of_equal_matrices_is_constant_and_meets_its_nodes(rng):
 def test_removing_the_grid_mean_keeps_local_differences(rng):
     vignette = np.zeros((4, 3, 4, 2, 3, 3))
     vignette[..., 1, 1] = 0.3  # in the middle of all photographs
-    found = ref.center_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
-    np.testing.assert_allclose(found.mean(axis=(0, 4, 5)), 0, atol=1e-15)
-    np.testing.assert_allclose(found[..., 1, 1] - found[..., 0, 0], 0.3)
+    result = ref.center_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
+    np.testing.assert_allclose(result.mean(axis=(0, 4, 5)), 0, atol=1e-15)
+    np.testing.assert_allclose(result[..., 1, 1] - result[..., 0, 0], 0.3)
 
 
 def test_white_balance_keeps_the_luminance_of_its_gains():

@@ -55,32 +55,32 @@ def read_by(call: ast.Call) -> bool:
     name = ast.unparse(call.func)
     if name in FUNCTIONS or (isinstance(call.func, ast.Attribute) and call.func.attr in METHODS):
         return True
-    mode = call.args[name == "open" :][:1] + [one.value for one in call.keywords if one.arg == "mode"]
+    mode = call.args[name == "open" :][:1] + [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
     reads = not mode or (isinstance(mode[0], ast.Constant) and str(mode[0].value).startswith("r"))
     return (name == "open" or name.endswith(".open")) and reads and not (call.args[1:] and name != "open")
 
 
 def reads(path: Path) -> set[str]:
     """Where a module reads files: 'module:function', of the innermost function."""
-    found = set()
+    actual = set()
 
     def visit(node: ast.AST, function: str) -> None:
         if isinstance(node, ast.FunctionDef):
             function = node.name
         if isinstance(node, ast.Call) and read_by(node):
-            found.add(f"{path.relative_to(ROOT).as_posix()}:{function}")
+            actual.add(f"{path.relative_to(ROOT).as_posix()}:{function}")
         for child in ast.iter_child_nodes(node):
             visit(child, function)
 
     visit(ast.parse(path.read_text("utf-8")), "")
-    return found
+    return actual
 
 
 def test_files_are_read_only_by_the_read_module():
-    found = {one for room in ("clsplat", "data_tools") for path in (ROOT / room).rglob("*.py") for one in reads(path)}
-    known = {one for one in found for place in ALLOWED if one == place or one.startswith(f"{place}:")}
-    assert sorted(found - known) == [], "read with clsplat.core.reading, or say in ALLOWED why not"
-    unused = [place for place in ALLOWED if not any(one == place or one.startswith(f"{place}:") for one in found)]
+    actual = {one for room in ("clsplat", "data_tools") for path in (ROOT / room).rglob("*.py") for one in reads(path)}
+    known = {one for one in actual for place in ALLOWED if one == place or one.startswith(f"{place}:")}
+    assert sorted(actual - known) == [], "read with clsplat.core.reading, or say in ALLOWED why not"
+    unused = [place for place in ALLOWED if not any(one == place or one.startswith(f"{place}:") for one in actual)]
     assert unused == [], "is not needed any more"
 
 

@@ -86,29 +86,29 @@ def test_temporary_files_of_a_killed_write_are_swept_next(tmp_path):
 @pytest.fixture
 def calls(monkeypatch):
     """Calls to the disk, in order: sync, replace, or unlink, and the name of the file or folder."""
-    found: list[tuple[str, str]] = []
+    results: list[tuple[str, str]] = []
     real = {name: getattr(os, name) for name in ("fsync", "replace", "rename", "unlink")}
 
     def fsync(number):
-        found.append(("sync", Path(os.readlink(f"/proc/self/fd/{number}")).name))
+        results.append(("sync", Path(os.readlink(f"/proc/self/fd/{number}")).name))
         real["fsync"](number)
 
     def replace(old, new):
-        found.append(("replace", Path(new).name))
+        results.append(("replace", Path(new).name))
         real["replace"](old, new)
 
     def rename(old, new):
-        found.append(("rename", Path(new).name))
+        results.append(("rename", Path(new).name))
         real["rename"](old, new)
 
     def unlink(path, **more):
         if os.path.lexists(path):
-            found.append(("unlink", Path(path).name))
+            results.append(("unlink", Path(path).name))
         real["unlink"](path, **more)
 
     for function in (fsync, replace, rename, unlink):
         monkeypatch.setattr(os, function.__name__, function)
-    return found
+    return results
 
 
 has_proc = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="the names of open files are read from there")

@@ -25,8 +25,8 @@ def command(*arguments: str | Path) -> list[str]:
 
 
 def status(out: Path) -> tuple[str, int]:
-    found = json.loads((out / "status.json").read_text())
-    return found["state"], found["exit_code"]
+    data = json.loads((out / "status.json").read_text())
+    return data["state"], data["exit_code"]
 
 
 @full

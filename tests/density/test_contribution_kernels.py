@@ -21,9 +21,9 @@ def weights(rasterizer, model, photographs):
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)])
 def test_weights_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
-    found = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
-    assert found.shape == (count,)
-    np.testing.assert_allclose(found, ref.contribution(case.project(), width, height), rtol=1e-4, atol=1e-5)
+    actual = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
+    assert actual.shape == (count,)
+    np.testing.assert_allclose(actual, ref.contribution(case.project(), width, height), rtol=1e-4, atol=1e-5)
 
 
 def test_pixels_beyond_the_edge_do_not_count(device, rng):
@@ -31,8 +31,8 @@ def test_pixels_beyond_the_edge_do_not_count(device, rng):
     case = random_case(rng, 1, 1, 1)
     case.parameters["means"][:] = np.linalg.inv(np.vstack([case.view.world_to_camera, [0, 0, 0, 1]]))[:3] @ [0, 0, 3, 1]
     case.parameters["log_scales"][:], case.parameters["logit_opacity"][:] = np.log(50), 3
-    found = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
-    np.testing.assert_allclose(found, 1 / (1 + np.exp(-3)), rtol=1e-3)
+    actual = weights(Rasterizer(device, "radix"), case.model(device), [black_photograph(device, case)])
+    np.testing.assert_allclose(actual, 1 / (1 + np.exp(-3)), rtol=1e-3)
 
 
 def test_masked_pixels_do_not_count(device, rng):
@@ -61,7 +61,7 @@ def test_schedules_agree(device, rng):
     case = random_case(rng, 60, 70, 50)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     mine, theirs = (
-        weights(Rasterizer(one, "radix"), case.model(one), [black_photograph(one, case)]) for one in (device, other)
+        weights(Rasterizer(item, "radix"), case.model(item), [black_photograph(item, case)]) for item in (device, other)
     )
     np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
 
@@ -73,7 +73,7 @@ def test_nan_gaussian_is_invisible_and_occludes_nothing(device, rng, name):
     case.parameters[name][3] = np.nan
     without["logit_opacity"][3] = -80
     rasterizer = Rasterizer(device, "radix")
-    found = weights(rasterizer, case.model(device), [black_photograph(device, case)])
+    actual = weights(rasterizer, case.model(device), [black_photograph(device, case)])
     case.parameters.update(without)
-    np.testing.assert_array_equal(found, weights(rasterizer, case.model(device), [black_photograph(device, case)]))
-    assert found[3] == 0
+    np.testing.assert_array_equal(actual, weights(rasterizer, case.model(device), [black_photograph(device, case)]))
+    assert actual[3] == 0

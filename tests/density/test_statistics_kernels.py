@@ -89,8 +89,8 @@ def test_columns(device, rng, names):
     view = ViewGradients(frame, None, [], device.upload(planes))
     for _ in range(2):
         stats.add(view, device.upload(planes[:2]))
-    seen = frame.radius.get()[:65] > 0
-    assert 0 < seen.sum() < 65
+    visible = frame.radius.get()[:65] > 0
+    assert 0 < visible.sum() < 65
     half = np.array([width / 2, height / 2])
     expected = {
         "screen_grad": ref.screen_gradient(planes[:2, :65].T.astype(np.float64), width, height),
@@ -98,9 +98,9 @@ def test_columns(device, rng, names):
         "screen_grad_abs_sum": planes[ABS_X:, :65].T.astype(np.float64) @ half,
     }
     for name in names:
-        np.testing.assert_allclose(gaussians.get(f"stats/{name}")[:, 0], 2 * expected[name] * seen, rtol=1e-5)
-        np.testing.assert_allclose(stats.mean(name), expected[name] * seen, rtol=1e-5)
-    np.testing.assert_array_equal(gaussians.get(SEEN)[:, 0], 2 * seen)
+        np.testing.assert_allclose(gaussians.get(f"stats/{name}")[:, 0], 2 * expected[name] * visible, rtol=1e-5)
+        np.testing.assert_allclose(stats.mean(name), expected[name] * visible, rtol=1e-5)
+    np.testing.assert_array_equal(gaussians.get(SEEN)[:, 0], 2 * visible)
     stats.clear()
     assert not any(gaussians.get(f"stats/{name}").any() for name in (*names, "seen"))
 

@@ -57,10 +57,10 @@ def test_squares_match_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
     views = RenderedView.render_all(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
-    found = sensitivities(views, look.model.gaussians.count)
-    assert found.shape == (count,)
+    result = sensitivities(views, look.model.gaussians.count)
+    assert result.shape == (count,)
     expected = 2 * squares(case)
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * expected.max(initial=0))
+    np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-4 * expected.max(initial=0))
 
 
 def test_squares_match_finite_differences(rng):
@@ -70,8 +70,8 @@ def test_squares_match_finite_differences(rng):
         parameters["logit_opacity"][:6] = 6  # alphas in the middle are capped, and have no gradient there
 
     case, step = safe_case(rng, 12, 20, 16, MARGIN, opaque), 1e-7
-    splats, background, found = case.project(), BACKGROUND.astype(np.float64), squares(case)
-    falloffs = {one.splat: one.falloff for one in ref.blend_steps(splats, 20, 16, ref.Thresholds())}
+    splats, background, result = case.project(), BACKGROUND.astype(np.float64), squares(case)
+    falloffs = {blend_step.splat: blend_step.falloff for blend_step in ref.blend_steps(splats, 20, 16, ref.Thresholds())}
     for i, falloff in falloffs.items():
         sides = []
         for sign in (1, -1):
@@ -79,7 +79,7 @@ def test_squares_match_finite_differences(rng):
             opacity[i] += sign * step
             sides.append(ref.blend(replace(splats, opacity=opacity), 20, 16, background)[0])
         grad_falloff = (sides[0] - sides[1]) / (2 * step) * splats.opacity[i] / falloff
-        assert found[i] == pytest.approx((grad_falloff**2).sum(), rel=1e-3)
+        assert result[i] == pytest.approx((grad_falloff**2).sum(), rel=1e-3)
 
 
 @on_one_setting
@@ -101,10 +101,10 @@ def test_bands_and_repetitions_have_the_same_bits(device, rng):
     flags = rng.random((50, 70)) < 0.5
     views = [look_at(device, case), look_at(device, case, budget=RenderLimits(60, 3)), look_at(device, case)]
     for number, plane, channel in ((BLENDED, flags, None), (WEIGHT, None, None), (SQUARE, None, 1)):
-        found = [look.sum(number, plane, channel) for look in views]
-        assert found[0].any()
-        np.testing.assert_array_equal(found[0], found[1])
-        np.testing.assert_array_equal(found[0], found[2])
+        actual = [look.sum(number, plane, channel) for look in views]
+        assert actual[0].any()
+        np.testing.assert_array_equal(actual[0], actual[1])
+        np.testing.assert_array_equal(actual[0], actual[2])
 
 
 @on_one_setting
@@ -112,7 +112,7 @@ def test_schedules_agree(device, rng):
     case = random_case(rng, 60, 70, 50)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     flags = rng.random((50, 70)) < 0.5
-    mine, theirs = (look_at(one, case) for one in (device, other))
+    mine, theirs = (look_at(item, case) for item in (device, other))
     np.testing.assert_array_equal(mine.sum(BLENDED, flags), theirs.sum(BLENDED, flags))
     expected = mine.sum(SQUARE, channel=2)
     np.testing.assert_allclose(theirs.sum(SQUARE, channel=2), expected, rtol=1e-4, atol=1e-6 * expected.max())
@@ -152,10 +152,10 @@ def test_views_are_drawn_by_seed_and_step():
     def drawn(number: int, seed: int, step: int) -> list[int]:
         return Survey(None, None, None, views, seed, step).sample_views(number)
 
-    one = drawn(10, seed=1, step=600)
-    assert len(set(one)) == 10
-    assert one == sorted(one) == drawn(10, seed=1, step=600)
-    assert one not in (drawn(10, seed=2, step=600), drawn(10, seed=1, step=700))
+    samples = drawn(10, seed=1, step=600)
+    assert len(set(samples)) == 10
+    assert samples == sorted(samples) == drawn(10, seed=1, step=600)
+    assert samples not in (drawn(10, seed=2, step=600), drawn(10, seed=1, step=700))
     assert drawn(25, seed=1, step=600) == drawn(99, seed=1, step=600) == views
     counts = np.bincount(np.concatenate([drawn(10, 1, step) for step in range(500)]), minlength=25)
     assert counts.min() > 140, "200 expected"

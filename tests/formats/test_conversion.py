@@ -71,10 +71,10 @@ def test_convert_replaces_no_file_of_a_run(source, tmp_path):
 def test_merged_model_has_the_highest_sh_degree(source, tmp_path, rng):
     write(tmp_path / "b.glb", splats(rng, 30, 1))
     done = clsplat.convert([source, tmp_path / "b.glb"], tmp_path / "c.ply")
-    found = load(tmp_path / "c.ply")
-    assert (done["gaussians"], found.sh_degree) == (130, 3)
-    assert not found.sh_rest[100:, 9:].any()
-    np.testing.assert_array_equal(found.means[:100], load(source).means)
+    pipeline = load(tmp_path / "c.ply")
+    assert (done["gaussians"], pipeline.sh_degree) == (130, 3)
+    assert not pipeline.sh_rest[100:, 9:].any()
+    np.testing.assert_array_equal(pipeline.means[:100], load(source).means)
 
 
 def test_merging_reports_each_dropped_setting(tmp_path, rng, caplog):
@@ -106,13 +106,13 @@ EXTREME = {
 @pytest.mark.parametrize("name", EXTREME)
 @pytest.mark.filterwarnings("error")
 def test_extreme_values_raise_no_numpy_warnings(name, tmp_path, rng):
-    one = splats(rng, 40, 1)
+    first = splats(rng, 40, 1)
     for table, value in EXTREME[name].items():
         if table == "filter_variance":
-            one.parameters[table] = np.full((40, 1), value, np.float32)
+            first.parameters[table] = np.full((40, 1), value, np.float32)
         else:
-            one.parameters[table][:10], one.parameters[table][10:20] = value, -value
-    write(tmp_path / "a.ply", one)
+            first.parameters[table][:10], first.parameters[table][10:20] = value, -value
+    write(tmp_path / "a.ply", first)
     assert examine(tmp_path / "a.ply")["gaussians"] == 40
     for file in ("b.spz", "b.sog", "b.glb"):
         assert clsplat.convert(tmp_path / "a.ply", tmp_path / file)["gaussians"] == 40
@@ -122,7 +122,7 @@ def test_extreme_values_raise_no_numpy_warnings(name, tmp_path, rng):
     assert model.opacities.min() >= 0
     assert pack(model).count > 0
     assert np.isfinite(
-        masses({n: t.astype(np.float64) for n, t in one.parameters.items()}, lambda logs: logs[:, 0])
+        masses({n: t.astype(np.float64) for n, t in first.parameters.items()}, lambda logs: logs[:, 0])
     ).all()
 
 
@@ -235,11 +235,11 @@ def test_crop_and_min_opacity_filter_gaussians(source, tmp_path):
     model = load(source)
     box = (-1.0, -1.0, -1.0, 1.0, 2.0, 3.0)
     clsplat.convert(source, tmp_path / "b.ply", crop=box, drop_below=0.3, sh_degree=1)
-    found = load(tmp_path / "b.ply")
+    pipeline = load(tmp_path / "b.ply")
     inside = ((model.means >= box[:3]) & (model.means <= box[3:])).all(axis=1) & (model.opacities >= 0.3)
-    np.testing.assert_array_equal(found.means, model.means[inside])
-    np.testing.assert_array_equal(found.sh_rest, model.sh_rest[inside, :9])
-    assert 0 < len(found) < 100
+    np.testing.assert_array_equal(pipeline.means, model.means[inside])
+    np.testing.assert_array_equal(pipeline.sh_rest, model.sh_rest[inside, :9])
+    assert 0 < len(pipeline) < 100
     with pytest.raises(DataError, match="none of 100 Gaussians is left"):
         clsplat.convert(source, tmp_path / "c.ply", crop="50,50,50,51,51,51")
 
@@ -247,11 +247,11 @@ def test_crop_and_min_opacity_filter_gaussians(source, tmp_path):
 def test_spz_with_ply_axes_is_rotated(source, tmp_path):
     upside_down = {"transform": "rotate=180,0,0", "quality": "high"}
     clsplat.convert(source, tmp_path / "ply_axes.spz", **upside_down)
-    expected, found = load(source), load(tmp_path / "ply_axes.spz")
-    np.testing.assert_allclose(np.sort(-found.means[:, 1]), np.sort(expected.means[:, 1]), atol=1e-3)
+    expected, pipeline = load(source), load(tmp_path / "ply_axes.spz")
+    np.testing.assert_allclose(np.sort(-pipeline.means[:, 1]), np.sort(expected.means[:, 1]), atol=1e-3)
     clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.ply", transform="rotate=180,0,0")
     right = load(tmp_path / "right.ply").tables()
-    for name, table in flip_axes(found.tables()).items():
+    for name, table in flip_axes(pipeline.tables()).items():
         if name != "quats":  # a rotation names its axes differently
             np.testing.assert_allclose(right[name], table, atol=1e-5, err_msg=name)
 
@@ -287,9 +287,9 @@ def test_values_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_pat
         with pytest.raises(DataError, match=re.escape(f"{told}; SOG cannot store that: `clsplat convert MODEL OTHER")):
             write(tmp_path / "out" / place, large)
     assert list((tmp_path / "out").iterdir()) == []
-    found = clsplat.check(tmp_path / "a.ply")
-    assert told in found["findings"]
-    json.dumps(found, allow_nan=False)
+    result = clsplat.check(tmp_path / "a.ply")
+    assert told in result["findings"]
+    json.dumps(result, allow_nan=False)
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.sog")["gaussians"] == 18
     assert f"{told}; they are dropped" in caplog.text
     assert len(load(tmp_path / "b.sog")) == 18
@@ -339,14 +339,14 @@ def test_run_folder_is_read_as_its_model(source, tmp_path):
 
 def test_check_describes_a_model(source, tmp_path):
     clsplat.convert(source, tmp_path / "b.spz")
-    found = clsplat.check(tmp_path / "b.spz")
-    assert (found["format"], found["gaussians"], found["sh_degree"], found["mode"]) == ("SPZ", 100, 3, "default")
+    result = clsplat.check(tmp_path / "b.spz")
+    assert (result["format"], result["gaussians"], result["sh_degree"], result["mode"]) == ("SPZ", 100, 3, "default")
     model = load(tmp_path / "b.spz")
-    np.testing.assert_allclose(found["bounds"], [model.means.min(axis=0), model.means.max(axis=0)])
-    assert found["valid"]
-    assert verdict(found) == f"{tmp_path / 'b.spz'}: valid"
-    assert "SPZ, 100 Gaussians, SH degree 3" in lines(found)
-    json.dumps(found, allow_nan=False)
+    np.testing.assert_allclose(result["bounds"], [model.means.min(axis=0), model.means.max(axis=0)])
+    assert result["valid"]
+    assert verdict(result) == f"{tmp_path / 'b.spz'}: valid"
+    assert "SPZ, 100 Gaussians, SH degree 3" in lines(result)
+    json.dumps(result, allow_nan=False)
 
 
 def test_missing_model_and_pipeline_file_are_refused(tmp_path):
@@ -369,9 +369,9 @@ def test_model_size_counts_only_its_files(few_steps, source, tmp_path):
 
 def test_file_name_is_printed_unchanged(source, tmp_path):
     write(tmp_path / "not_finite_no_rotation.ply", read(source))
-    found = clsplat.check(tmp_path / "not_finite_no_rotation.ply")
-    assert lines(found).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
-    assert "0 not finite, 0 without rotation, 0 flat, " in lines(found)
+    result = clsplat.check(tmp_path / "not_finite_no_rotation.ply")
+    assert lines(result).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
+    assert "0 not finite, 0 without rotation, 0 flat, " in lines(result)
 
 
 def test_check_counts_invisible_gaussians(tmp_path, rng):
@@ -383,11 +383,11 @@ def test_check_counts_invisible_gaussians(tmp_path, rng):
     p["logit_opacity"][2:5] = -30
     p["quats"][5] = 0
     write_ply(tmp_path / "a.ply", p, {})
-    found = clsplat.check(tmp_path / "a.ply")
-    assert found["degenerate"] == {"not_finite": 1, "no_rotation": 1, "flat": 1, "invisible": 3}
-    assert not found["valid"]
-    assert "1 of 40 Gaussians have values that are not finite; 1 quaternions have length 0" in verdict(found)
-    json.dumps(found, allow_nan=False)
+    result = clsplat.check(tmp_path / "a.ply")
+    assert result["degenerate"] == {"not_finite": 1, "no_rotation": 1, "flat": 1, "invisible": 3}
+    assert not result["valid"]
+    assert "1 of 40 Gaussians have values that are not finite; 1 quaternions have length 0" in verdict(result)
+    json.dumps(result, allow_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -443,8 +443,8 @@ def test_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, 
     (tmp_path / "p.yaml").write_text(text.replace("INIT", f"{{source: model, file: '{tmp_path / name}'}}"))
     clsplat.run(tmp_path / "p.yaml", out=out)
     assert f"{out / name}: axes" not in caplog.text  # which it wrote itself
-    found = load(out / name)
-    assert len(found) == 40
+    pipeline = load(out / name)
+    assert len(pipeline) == 40
     assert detect(out / name).name == detect(tmp_path / name).name
     assert clsplat.check(out)["whole"]
     assert clsplat.render_views(out / name, tiny_scene, tmp_path / "views") == 2
@@ -466,29 +466,29 @@ def test_formats_page_lists_every_format():
 
 def test_infinite_opacities_and_flat_scales_are_limits(tmp_path, rng, caplog):
     """NaN, and infinite scales, are not."""
-    one = splats(rng, 6, 0)
-    one.parameters["logit_opacity"][:2, 0] = np.inf, -np.inf
-    one.parameters["log_scales"][1:3, 0] = -np.inf
-    write(tmp_path / "a.ply", one)
+    first = splats(rng, 6, 0)
+    first.parameters["logit_opacity"][:2, 0] = np.inf, -np.inf
+    first.parameters["log_scales"][1:3, 0] = -np.inf
+    write(tmp_path / "a.ply", first)
     assert examine(tmp_path / "a.ply")["valid"]
     assert [text for text in caplog.messages if "3 Gaussians have an opacity of 0 or 1, or a scale of 0" in text]
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb")["gaussians"] == 6
-    found = load(tmp_path / "b.glb")
-    np.testing.assert_allclose(found.opacities[:2], [1, 0], atol=2e-6)
-    np.testing.assert_allclose(found.scales[1:3, 0], 1e-6, rtol=1e-5)
-    one.parameters["log_scales"][3] = np.inf
-    one.parameters["logit_opacity"][4] = np.nan
-    write(tmp_path / "a.ply", one)
+    pipeline = load(tmp_path / "b.glb")
+    np.testing.assert_allclose(pipeline.opacities[:2], [1, 0], atol=2e-6)
+    np.testing.assert_allclose(pipeline.scales[1:3, 0], 1e-6, rtol=1e-5)
+    first.parameters["log_scales"][3] = np.inf
+    first.parameters["logit_opacity"][4] = np.nan
+    write(tmp_path / "a.ply", first)
     with pytest.raises(DataError, match="log_scales, logit_opacity have values that are not finite"):
         load(tmp_path / "a.ply")
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 4
 
 
 def test_empty_result_is_an_error(tmp_path, rng):
-    one = splats(rng, 6, 0)
-    write(tmp_path / "a.ply", one.rows(slice(0)))
-    one.parameters["means"][:] = np.nan
-    write(tmp_path / "b.ply", one)
+    first = splats(rng, 6, 0)
+    write(tmp_path / "a.ply", first.rows(slice(0)))
+    first.parameters["means"][:] = np.nan
+    write(tmp_path / "b.ply", first)
     for name in ("a.ply", "b.ply"):
         with pytest.raises(DataError, match="the model has no Gaussians, or none with valid values"):
             clsplat.convert(tmp_path / name, tmp_path / "c.ply")

@@ -114,15 +114,15 @@ def test_models_have_the_numbers_that_their_makers_state():
     }
     assert len(stated) == 6
     for path, output in stated.items():
-        found = outcomes()[path.with_name(output["file"])]
-        assert isinstance(found, SplatFile)
-        assert (len(found), found.sh_degree) == (output["gaussian_count"], output["sh_degree"])
+        actual = outcomes()[path.with_name(output["file"])]
+        assert isinstance(actual, SplatFile)
+        assert (len(actual), actual.sh_degree) == (output["gaussian_count"], output["sh_degree"])
 
 
 def golden(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a text file of OpenUSD."""
-    found = re.findall(r"(\w+) = \[(.*)\]", path.read_text("utf-8"))
-    return {name: np.array([float(number) for number in re.findall(r"[-+.\w]+", text)]) for name, text in found}
+    matches = re.findall(r"(\w+) = \[(.*)\]", path.read_text("utf-8"))
+    return {name: np.array([float(number) for number in re.findall(r"[-+.\w]+", text)]) for name, text in matches}
 
 
 def test_values_are_those_of_the_golden_files():
@@ -134,9 +134,9 @@ def test_values_are_those_of_the_golden_files():
     }
     assert len(pairs) == 3
     for path, expected in pairs.items():
-        found = outcomes()[path]
-        assert isinstance(found, SplatFile)
-        p = flip_axes(found.parameters)
+        actual = outcomes()[path]
+        assert isinstance(actual, SplatFile)
+        p = flip_axes(actual.parameters)
         harmonics = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1)
         values = {
             "positions": p["means"],
@@ -152,9 +152,9 @@ def test_values_are_those_of_the_golden_files():
 @pytest.mark.parametrize("ending", ["glb", "gltf"])
 def test_khr_matrix_has_its_values_in_each_number_type(ending):
     """Fifteen parts; all but one have linear colors."""
-    found = outcomes()[data_set("splats") / "khr" / f"khr_conformance_matrix.{ending}"]
-    assert isinstance(found, SplatFile)
-    p = flip_axes(found.parameters)
+    actual = outcomes()[data_set("splats") / "khr" / f"khr_conformance_matrix.{ending}"]
+    assert isinstance(actual, SplatFile)
+    p = flip_axes(actual.parameters)
     np.testing.assert_array_equal(p["means"], [[1, 2, 3]] * 15)
     np.testing.assert_allclose(np.abs(p["quats"]), [[0, 1, 0, 0]] * 15, atol=1e-6)
     alpha = np.sort(opacities(p["logit_opacity"])[:, 0])

@@ -33,10 +33,10 @@ def attribute(tree, binary, name):
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (200, 0), (200, 1), (200, 2)])
 def test_glb_round_trip_is_within_its_precision(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
-    found = round_trip(tmp_path / "a.glb", source)
+    copy = round_trip(tmp_path / "a.glb", source)
     assert detect(tmp_path / "a.glb").name == "GLB"
-    assert (found.mode, found.rendering) == ("mip", source.rendering)
-    assert_close(found, source, 1e-3, means=0, log_scales=1e-6, opacity=1e-6, sh_base=0, sh_rest=0)
+    assert (copy.mode, copy.rendering) == ("mip", source.rendering)
+    assert_close(copy, source, 1e-3, means=0, log_scales=1e-6, opacity=1e-6, sh_base=0, sh_rest=0)
 
 
 def test_glb_follows_the_specification(tmp_path, rng):
@@ -72,12 +72,12 @@ def test_glb_follows_the_specification(tmp_path, rng):
 
 def test_glb_of_another_program_equals_its_source():
     """splat-transform turns a model by half about z, where the axes of glTF ask for half about x."""
-    source, found = load(interop("train1000.ply")), load(interop("train1000.glb"))
+    source, pipeline = load(interop("train1000.ply")), load(interop("train1000.glb"))
     half = source.transformed(rotation=np.diag([-1.0, 1, -1]))
-    np.testing.assert_allclose(found.means, half.means, atol=1e-5)
-    np.testing.assert_allclose(found.sh_rest, half.sh_rest, atol=1e-5)
-    np.testing.assert_allclose(found.log_scales, half.log_scales, atol=1e-5)
-    np.testing.assert_allclose(covariances(found), covariances(half), atol=1e-5)
+    np.testing.assert_allclose(pipeline.means, half.means, atol=1e-5)
+    np.testing.assert_allclose(pipeline.sh_rest, half.sh_rest, atol=1e-5)
+    np.testing.assert_allclose(pipeline.log_scales, half.log_scales, atol=1e-5)
+    np.testing.assert_allclose(covariances(pipeline), covariances(half), atol=1e-5)
 
 
 def covariances(model):
@@ -99,11 +99,11 @@ def test_moved_turned_and_scaled_node_moves_its_gaussians(tmp_path, rng):
     rotation = [0, 0.5**0.5, 0, 0.5**0.5]
     plain, other = moved(tmp_path, rng, rotation=rotation, scale=[2, 2, 2], translation=[1, 0, 0])
     expected = load(plain).transformed(2.0, np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), (1, -1, 0))
-    found = load(other)
+    pipeline = load(other)
     for name, table in expected.tables().items():
         if name != "quats":
-            np.testing.assert_allclose(getattr(found, name), table, atol=2e-6, err_msg=name)
-    np.testing.assert_allclose(np.abs((unit(found.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
+            np.testing.assert_allclose(getattr(pipeline, name), table, atol=2e-6, err_msg=name)
+    np.testing.assert_allclose(np.abs((unit(pipeline.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
 
 
 def test_low_precision_rotation_is_accepted(tmp_path, rng):
@@ -288,9 +288,9 @@ def test_world_filter_is_baked_except_in_ply(tmp_path, rng):
     for name in ("a.ply", "a.glb"):
         model.save(tmp_path / name)
     assert load(tmp_path / "a.ply").filter_variance is not None
-    found, baked = load(tmp_path / "a.glb"), model.baked()
-    np.testing.assert_allclose(found.log_scales, baked.log_scales, atol=1e-6)
-    np.testing.assert_allclose(found.opacities, baked.opacities, atol=1e-6)
+    pipeline, baked = load(tmp_path / "a.glb"), model.baked()
+    np.testing.assert_allclose(pipeline.log_scales, baked.log_scales, atol=1e-6)
+    np.testing.assert_allclose(pipeline.opacities, baked.opacities, atol=1e-6)
     assert angles(read(tmp_path / "a.glb"), read(tmp_path / "a.ply")).max() < 1e-3
 
 
@@ -321,9 +321,9 @@ def parted(tmp_path, rng, degree=1, count=40):
     return source, *split_glb((tmp_path / "a.glb").read_bytes())
 
 
-def assert_same(found, expected):
+def assert_same(actual, expected):
     for name, table in expected.parameters.items():
-        np.testing.assert_array_equal(found.parameters[name], table, err_msg=name)
+        np.testing.assert_array_equal(actual.parameters[name], table, err_msg=name)
 
 
 @pytest.mark.parametrize("where", ["data:application/octet-stream;base64,", "a%20b/c.bin"])
@@ -373,13 +373,13 @@ def test_linear_colors_become_srgb(tmp_path, rng, caplog):
     few = {name: number for name, number in first["attributes"].items() if "SH_DEGREE_" not in name or "_0_" in name}
     tree["meshes"][0]["primitives"] = [{**first, "attributes": few}, first]
     (tmp_path / "b.glb").write_bytes(join_glb(tree, binary))
-    found = read(tmp_path / "b.glb").parameters
+    actual = read(tmp_path / "b.glb").parameters
     assert caplog.text.count("its colors are linear") == 1
     linear = np.maximum(source.parameters["sh_base"] * SH_C0 + 0.5, 0)
-    shown = found["sh_base"][:40] * SH_C0 + 0.5
+    shown = actual["sh_base"][:40] * SH_C0 + 0.5
     back = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(back, linear, atol=1e-5)
-    assert not found["sh_rest"][:40].any()
+    assert not actual["sh_rest"][:40].any()
     directions = unit(rng.normal(size=(50, 4)))[:, :3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -388,7 +388,7 @@ def test_linear_colors_become_srgb(tmp_path, rng, caplog):
 
     before = np.maximum(colors(source.parameters["sh_base"], source.parameters["sh_rest"]), 0)
     wanted = np.where(before <= 0.0031308, 12.92 * before, 1.055 * before ** (1 / 2.4) - 0.055)
-    error = np.abs(colors(found["sh_base"][40:], found["sh_rest"][40:]) - wanted)
+    error = np.abs(colors(actual["sh_base"][40:], actual["sh_rest"][40:]) - wanted)
     assert error.mean() < 0.02 < np.abs(before - wanted).mean() / 3
 
 
@@ -420,9 +420,9 @@ def test_spz_in_a_glb_has_the_axes_that_its_bounds_show(tmp_path, rng):
     half = flip_axes(plain.parameters, (-1.0, 1.0, -1.0))
     for bounds, expected in ((None, half), (as_gltf * [-1, 1, -1], half), (as_gltf, plain.parameters)):
         (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data, bounds), data))
-        found = read(tmp_path / "b.glb")
-        assert found.mode == "mip"
-        for name, table in found.parameters.items():
+        result = read(tmp_path / "b.glb")
+        assert result.mode == "mip"
+        for name, table in result.parameters.items():
             np.testing.assert_array_equal(table, expected[name], err_msg=name)
     (tmp_path / "b.glb").write_bytes(join_glb(spz_tree(data[:-9]), data[:-9]))
     with pytest.raises(DataError, match=r"b\.glb: is truncated before the checksum"):

@@ -44,34 +44,34 @@ def test_disc_gets_a_tiny_third_axis(tmp_path, rng, unit, third):
     header, body = path.read_bytes().split(b"end_header\n", 1)
     rows = np.delete(np.frombuffer(body, "<f4").reshape(5, -1), 57, axis=1)
     path.write_bytes(header.replace(b"property float scale_2\n", b"") + b"end_header\n" + rows.tobytes())
-    found = read(path).parameters
-    np.testing.assert_array_equal(found["log_scales"][:, :2], source["log_scales"][:, :2])
-    np.testing.assert_allclose(found["log_scales"][:, 2], third, rtol=1e-6)
-    np.testing.assert_array_equal(found["quats"], source["quats"])
+    actual = read(path).parameters
+    np.testing.assert_array_equal(actual["log_scales"][:, :2], source["log_scales"][:, :2])
+    np.testing.assert_allclose(actual["log_scales"][:, 2], third, rtol=1e-6)
+    np.testing.assert_array_equal(actual["quats"], source["quats"])
 
 
 def test_published_bytes_of_a_compressed_ply(rng):
     """Values worked out by hand from the first splat of a file that splat-transform wrote."""
     path = interop("train1000.compressed.ply")
     assert detect(path).name == "compressed PLY"
-    found = {name: table[0] for name, table in read(path).parameters.items()}
-    np.testing.assert_allclose(found["means"], (-2.633789, -0.987691, -1.480688), atol=2e-6)
-    np.testing.assert_allclose(found["log_scales"], (-5.685699, -4.33116, -4.80418), atol=1e-5)
-    np.testing.assert_allclose(found["quats"], (0.867207, -0.281322, 0.22326, 0.344913), atol=1e-6)
-    np.testing.assert_allclose(found["logit_opacity"], 0.149296, atol=1e-5)
-    np.testing.assert_allclose(found["sh_base"], (-0.85329, -0.360405, -0.564274), atol=1e-5)
-    np.testing.assert_allclose(found["sh_rest"][::3][:4], (0.015625, 0.015625, -0.078125, -0.046875), atol=1e-7)
+    actual = {name: table[0] for name, table in read(path).parameters.items()}
+    np.testing.assert_allclose(actual["means"], (-2.633789, -0.987691, -1.480688), atol=2e-6)
+    np.testing.assert_allclose(actual["log_scales"], (-5.685699, -4.33116, -4.80418), atol=1e-5)
+    np.testing.assert_allclose(actual["quats"], (0.867207, -0.281322, 0.22326, 0.344913), atol=1e-6)
+    np.testing.assert_allclose(actual["logit_opacity"], 0.149296, atol=1e-5)
+    np.testing.assert_allclose(actual["sh_base"], (-0.85329, -0.360405, -0.564274), atol=1e-5)
+    np.testing.assert_allclose(actual["sh_rest"][::3][:4], (0.015625, 0.015625, -0.078125, -0.046875), atol=1e-7)
 
 
 @pytest.mark.parametrize(("name", "rows"), [("train1000", 1000), ("playbot31k", 31_000)])
 def test_compressed_ply_of_another_program_equals_its_source(name, rows):
     """Its splats are sorted: each is matched with the nearest of the source."""
-    source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.compressed.ply"))
-    assert len(found) == rows
-    distance, nearest = cKDTree(source.parameters["means"]).query(found.parameters["means"])
+    source, result = read(interop(f"{name}.ply")), read(interop(f"{name}.compressed.ply"))
+    assert len(result) == rows
+    distance, nearest = cKDTree(source.parameters["means"]).query(result.parameters["means"])
     assert np.median(distance) < 5e-3
     kept = source.rows(nearest)
-    difference = np.abs(found.parameters["sh_base"] - kept.parameters["sh_base"])
+    difference = np.abs(result.parameters["sh_base"] - kept.parameters["sh_base"])
     assert np.median(difference) < 0.01
 
 
@@ -119,10 +119,10 @@ def test_ascii_ply_is_its_binary_twin(degree, tmp_path, rng):
     text = as_text((tmp_path / "a.ply").read_bytes())
     for name, content in (("b.ply", text), ("c.ply", text.replace(b"\n", b"\r\n"))):
         (tmp_path / name).write_bytes(content)
-        found = read(tmp_path / name)
-        assert found.mode == "mip"
+        result = read(tmp_path / name)
+        assert result.mode == "mip"
         for table, values in read(tmp_path / "a.ply").parameters.items():
-            np.testing.assert_array_equal(found.parameters[table], values)
+            np.testing.assert_array_equal(result.parameters[table], values)
     (tmp_path / "b.ply").write_bytes(text.replace(b"element vertex 20", b"element vertex 999999999"))
     with pytest.raises(DataError, match=r"declares 999999999 vertices, .* bytes; the file is truncated"):
         read(tmp_path / "b.ply")

@@ -61,16 +61,16 @@ def covariances(one: SplatFile) -> np.ndarray:
 
 def test_weights_ignore_scene_size_and_grow_with_opacity_area(rng):
     p = splats(rng, 200).parameters
-    found = log_weights(p)
+    result = log_weights(p)
     larger = {**p, "means": 10 * p["means"], "log_scales": p["log_scales"] + np.float32(np.log(10))}
-    np.testing.assert_allclose(log_weights(larger), found, atol=1e-5)
-    assert abs(np.median(found)) < 1e-9
+    np.testing.assert_allclose(log_weights(larger), result, atol=1e-5)
+    assert abs(np.median(result)) < 1e-9
     more = {name: table.copy() for name, table in p.items()}
-    middle = np.argsort(found)[90:110]
+    middle = np.argsort(result)[90:110]
     more["logit_opacity"][middle[0]] += 1
     more["log_scales"][middle[1]] += 0.5
     after = log_weights(more)
-    changed = after - found - np.median(after - found)
+    changed = after - result - np.median(after - result)
     assert (changed[middle[:2]] > 0.1).all()
 
 
@@ -86,9 +86,9 @@ def test_sky_gaussians_do_not_decide_the_rounding(count, rng, tmp_path):
     np.testing.assert_allclose(beside, alone, atol=0.15)
     for name in ("a.spz", "a.sog"):
         errors = []
-        for one in (source, behind):
-            found = round_trip(tmp_path / name, one).parameters["means"]
-            errors.append(np.median(cKDTree(found).query(source.parameters["means"])[0]))
+        for item in (source, behind):
+            actual = round_trip(tmp_path / name, item).parameters["means"]
+            errors.append(np.median(cKDTree(actual).query(source.parameters["means"])[0]))
         assert errors[1] < 1.3 * errors[0], name
 
 
@@ -102,8 +102,8 @@ def test_model_without_sky_counts_all_gaussians(rng, tmp_path):
     assert abs(np.median(log_weights(source.parameters))) < 1e-9
     noted = replace(source, rendering={"sky": "splats"})
     for name in ("a.spz", "a.sog"):
-        found = [round_trip(tmp_path / name, one).parameters["means"] for one in (source, noted)]
-        assert (found[0] != found[1]).any(), name
+        actual = [round_trip(tmp_path / name, item).parameters["means"] for item in (source, noted)]
+        assert (actual[0] != actual[1]).any(), name
 
 
 def test_sky_is_recognized_in_a_converted_ply(rng, tmp_path):
@@ -137,8 +137,8 @@ def test_weights_are_finite_of_any_model(count, rng):
 
 
 def test_steps_are_proportional_to_root_weights(rng):
-    found = quantization_steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
-    np.testing.assert_array_equal(found, [64, 16, 8, 4, 2, 1, 1])
+    result = quantization_steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
+    np.testing.assert_array_equal(result, [64, 16, 8, 4, 2, 1, 1])
 
 
 @pytest.mark.parametrize("count", [1, 50])
@@ -156,17 +156,17 @@ def test_rounding_matches_the_reference(count, rng):
                 wanted[:k] += change
                 wanted[k] = value
             expected[row, channel::3] = wanted
-    found = round_sh(rest, step, form)
-    assert (np.abs(found - expected) > 1e-6).any(axis=1).mean() < 0.05  # a tie of float32 is none of float64
+    result = round_sh(rest, step, form)
+    assert (np.abs(result - expected) > 1e-6).any(axis=1).mean() < 0.05  # a tie of float32 is none of float64
 
 
 def test_joint_rounding_is_less_visible_than_independent(rng):
     rest = one_sided_model(rng, 400).parameters["sh_rest"]
     step = np.full(400, 1 / 32, np.float32)
     form = visible_form(rest)
-    found, alone = round_sh(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
-    np.testing.assert_array_equal(found, np.rint(found * 32) / 32)
-    assert visible_error(found - rest, form).sum() < 0.4 * visible_error(alone - rest, form).sum()
+    result, alone = round_sh(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
+    np.testing.assert_array_equal(result, np.rint(result * 32) / 32)
+    assert visible_error(result - rest, form).sum() < 0.4 * visible_error(alone - rest, form).sum()
     np.testing.assert_array_equal(round_sh(rest, step, np.eye(15)), alone)
 
 
@@ -179,10 +179,10 @@ def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
     moments = np.einsum("nkc,nlc->kl", table, table)
     expected = 8 * moments / np.trace(moments) + sog_quantize.ISOTROPIC * np.eye(8)
     np.testing.assert_allclose(form, expected, atol=0.02)
-    found = round_sh(rest, step, form)
+    result = round_sh(rest, step, form)
     monkeypatch.setattr(sog_quantize, "ROWS", rows)
     np.testing.assert_array_equal(visible_form(rest), form)
-    np.testing.assert_array_equal(round_sh(rest, step, form), found)
+    np.testing.assert_array_equal(round_sh(rest, step, form), result)
     assert np.isfinite(round_sh(0 * rest, step, visible_form(0 * rest))).all()
 
 
@@ -206,15 +206,15 @@ def test_band_0_absorbs_the_view_independent_part(rng):
     directions = rng.normal((0, 0, 2), size=(40, 3))
     values = basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     base, lacking = rng.normal(size=(20, 3)), rng.normal(0, 0.1, (20, 15, 3))
-    found = compensate_base(base, lacking.reshape(20, 45), values.T @ values)
+    result = compensate_base(base, lacking.reshape(20, 45), values.T @ values)
     colors = np.einsum("dk,nkc->ndc", values, lacking)
-    np.testing.assert_allclose((found - base) * SH_C0, colors.mean(axis=1), atol=1e-5)
+    np.testing.assert_allclose((result - base) * SH_C0, colors.mean(axis=1), atol=1e-5)
 
 
 def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     source = one_sided_model(rng, 500)
-    found = round_trip(tmp_path / "a.spz", source).parameters
-    levels = 128 * found["sh_rest"]
+    actual = round_trip(tmp_path / "a.spz", source).parameters
+    levels = 128 * actual["sh_rest"]
     np.testing.assert_array_equal(levels, np.rint(levels))
     expected = np.sort(
         quantization_steps(log_weights(source.parameters), usual_step(source.parameters["sh_rest"], 3, 5), 64)
@@ -232,30 +232,30 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
 def test_spz_steps_depend_on_each_gaussians_weight(tmp_path, rng):
     source = one_sided_model(rng, 500)
     source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
-    found = round_trip(tmp_path / "a.spz", source).parameters
+    actual = round_trip(tmp_path / "a.spz", source).parameters
     p = source.rows(morton_order(source.parameters["means"])).parameters
     own = np.argsort(quantization_steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
     p = {name: table[own] for name, table in p.items()}
     weights = log_weights(p)[:, None]
-    base = compensate_base(p["sh_base"], p["sh_rest"] - found["sh_rest"], visible_form(p["sh_rest"]))
+    base = compensate_base(p["sh_base"], p["sh_rest"] - actual["sh_rest"], visible_form(p["sh_rest"]))
     step = quantization_steps(weights, 2**0.5, 16)
-    levels = 255 * (0.15 * found["sh_base"].astype(np.float64) + 0.5)
+    levels = 255 * (0.15 * actual["sh_base"].astype(np.float64) + 0.5)
     np.testing.assert_allclose(levels, np.rint(levels / step) * step, atol=1e-3)
-    assert (np.abs(found["sh_base"] - base) <= step / 2 / 255 / 0.15 + 1e-5).all()
+    assert (np.abs(actual["sh_base"] - base) <= step / 2 / 255 / 0.15 + 1e-5).all()
     assert np.abs(base - p["sh_base"]).max() > 0.05, "errors of harmonics are large enough to tell"
     largest = np.exp(p["log_scales"].min(axis=1, keepdims=True)) / 4 * np.exp2(-weights / 2)  # half a step
-    assert (np.abs(found["means"] - p["means"]) <= np.maximum(largest, 2**-13) * 1.0001).all()
+    assert (np.abs(actual["means"] - p["means"]) <= np.maximum(largest, 2**-13) * 1.0001).all()
 
 
 def test_spz_positions_and_rotations_are_within_their_steps(tmp_path, rng):
     source = splats(rng, 300, 0)
-    found, expected = round_trip(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
+    copy, expected = round_trip(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
     smallest = np.exp(expected.parameters["log_scales"].min(axis=1, keepdims=True))
-    away = np.abs(found.parameters["means"] - expected.parameters["means"])
+    away = np.abs(copy.parameters["means"] - expected.parameters["means"])
     largest = smallest / 4 * np.exp2(-log_weights(expected.parameters)[:, None] / 2)  # half a step
     assert (away <= np.maximum(largest, 2**-13) * 1.0001).all()
     assert (away > smallest / 4).any(), "where weights are small, steps are larger"
-    cosine = np.abs((unit(found.parameters["quats"]) * unit(expected.parameters["quats"])).sum(axis=1))
+    cosine = np.abs((unit(copy.parameters["quats"]) * unit(expected.parameters["quats"])).sum(axis=1))
     assert np.degrees(2 * np.arccos(np.minimum(cosine, 1))).max() < 0.7
 
 
@@ -310,20 +310,20 @@ def test_small_harmonics_have_smaller_steps(rng):
 
 def test_sog_keeps_the_shape_and_converts_again_losslessly(tmp_path, rng):
     source = one_sided_model(rng, 1500)
-    found = round_trip(tmp_path / "a.sog", source)
+    copy = round_trip(tmp_path / "a.sog", source)
     order = morton_order(source.parameters["means"])
-    expected, shapes = covariances(source.rows(order)), covariances(found)
+    expected, shapes = covariances(source.rows(order)), covariances(copy)
     size = np.linalg.norm(expected, axis=(1, 2))
     assert (np.linalg.norm(shapes - expected, axis=(1, 2)) < 0.2 * size).all()
     rest = source.parameters["sh_rest"][order]
-    base = compensate_base(source.parameters["sh_base"][order], rest - found.parameters["sh_rest"], visible_form(rest))
-    assert np.abs(found.parameters["sh_base"] - base).max() < 0.03
+    base = compensate_base(source.parameters["sh_base"][order], rest - copy.parameters["sh_rest"], visible_form(rest))
+    assert np.abs(copy.parameters["sh_base"] - base).max() < 0.03
     for name, bound in (("means", 0.01), ("logit_opacity", 1.0)):
-        away = np.abs(found.parameters[name] - source.parameters[name][order])
+        away = np.abs(copy.parameters[name] - source.parameters[name][order])
         assert np.percentile(away, 90) <= bound, name
-    again = round_trip(tmp_path / "b.sog", found)
-    rows = np.lexsort(found.parameters["means"].T), np.lexsort(again.parameters["means"].T)
+    again = round_trip(tmp_path / "b.sog", copy)
+    rows = np.lexsort(copy.parameters["means"].T), np.lexsort(again.parameters["means"].T)
     for name in ("sh_rest", "log_scales", "quats", "sh_base"):
         np.testing.assert_allclose(
-            again.parameters[name][rows[1]], found.parameters[name][rows[0]], atol=1e-4, err_msg=name
+            again.parameters[name][rows[1]], copy.parameters[name][rows[0]], atol=1e-4, err_msg=name
         )

@@ -28,43 +28,43 @@ from tests.support.models import assert_close, interop, round_trip, splats
 def test_published_bytes_of_a_sog():
     path = interop("train1000.sog")
     assert detect(path).name == "SOG"
-    found = {name: table[0] for name, table in read(path).parameters.items()}
-    np.testing.assert_allclose(found["means"], (-2.631508, -0.98734, -1.482454), atol=2e-6)
-    np.testing.assert_allclose(found["log_scales"], (-5.693027, -4.337001, -4.804688), atol=1e-5)
-    np.testing.assert_allclose(found["quats"], (0.868391, -0.285616, 0.219064, 0.341075), atol=1e-6)
-    np.testing.assert_allclose(found["logit_opacity"], 0.133531, atol=1e-5)
-    np.testing.assert_allclose(found["sh_rest"][::3][:4], (0.014241, 0.016862, -0.073519, -0.052921), atol=1e-6)
+    actual = {name: table[0] for name, table in read(path).parameters.items()}
+    np.testing.assert_allclose(actual["means"], (-2.631508, -0.98734, -1.482454), atol=2e-6)
+    np.testing.assert_allclose(actual["log_scales"], (-5.693027, -4.337001, -4.804688), atol=1e-5)
+    np.testing.assert_allclose(actual["quats"], (0.868391, -0.285616, 0.219064, 0.341075), atol=1e-6)
+    np.testing.assert_allclose(actual["logit_opacity"], 0.133531, atol=1e-5)
+    np.testing.assert_allclose(actual["sh_rest"][::3][:4], (0.014241, 0.016862, -0.073519, -0.052921), atol=1e-6)
 
 
 def test_sog_of_another_program_equals_its_source():
-    source, found = read(interop("playbot31k.ply")), read(interop("playbot31k.sog"))
-    kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
+    source, result = read(interop("playbot31k.ply")), read(interop("playbot31k.sog"))
+    kept = np.sort(source.parameters["means"], axis=0), np.sort(result.parameters["means"], axis=0)
     np.testing.assert_allclose(kept[0], kept[1], atol=1e-4)
 
 
 def test_version_1_is_read():
-    found = read(data_set("splats") / "playcanvas-logo_sog").parameters
-    assert len(found["means"]) == 307_128
-    np.testing.assert_allclose(found["log_scales"].max(axis=0), (-1.0510782, -1.2544534, -0.9433849), atol=1e-5)
-    np.testing.assert_allclose(found["logit_opacity"].max(), 5.537334, atol=1e-5)
+    actual = read(data_set("splats") / "playcanvas-logo_sog").parameters
+    assert len(actual["means"]) == 307_128
+    np.testing.assert_allclose(actual["log_scales"].max(axis=0), (-1.0510782, -1.2544534, -0.9433849), atol=1e-5)
+    np.testing.assert_allclose(actual["logit_opacity"].max(), 5.537334, atol=1e-5)
 
 
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 0), (300, 1), (1100, 2)])
 def test_sog_round_trip_is_within_its_steps(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
-    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
-    assert (found.mode, found.rendering) == ("mip", source.rendering)
-    assert_close(found, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
+    assert (copy.mode, copy.rendering) == ("mip", source.rendering)
+    assert_close(copy, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
 
 
 def test_palette_with_an_entry_per_distinct_vector_is_exact(tmp_path, rng):
     """Eight different colors in a thousand Gaussians."""
     source = splats(rng, 1024)
     source.parameters["sh_rest"][:] = source.parameters["sh_rest"][rng.integers(0, 8, 1024)].round(1)
-    found = round_trip(tmp_path / "a.sog", source).parameters["sh_rest"]
+    actual = round_trip(tmp_path / "a.sog", source).parameters["sh_rest"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_folder_and_bundle_have_the_same_content(tmp_path, rng):
@@ -82,10 +82,10 @@ def test_folder_and_bundle_have_the_same_content(tmp_path, rng):
 @pytest.mark.parametrize("at", [1, 2, 9, 16, 17, 18])
 def test_folder_keeps_its_old_model_until_the_new_is_complete(at, tmp_path, rng, monkeypatch):
     """The n-th sync or rename of a write fails: images of one model never stand under the meta.json of another."""
-    place, calls = tmp_path / "meta.json", []
+    path, calls = tmp_path / "meta.json", []
     old, new = (splats(rng, 30, 0) for _ in range(2))
-    write(place, old)
-    before = read(place).parameters["means"]
+    write(path, old)
+    before = read(path).parameters["means"]
     (tmp_path / "photo.webp").write_bytes(b"of nobody")
 
     def failing(function):
@@ -101,16 +101,16 @@ def test_folder_keeps_its_old_model_until_the_new_is_complete(at, tmp_path, rng,
         for name in ("fsync", "replace"):
             patch.setattr(os, name, failing(getattr(os, name)))
         with pytest.raises(OutputError, match="No space left"):
-            write(place, new)
-    found = read(place).parameters["means"]
+            write(path, new)
+    actual = read(path).parameters["means"]
     if at == 18:  # of the folder, after the rename: a power cut may still undo it, so both are kept
-        assert not np.array_equal(found, before)
+        assert not np.array_equal(actual, before)
         return
-    np.testing.assert_array_equal(found, before)
+    np.testing.assert_array_equal(actual, before)
     assert len(list(tmp_path.glob("*.webp"))) == 5 + 1
-    write(place, new)
+    write(path, new)
     assert len(list(tmp_path.glob("*.webp"))) == 5 + 1
-    assert not np.array_equal(read(place).parameters["means"], before)
+    assert not np.array_equal(read(path).parameters["means"], before)
 
 
 def test_replacing_meta_removes_only_its_own_images(tmp_path, rng):
@@ -128,9 +128,9 @@ def test_larger_palette_is_more_accurate(tmp_path, rng):
     source = splats(rng, 2050, 1)
     errors = []
     for quality in ("small", "balanced"):
-        found = round_trip(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
+        actual = round_trip(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
         expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
-        errors.append(float(np.square(found - expected).mean()))
+        errors.append(float(np.square(actual - expected).mean()))
     assert errors[1] < errors[0] < 0.1**2
 
 
@@ -169,8 +169,8 @@ def test_palette_is_more_accurate_for_heavier_points(rng):
     points = rng.normal(size=(4000, 9)).astype(np.float32)
     weights = np.where(np.arange(4000) % 10 == 0, 50.0, 0.1)
 
-    def error(found):
-        return (weights * np.square(found[0][found[1]] - points).sum(axis=1)).sum()
+    def error(actual):
+        return (weights * np.square(actual[0][actual[1]] - points).sum(axis=1)).sum()
 
     evenly, weighted = palette(points, 64, np.zeros(4000)), palette(points, 64, weights)
     assert error(weighted) < 0.8 * error(evenly)
@@ -195,9 +195,9 @@ def test_palette_does_not_depend_on_the_thread_count(rng):
 def test_transparent_splat_keeps_its_color(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
-    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
-    assert_close(found, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
+    assert_close(copy, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
 
 
 def folder_of(tmp_path, rng, **changes):
@@ -334,11 +334,11 @@ def test_bundle_files_may_be_in_a_subfolder(tmp_path, rng):
 
 def sums(folder: Path, count: int = 24) -> list[str]:
     """The SHA-256 of so many models as SOG."""
-    found = []
+    results = []
     for seed in range(count):
         write(folder / "a.sog", splats(np.random.default_rng(seed), 60, 0), Writing(quiet=True))
-        found.append(sha256((folder / "a.sog").read_bytes()).hexdigest())
-    return found
+        results.append(sha256((folder / "a.sog").read_bytes()).hexdigest())
+    return results
 
 
 def test_cpus_with_and_without_avx_512_write_equal_bytes(tmp_path):
@@ -362,9 +362,9 @@ def test_cpus_with_and_without_avx_512_write_equal_bytes(tmp_path):
 def test_position_precision_depends_only_on_the_range(place, tmp_path, rng):
     source = splats(rng, 400, 0)
     source.parameters["means"][:] += place
-    found = round_trip(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
+    actual = round_trip(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
-    assert np.abs(found - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
+    assert np.abs(actual - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         means = json.loads(archive.read("meta.json"))["means"]
     ends = np.sign(expected) * np.log1p(np.abs(expected.astype(np.float64)))

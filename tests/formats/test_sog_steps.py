@@ -20,22 +20,22 @@ def covariances(quats, log_scales):
 
 def test_permuted_axes_give_an_equal_gaussian_with_less_rotation(rng):
     quats, sizes = rng.normal(size=(2000, 4)), rng.normal(size=(2000, 3))
-    found, renamed = round_quats(quats, sizes, 1)
-    assert (np.argmax(np.abs(found), axis=1) == 0).all()
-    assert found[:, 0].min() > 0.84, "the farthest rotation from all that bring axes onto axes has 62.8 degrees"
+    actual, renamed = round_quats(quats, sizes, 1)
+    assert (np.argmax(np.abs(actual), axis=1) == 0).all()
+    assert actual[:, 0].min() > 0.84, "the farthest rotation from all that bring axes onto axes has 62.8 degrees"
     np.testing.assert_array_equal(np.sort(renamed, axis=1), np.sort(sizes.astype(np.float32), axis=1))
     expected = covariances(quats, sizes)
     largest = np.abs(expected).max(axis=(1, 2))
-    assert (np.abs(covariances(found, renamed) - expected).max(axis=(1, 2)) < 0.02 * largest).all()
+    assert (np.abs(covariances(actual, renamed) - expected).max(axis=(1, 2)) < 0.02 * largest).all()
 
 
 def test_light_gaussians_have_larger_position_steps(rng):
     means, sizes = rng.normal(size=(3000, 3)).astype(np.float32), rng.normal(-3, 0.5, (3000, 3)).astype(np.float32)
     weights = rng.uniform(-4, 4, 3000)
-    found = round_means(means, sizes, weights, 0.25)
+    result = round_means(means, sizes, weights, 0.25)
     largest = 0.25 * np.exp(sizes.mean(axis=1)) * np.exp2(-weights / 2) / 2  # half a step
     level = np.log1p(np.abs(means)).max() * 2 / LEVELS * 5
-    moved = np.abs(found - means).max(axis=1)
+    moved = np.abs(result - means).max(axis=1)
     assert (moved < np.maximum(largest, level) * 1.05).all()
     assert moved[weights < -2].mean() > 3 * moved[weights > 2].mean()
 
@@ -63,10 +63,10 @@ def test_rounded_tables_are_written_exactly_in_fewer_bytes(tmp_path: Path, rng):
     p["means"] = round_means(p["means"], p["log_scales"], np.zeros(1500), 0.5)
     p["quats"], p["log_scales"] = round_quats(p["quats"], p["log_scales"], 4)
     p["log_scales"], p["sh_base"] = round_to(p["log_scales"], 0.1), round_to(p["sh_base"], 0.06)
-    found = round_trip(tmp_path / "after.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "after.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(p["means"]))
     for name in ("means", "quats", "log_scales", "sh_base"):
-        np.testing.assert_allclose(found.parameters[name], expected.parameters[name], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(copy.parameters[name], expected.parameters[name], rtol=1e-4, atol=1e-5)
     assert (tmp_path / "after.sog").stat().st_size < 0.85 * (tmp_path / "before.sog").stat().st_size
 
 

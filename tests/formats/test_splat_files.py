@@ -24,31 +24,31 @@ def by_size(source):
 def test_published_bytes_of_a_splat(tmp_path):
     (tmp_path / "a").write_bytes(PUBLISHED)
     assert detect(tmp_path / "a").name == "splat", "by content, for the name says nothing"
-    found = {name: table[0] for name, table in read(tmp_path / "a").parameters.items()}
-    np.testing.assert_allclose(found["means"], (-9.907656, 0.429362, 6.662564), atol=1e-6)
-    np.testing.assert_allclose(found["log_scales"], (-1.418824, -2.311857, -1.433735), atol=1e-6)
-    np.testing.assert_allclose(found["logit_opacity"], np.log(0x7C / (255 - 0x7C)), atol=1e-5)
+    actual = {name: table[0] for name, table in read(tmp_path / "a").parameters.items()}
+    np.testing.assert_allclose(actual["means"], (-9.907656, 0.429362, 6.662564), atol=1e-6)
+    np.testing.assert_allclose(actual["log_scales"], (-1.418824, -2.311857, -1.433735), atol=1e-6)
+    np.testing.assert_allclose(actual["logit_opacity"], np.log(0x7C / (255 - 0x7C)), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["train1000"])
 def test_splat_of_another_program_equals_its_source(name):
-    source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.splat"))
+    source, result = read(interop(f"{name}.ply")), read(interop(f"{name}.splat"))
     expected = by_size(source)
-    same = np.flatnonzero((found.parameters["means"] == expected.parameters["means"]).all(axis=1))
-    assert len(same) > 0.9 * len(found), "ties are in another order"
-    assert angles(found.rows(same), expected.rows(same)).max() < 1.8, "its writer truncates to 1/128"
-    found, expected = found.rows(same), expected.rows(same)
-    np.testing.assert_allclose(found.parameters["log_scales"], expected.parameters["log_scales"], atol=1e-5)
+    same = np.flatnonzero((result.parameters["means"] == expected.parameters["means"]).all(axis=1))
+    assert len(same) > 0.9 * len(result), "ties are in another order"
+    assert angles(result.rows(same), expected.rows(same)).max() < 1.8, "its writer truncates to 1/128"
+    result, expected = result.rows(same), expected.rows(same)
+    np.testing.assert_allclose(result.parameters["log_scales"], expected.parameters["log_scales"], atol=1e-5)
 
 
 def test_splat_round_trip_is_within_its_steps(tmp_path, rng):
     source = splats(rng, 300)
     source.parameters["sh_base"][:] = np.clip(source.parameters["sh_base"], -1.7, 1.7)
-    found = round_trip(tmp_path / "a.splat", source)
+    copy = round_trip(tmp_path / "a.splat", source)
     expected = by_size(source)
     expected.parameters["sh_rest"] = np.zeros((300, 0), np.float32)
     bounds = {"means": 0, "log_scales": 1e-6, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.2820947, "sh_rest": 0}
-    assert_close(found, expected, 0.8, **bounds)
+    assert_close(copy, expected, 0.8, **bounds)
 
 
 def test_data_lost_in_splat_is_reported(tmp_path, rng, caplog):
@@ -95,32 +95,32 @@ def test_scales_of_a_splat_may_be_logarithms(tmp_path, rng, caplog):
 @pytest.mark.parametrize("level", LEVELS)
 def test_ksplat_of_another_program_equals_its_source(level):
     """Its writer keeps degree 2 and the order of the source."""
-    source, found = read(interop("train1000.ply")), read(interop(f"train1000.{level}.ksplat"))
+    source, result = read(interop("train1000.ply")), read(interop(f"train1000.{level}.ksplat"))
     assert detect(interop(f"train1000.{level}.ksplat")).name == "ksplat"
-    degree = found.sh_degree
+    degree = result.sh_degree
     position, scale, sh = LEVELS[level]
-    assert len(found) == len(source)
-    expected = source.rows(cKDTree(source.parameters["means"]).query(found.parameters["means"])[1])
+    assert len(result) == len(source)
+    expected = source.rows(cKDTree(source.parameters["means"]).query(result.parameters["means"])[1])
     expected.parameters["sh_rest"] = expected.parameters["sh_rest"][:, : 3 * ((degree + 1) ** 2 - 1)]
     bounds = {"means": position, "log_scales": scale, "sh_rest": sh, "opacity": 1.01 / 255}
-    assert_close(found, expected, 0.2, **bounds)
+    assert_close(result, expected, 0.2, **bounds)
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_larger_ksplat_has_buckets(level):
-    found = read(interop(f"playbot31k.{level}.ksplat"))
+    result = read(interop(f"playbot31k.{level}.ksplat"))
     source = read(interop("playbot31k.ply"))
-    assert len(found) == len(source)
+    assert len(result) == len(source)
     for axis in range(3):
-        a, b = np.sort(found.parameters["means"][:, axis]), np.sort(source.parameters["means"][:, axis])
+        a, b = np.sort(result.parameters["means"][:, axis]), np.sort(source.parameters["means"][:, axis])
         np.testing.assert_allclose(a, b, atol=1e-3)
 
 
 def test_positions_of_a_ksplat_are_relative_to_their_bucket(tmp_path):
     (tmp_path / "a.ksplat").write_bytes(ksplat())
-    found = read(tmp_path / "a.ksplat").parameters
-    np.testing.assert_allclose(found["means"], [[-1.5, -0.5, 0.5]] * 3)
-    assert found["sh_rest"].shape == (3, 9)
+    actual = read(tmp_path / "a.ksplat").parameters
+    np.testing.assert_allclose(actual["means"], [[-1.5, -0.5, 0.5]] * 3)
+    assert actual["sh_rest"].shape == (3, 9)
 
 
 DAMAGED = {

@@ -36,11 +36,11 @@ def test_published_bytes_of_an_spz(version):
     """Positions as the file has them, up and back; then as a PLY has them, whose order it keeps."""
     path = interop(f"train1000.v{version}.spz")
     assert detect(path).name == "SPZ"
-    found = {name: table[0] for name, table in flip_axes(read(path).parameters).items()}
-    np.testing.assert_allclose(found["means"], (2.095947, 0.599854, -1.219238), atol=1e-6)
-    np.testing.assert_allclose(found["log_scales"], (-5.6875, -5.0625, -5.125), atol=0)
-    np.testing.assert_allclose(found["quats"], (0.993998, 0.009686, -0.03321, 0.103783), atol=1e-6)
-    assert not found["sh_rest"].any()
+    actual = {name: table[0] for name, table in flip_axes(read(path).parameters).items()}
+    np.testing.assert_allclose(actual["means"], (2.095947, 0.599854, -1.219238), atol=1e-6)
+    np.testing.assert_allclose(actual["log_scales"], (-5.6875, -5.0625, -5.125), atol=0)
+    np.testing.assert_allclose(actual["quats"], (0.993998, 0.009686, -0.03321, 0.103783), atol=1e-6)
+    assert not actual["sh_rest"].any()
     turned = {name: table[0] for name, table in read(path).parameters.items()}
     np.testing.assert_allclose(turned["means"], (2.095947, -0.599854, 1.219238), atol=1e-6)
     np.testing.assert_allclose(turned["quats"], (0.993998, 0.009686, 0.03321, -0.103783), atol=1e-6)
@@ -48,8 +48,8 @@ def test_published_bytes_of_an_spz(version):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_spz_of_another_program_equals_its_source(version):
-    source, found = read(interop("playbot31k.ply")), read(interop(f"playbot31k.v{version}.spz"))
-    kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
+    source, result = read(interop("playbot31k.ply")), read(interop(f"playbot31k.v{version}.spz"))
+    kept = np.sort(source.parameters["means"], axis=0), np.sort(result.parameters["means"], axis=0)
     np.testing.assert_allclose(kept[0], kept[1], atol=2e-4)
     assert angles(read(interop("train1000.ply")), read(interop(f"train1000.v{version}.spz"))).max() < 0.2
 
@@ -57,10 +57,10 @@ def test_spz_of_another_program_equals_its_source(version):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_round_trip_is_within_its_steps(tmp_path, rng, degree):
     source = splats(rng, 200, degree, "mip")
-    found = round_trip(tmp_path / "a.spz", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.spz", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
-    assert found.mode == "mip"
-    assert_close(found, expected, 0.25, sh_rest=1 / 256, **STEPS)
+    assert copy.mode == "mip"
+    assert_close(copy, expected, 0.25, sh_rest=1 / 256, **STEPS)
 
 
 def test_both_versions_give_the_same_values(tmp_path, rng):
@@ -78,8 +78,8 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
         caplog.clear()
         source.parameters["means"][0] = largest
         expected = source.rows(morton_order(source.parameters["means"])).parameters
-        found = round_trip(tmp_path / "a.spz", source).parameters["means"]
-        away, least = np.abs(found - expected["means"]).max(axis=1), 2.0 ** -(fraction + 1)
+        actual = round_trip(tmp_path / "a.spz", source).parameters["means"]
+        away, least = np.abs(actual - expected["means"]).max(axis=1), 2.0 ** -(fraction + 1)
         assert (away <= np.maximum(np.exp(-9.9) / 4 * np.exp2(-log_weights(expected) / 2), least)).all()
         lost = (
             f"coordinate, {largest:g}, SPZ rounds all positions to {2.0**-fraction:.3g} instead of 0.000244 scene units"
@@ -99,9 +99,9 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
 def test_harmonics_beyond_one_are_clipped_with_a_warning(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_rest"][3, 5] = 2.9
-    found = round_trip(tmp_path / "a.spz", source)
+    copy = round_trip(tmp_path / "a.spz", source)
     assert "values of 1 Gaussians were clipped" in caplog.text
-    assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
+    assert 127 / 128 <= np.abs(copy.parameters["sh_rest"]).max() <= 1
 
 
 def test_out_of_range_values_are_clipped_with_a_warning(tmp_path, rng, caplog):
@@ -120,31 +120,31 @@ def legacy(version, count=2, flags=0, rest=b""):
         if version == 1
         else b"".join(struct.pack("<i", int(v * 4096))[:3] for v in (1, -2, 0.5))
     )
-    one = [positions, b"\xff", b"\x80" * 3, b"\x50" * 3, b"\x80\x7f\x80" if version < 3 else b""]
+    first = [positions, b"\xff", b"\x80" * 3, b"\x50" * 3, b"\x80\x7f\x80" if version < 3 else b""]
     header = struct.pack("<4s2I4B", b"NGSP", version, count, 0, 12, flags, 0)
-    return header + b"".join(plane * count for plane in one) + rest
+    return header + b"".join(plane * count for plane in first) + rest
 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_older_versions_are_read(version, tmp_path):
     (tmp_path / "a.spz").write_bytes(gzip.compress(legacy(version)))
-    found = read(tmp_path / "a.spz").parameters
-    np.testing.assert_allclose(found["means"], [[1, 2, -0.5]] * 2)
-    np.testing.assert_allclose(np.abs(found["quats"]), [[1, 0, 0, 0]] * 2, atol=0.005)
-    np.testing.assert_array_equal(found["log_scales"], np.full((2, 3), -5))
+    actual = read(tmp_path / "a.spz").parameters
+    np.testing.assert_allclose(actual["means"], [[1, 2, -0.5]] * 2)
+    np.testing.assert_allclose(np.abs(actual["quats"]), [[1, 0, 0, 0]] * 2, atol=0.005)
+    np.testing.assert_array_equal(actual["log_scales"], np.full((2, 3), -5))
 
 
 def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, caplog):
     caplog.set_level("INFO")
-    one = replace(splats(rng, 20), rendering={"background": "white"})
+    first = replace(splats(rng, 20), rendering={"background": "white"})
     for name in ("a.spz", "b.spz"):
-        write(tmp_path / name, one)
+        write(tmp_path / name, first)
         read(tmp_path / name)
     assert [
         (text.split(":")[0], "does not store" in text, "read with the axes" in text) for text in caplog.messages
     ] == [(str(tmp_path / name), writes, not writes) for name in ("a.spz", "b.spz") for writes in (True, False)]
     caplog.clear()
-    write(tmp_path / "a.spz", one, Writing(quiet=True))
+    write(tmp_path / "a.spz", first, Writing(quiet=True))
     read(tmp_path / "a.spz", Reading(quiet=True))
     assert not caplog.messages
 
@@ -179,21 +179,21 @@ def test_declared_axes_are_turned_to_those_of_a_ply(tmp_path, caplog):
     for number, name in enumerate(AXES, 1):
         header = struct.pack("<4s2I4B", b"NGSP", 2, 2, 3, 12, 2, 0)
         path.write_bytes(header + rest + struct.pack("<2II", 0xADBE0003, 4, number))
-        found = read(path)
+        result = read(path)
         path.write_bytes(header + rest + struct.pack("<2II", 0xADBE0003, 4, 6))
         stored = read(path)  # of the axes of a PLY
         matrix = np.array([axes[letter] for letter in name], np.float64).T
         assert f"axes that it declares, {name}" in caplog.text
-        np.testing.assert_allclose(found.parameters["means"], stored.parameters["means"] @ matrix.T, atol=1e-6)
+        np.testing.assert_allclose(result.parameters["means"], stored.parameters["means"] @ matrix.T, atol=1e-6)
         colors = [
             basis(seen[None]) @ one.parameters["sh_rest"].reshape(2, 15, 3)
-            for one, seen in ((stored, direction), (found, matrix @ direction))
+            for one, seen in ((stored, direction), (result, matrix @ direction))
         ]
         np.testing.assert_allclose(*colors, atol=1e-5)
         spreads = [
             Rotation.from_quat(np.roll(unit(one.parameters["quats"]), -1, axis=1)).as_matrix()
             * np.exp(one.parameters["log_scales"])[:, None, :]
-            for one in (stored, found)
+            for one in (stored, result)
         ]
         before, after = (spread @ spread.transpose(0, 2, 1) for spread in spreads)
         np.testing.assert_allclose(matrix @ before @ matrix.T, after, atol=1e-5 * before.max())
@@ -326,12 +326,12 @@ def test_reading_needs_little_more_memory_than_the_model(version, tmp_path, rng)
     path.write_bytes(content)
     tracemalloc.start()
     try:
-        found = read(path)
+        result = read(path)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert len(content) < 70_000
-    assert len(found) == count
+    assert len(result) == count
     assert peak / count < 1.3 * 59 * 4, f"{peak / count:.0f} bytes a splat; the model has {59 * 4}"
 
 

@@ -63,7 +63,7 @@ def test_each_leaf_is_a_morton_run_inside_its_box(written):
     folder, made = written
     meta = json.loads((folder / "lod-meta.json").read_text())
     files = [read(folder / name) for name in meta["filenames"]]
-    ends, found = dict.fromkeys(range(len(files)), 0), {level: [] for level in range(3)}
+    ends, actual = dict.fromkeys(range(len(files)), 0), {level: [] for level in range(3)}
     for leaf in leaves(meta["tree"]):
         assert sum(run["count"] for run in leaf["lods"].values()) <= SMALL.splats
         low, high = np.array(leaf["bound"]["min"]), np.array(leaf["bound"]["max"])
@@ -74,35 +74,35 @@ def test_each_leaf_is_a_morton_run_inside_its_box(written):
             means = files[run["file"]].parameters["means"][run["offset"] : ends[run["file"]]]
             assert (means >= low - 0.01).all()
             assert (means <= high + 0.01).all()
-            found[int(level)].append(means)
+            actual[int(level)].append(means)
     assert ends == {file: len(part) for file, part in enumerate(files)}
     for level, source in enumerate(made):
-        expected, means = source.parameters["means"], np.concatenate(found[level])
+        expected, means = source.parameters["means"], np.concatenate(actual[level])
         np.testing.assert_allclose(np.sort(means, axis=0), np.sort(expected, axis=0), atol=0.002)
 
 
 def test_finest_level_is_read_back(written):
     folder, made = written
     for place in (folder, folder / "lod-meta.json"):
-        found = read(place)
-        assert (found.mode, found.rendering) == ("mip", made[0].rendering)
+        result = read(place)
+        assert (result.mode, result.rendering) == ("mip", made[0].rendering)
         assert len(load(place)) == 700
     assert detect(folder / "lod-meta.json").name == "streamed SOG"
-    order = np.concatenate([leaf.rows[0] for leaf in tree([one.parameters for one in made], SMALL).leaves()])
+    order = np.concatenate([leaf.rows[0] for leaf in tree([item.parameters for item in made], SMALL).leaves()])
     close = {"means": 0.002, "log_scales": 0.1, "opacity": 0.0101, "sh_base": 0.1, "sh_rest": 0.5}
-    assert_close(found, made[0].rows(order), 0.8, **close)
+    assert_close(result, made[0].rows(order), 0.8, **close)
 
 
 def test_too_large_leaves_are_divided(rng):
     parameters = splats(rng, 700).parameters
     for limits in (SMALL, LeafLimits(100, 1e9, 1), LeafLimits(1000, 1.0, 20)):
-        found = list(tree([parameters], limits).leaves())
-        for leaf in found:
+        actual = list(tree([parameters], limits).leaves())
+        for leaf in actual:
             span = np.ptp(parameters["means"][leaf.rows[0]], axis=0).max()
             assert len(leaf.rows[0]) <= limits.splats
             assert span <= limits.extent * typical_size(parameters["means"]) or len(leaf.rows[0]) <= limits.few
             np.testing.assert_array_equal(morton_order(parameters["means"][leaf.rows[0]]), np.arange(len(leaf.rows[0])))
-        np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in found])), np.arange(700))
+        np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in actual])), np.arange(700))
 
 
 def test_box_covers_one_rotated_standard_deviation(rng):
@@ -136,10 +136,10 @@ def test_same_levels_give_the_same_bytes(written, tmp_path, rng):
 
 
 def test_one_or_coincident_gaussians_make_levels(tmp_path, rng):
-    one = splats(rng, 1)
-    write_lod(tmp_path / "one", [one, one])
+    first = splats(rng, 1)
+    write_lod(tmp_path / "one", [first, first])
     assert len(read(tmp_path / "one")) == 1
-    write_lod(tmp_path / "same", [one.rows(np.zeros(900, int))], limits=SMALL)
+    write_lod(tmp_path / "same", [first.rows(np.zeros(900, int))], limits=SMALL)
     assert len(read(tmp_path / "same")) == 900
 
 
@@ -232,8 +232,8 @@ def test_environment_is_part_of_the_model(written, rng):
     write(folder / "env" / "meta.json", splats(rng, 20, 2))
     meta = json.loads((folder / "lod-meta.json").read_text())
     (folder / "lod-meta.json").write_text(json.dumps({**meta, "environment": "env/meta.json"}))
-    found = read(folder)
-    assert (len(found), found.sh_degree) == (720, 2)
+    result = read(folder)
+    assert (len(result), result.sh_degree) == (720, 2)
 
 
 WRONG = {
@@ -331,11 +331,11 @@ def test_check_names_each_missing_or_damaged_level_file(written):
     next((folder / coarse[1]).parent.glob("scales*.webp")).write_bytes(b"RIFF")
     meta["counts"][2] += 1
     path.write_text(json.dumps({**meta, "filenames": [*meta["filenames"], "more/meta.json"]}))
-    found = examine(folder)
-    assert not found["valid"]
-    missing, damaged, count, spare = found["findings"]
+    result = examine(folder)
+    assert not result["valid"]
+    missing, damaged, count, spare = result["findings"]
     assert missing.startswith(f"{folder / coarse[0]}: cannot be read (No such file")
     assert str(folder / coarse[1]) in damaged
     assert "splats of level 2, but its leaves have 100" in count
     assert spare.startswith(f"{folder / 'more'}")
-    assert verdict(found).endswith("; write it again")
+    assert verdict(result).endswith("; write it again")

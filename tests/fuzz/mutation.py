@@ -140,14 +140,14 @@ def _splice(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds:
 
 def _number(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
     """Replace a number in text by a word."""
-    found = NUMBER.search(data, at) or NUMBER.search(data)
-    return data[: found.start()] + random.choice(known) + data[found.end() :] if found else data
+    actual = NUMBER.search(data, at) or NUMBER.search(data)
+    return data[: actual.start()] + random.choice(known) + data[actual.end() :] if actual else data
 
 
 def _word(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
     """Replace a word, or what stands in quotes, by another."""
-    found = re.compile(rb'"[^"]*"|\w+').search(data, at)
-    return data[: found.start()] + random.choice(known) + data[found.end() :] if found else data
+    result = re.compile(rb'"[^"]*"|\w+').search(data, at)
+    return data[: result.start()] + random.choice(known) + data[result.end() :] if result else data
 
 
 CHANGES = [_flip, _byte, _cut, _remove, _repeat, _insert, _overwrite, _splice, _number, _number, _word]

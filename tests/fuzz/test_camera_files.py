@@ -32,12 +32,12 @@ def test_damaged_path_is_read_or_refused(seeds, folder):
     @fuzzed(80, data=damaged(seeds, WORDS))
     def reads(data):
         (folder / "b.json").write_bytes(data)
-        found = outcome(camera_path.read, folder / "b.json")
+        actual = outcome(camera_path.read, folder / "b.json")
         outcome(camera_files.read_inria, folder / "b.json")
-        if found is not None:
-            assert 1 <= len(found.views) <= MAX_FRAMES
-            assert all(view.camera.check() and max(found.size) <= SIDES[1] for view in found.views)
-            assert all(view.name == f"frame_{i:05d}" for i, view in enumerate(found.views, 1))
+        if actual is not None:
+            assert 1 <= len(actual.views) <= MAX_FRAMES
+            assert all(view.camera.check() and max(actual.size) <= SIDES[1] for view in actual.views)
+            assert all(view.name == f"frame_{i:05d}" for i, view in enumerate(actual.views, 1))
 
     reads()
 

@@ -53,18 +53,18 @@ def seeds(name: str, folder: Path) -> list[bytes]:
         return [interop("train1000.compressed.ply").read_bytes()]
     if name == "glTF":
         return [as_gltf(data) for data in seeds("GLB", folder)]
-    found = []
+    results = []
     for count, degree, mode in ((3, 0, "mip"), (40, 1, "default"), (5, 3, "mip")):
         write(folder / NAMES[name], splats(RNG, count, degree, mode))
-        found.append((folder / NAMES[name]).read_bytes())
+        results.append((folder / NAMES[name]).read_bytes())
         if name == "SPZ":
-            found += [spz_version_4(found[-1])] * bool(find_spec("zstandard"))
-            plain = zlib.decompress(found[0], 31)
-            found.append(plain[:14] + bytes([plain[14] | 2]) + plain[15:] + AXES)
+            results += [spz_version_4(results[-1])] * bool(find_spec("zstandard"))
+            plain = zlib.decompress(results[0], 31)
+            results.append(plain[:14] + bytes([plain[14] | 2]) + plain[15:] + AXES)
         if name == "GLB":
             spz = (seeds("SPZ", folder))[-1]
-            found.append(join_glb(spz_tree(spz, np.ones((2, 3))), spz))
-    return found
+            results.append(join_glb(spz_tree(spz, np.ones((2, 3))), spz))
+    return results
 
 
 def as_gltf(data: bytes) -> bytes:
@@ -192,10 +192,10 @@ def test_sog_of_another_shape_is_read_or_refused(folder: Path):
         packed = io.BytesIO((folder / f"{kind}.sog").read_bytes())
         with zipfile.ZipFile(packed, "a", kind) as archive:
             archive.writestr("meta.json", data)
-        found = bytearray(packed.getvalue())
+        result = bytearray(packed.getvalue())
         if place < 1:
-            found[int(place * len(found))] ^= 1 << 4
-        (folder / "b.sog").write_bytes(found)
+            result[int(place * len(result))] ^= 1 << 4
+        (folder / "b.sog").write_bytes(result)
         reads_or_refuses(folder / "b.sog")
 
     reads()

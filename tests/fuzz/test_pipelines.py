@@ -74,9 +74,9 @@ def overrides() -> list[bytes]:
 
 @pytest.mark.parametrize("name", ["smoke", "micro_splatting"])
 def test_damaged_setting_is_valid_or_refused(name):
-    one = damaged(overrides(), [*YAML, "stages[0]", ".", "=", "[", "]"])
+    first = damaged(overrides(), [*YAML, "stages[0]", ".", "=", "[", "]"])
 
-    @fuzzed(100, data=lambda random: [one(random) for _ in range(random.randint(1, 2))])
+    @fuzzed(100, data=lambda random: [first(random) for _ in range(random.randint(1, 2))])
     def reads(data):
         pipeline = outcome(load, name, [text.decode("utf-8", "surrogateescape") for text in data])
         if pipeline is not None:

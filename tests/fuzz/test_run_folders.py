@@ -49,9 +49,9 @@ def test_damaged_archive_is_equal_or_refused(folder: Path):
     @fuzzed(data=damaged([checkpoint()], WORDS))
     def reads(data):
         path.write_bytes(data)
-        found = outcome(archive.read, path)
-        if found is not None:
-            notes, arrays = found
+        actual = outcome(archive.read, path)
+        if actual is not None:
+            notes, arrays = actual
             assert notes == NOTES
             assert arrays.keys() == ARRAYS.keys()
             assert all(np.array_equal(arrays[name], ARRAYS[name]) for name in ARRAYS)
@@ -68,10 +68,10 @@ def test_damaged_field_is_equal_or_refused(folder: Path):
     @fuzzed(data=damaged([(folder / "whole.npz").read_bytes()], [*WORDS, "width", "white", "format"]))
     def reads(data):
         path.write_bytes(data)
-        found = outcome(load_field, path)
-        if found is not None:
-            assert (found.shape, found.rendering) == (field.shape, field.rendering)
-            assert np.array_equal(found.parameters, field.parameters)
+        actual = outcome(load_field, path)
+        if actual is not None:
+            assert (actual.shape, actual.rendering) == (field.shape, field.rendering)
+            assert np.array_equal(actual.parameters, field.parameters)
 
     reads()
 
@@ -94,10 +94,10 @@ def test_damaged_run_file_is_read_equal_or_reported(name, run: Path):
     def reads(data):
         (run / name).write_bytes(data)
         assert isinstance(outcome(read_status, run), dict)
-        found = outcome(lambda: verify(RunState.read(run)))
-        assert found is not None
-        if found["whole"]:
-            assert checked_part(name, json.loads(data), found) == checked_part(name, json.loads(before), whole)
+        actual = outcome(lambda: verify(RunState.read(run)))
+        assert actual is not None
+        if actual["whole"]:
+            assert checked_part(name, json.loads(data), actual) == checked_part(name, json.loads(before), whole)
 
     try:
         reads()
@@ -105,9 +105,9 @@ def test_damaged_run_file_is_read_equal_or_reported(name, run: Path):
         (run / name).write_bytes(before)
 
 
-def checked_part(name: str, content: Any, found: dict[str, Any]) -> Any:
+def checked_part(name: str, content: Any, actual: dict[str, Any]) -> Any:
     """What a check holds a file to: all of it, but of status.json, which has no checksum, the state and the files."""
-    return [content["state"], [one["file"] for one in found["objects"]]] if name == "status.json" else content
+    return [content["state"], [item["file"] for item in actual["objects"]]] if name == "status.json" else content
 
 
 def test_damaged_sky_is_a_map_or_refused(folder: Path):
@@ -118,9 +118,9 @@ def test_damaged_sky_is_a_map_or_refused(folder: Path):
     @fuzzed(data=damaged([path.read_bytes()], ["side", "texels", "models", "NaN", "1e999", "null", "[[0, 0, 0]]"]))
     def reads(data):
         path.write_bytes(data)
-        found = outcome(read_sky_file, model)
-        if found is not None:
-            assert found.texels.shape == (found.side**2, 3)
-            assert np.isfinite(found.texels).all()
+        actual = outcome(read_sky_file, model)
+        if actual is not None:
+            assert actual.texels.shape == (actual.side**2, 3)
+            assert np.isfinite(actual.texels).all()
 
     reads()

@@ -106,7 +106,7 @@ def tables() -> list[bytes]:
     lens = {"fl_x": 50, "fl_y": 51.5, "cx": 30.5, "cy": 25, "w": 64, "h": 48}
     own = [{**frame, **lens, "k1": 0.01, "camera_model": "OPENCV"} for frame in frames]
     masked = [{**frame, "mask_path": "a.png"} for frame in frames]
-    found = [
+    actual = [
         {**lens, "frames": frames, "test_filenames": ["a.png"], "train_filenames": ["b.png"]},
         {"frames": own, "ply_file_path": "points.ply"},
         {"camera_angle_x": 0.7, "frames": [{**frame, "file_path": f"./{frame['file_path'][0]}"} for frame in frames]},
@@ -114,7 +114,7 @@ def tables() -> list[bytes]:
         {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 48, "frames": frames},
         {**lens, "frames": [{**frame, "time": i, "static_path": "a.png"} for i, frame in enumerate(frames)]},
     ]
-    return [json.dumps(table, indent=i % 2 or None).encode() for i, table in enumerate(found)]
+    return [json.dumps(table, indent=i % 2 or None).encode() for i, table in enumerate(actual)]
 
 
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])

@@ -147,10 +147,10 @@ def test_tables_become_float32(rng):
 def test_model_has_a_rich_display(rng):
     model = model_of(random_case(rng, 3))
     assert repr(model) == "Model(3 Gaussians, SH degree 3)"
-    for one in (model, model[:0]):
-        page = Page(one._repr_html_())
+    for item in (model, model[:0]):
+        page = Page(item._repr_html_())
         assert page.elements["tr"] == 6
-        assert f"Gaussians{len(one)}" in page.text.replace("\n", "")
+        assert f"Gaussians{len(item)}" in page.text.replace("\n", "")
 
 
 def test_scene_display_has_four_images_and_escaped_names(tiny_scene):

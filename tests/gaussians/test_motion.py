@@ -34,9 +34,9 @@ def moving_model(width: int = 5, count: int = 40) -> Model:
 def test_ply_keeps_the_motion(tmp_path, width):
     model = moving_model(width)
     model.save(tmp_path / "model.ply")
-    found = load(tmp_path / "model.ply")
+    pipeline = load(tmp_path / "model.ply")
     for name, table in model.tables().items():
-        np.testing.assert_array_equal(getattr(found, name), table)
+        np.testing.assert_array_equal(getattr(pipeline, name), table)
     for column in motion_columns(width):
         assert f"property float {column}\n".encode() in (tmp_path / "model.ply").read_bytes()
 
@@ -77,8 +77,8 @@ def test_snapshot_follows_the_kernels_formulas():
 
 def test_snapshot_of_a_moved_model_is_the_moved_snapshot():
     model, turn = moving_model(motion_width(2, True)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-    one, other = model.transformed(2.0, turn, (1, 2, 3)).at(0.6), model.at(0.6).transformed(2.0, turn, (1, 2, 3))
-    for name, table in one.tables().items():
+    first, other = model.transformed(2.0, turn, (1, 2, 3)).at(0.6), model.at(0.6).transformed(2.0, turn, (1, 2, 3))
+    for name, table in first.tables().items():
         np.testing.assert_allclose(table, getattr(other, name), atol=2e-5, err_msg=name)
 
 
@@ -113,7 +113,7 @@ def test_series_reports_lost_data_once(tmp_path: Path, caplog: pytest.LogCapture
     model = moving_model()
     replace(model, rendering=replace(model.rendering, background="white")).save(tmp_path / "moving.ply")
     clsplat.convert(tmp_path / "moving.ply", tmp_path / "frame.spz", frames=3)
-    (told,) = [one.getMessage() for one in caplog.records if "does not store" in one.getMessage()]
+    (told,) = [record.getMessage() for record in caplog.records if "does not store" in record.getMessage()]
     assert told.startswith(str(tmp_path / "frame_0000.spz"))
 
 

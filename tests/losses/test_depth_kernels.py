@@ -55,8 +55,8 @@ def test_reference_gradient_matches_finite_differences(rng):
         return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH)).sum())
 
     splats = ref.project(gaussians, camera, case.degree, **numbers)
-    found, grad_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
-    upstream = found.mean2d, found.conic, found.opacity, found.color
+    actual, grad_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
+    upstream = actual.mean2d, actual.conic, actual.opacity, actual.color
     settings = case.degree, case.variance, case.compensate
     gradients = ref.project_backward(gaussians, camera, *settings, splats, *upstream)
     gradients["means"] = gradients["means"] + grad_depth[:, None] * camera.rotation[2]
@@ -114,14 +114,14 @@ def depths_of_means(device: Device, trainer, photograph, count: int = 30) -> Poi
 @on_one_setting
 def test_points_with_more_observations_weigh_more(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
-    found = depths_of_means(device, trainer, photograph)
+    result = depths_of_means(device, trainer, photograph)
     camera = replace(photograph.camera, view=0)
-    here = found.at(camera)
+    here = result.at(camera)
     assert here is not None
-    assert here is found.at(camera), "kept"
+    assert here is result.at(camera), "kept"
     assert set(np.unique(here.weights.get())) == {0.25, 0.75}
-    assert found.at(replace(camera, view=1)) is None, "a view without points"
-    assert found.at(photograph.camera) is None, "a view that is not trained on"
+    assert result.at(replace(camera, view=1)) is None, "a view without points"
+    assert result.at(photograph.camera) is None, "a view that is not trained on"
 
 
 @on_one_setting

@@ -57,7 +57,7 @@ def error_after(device, weight: float) -> float:
 
 @on_one_setting
 def test_points_halve_the_error_of_a_plain_wall(device):
-    without, found = (error_after(device, weight) for weight in (0.0, 1.0))
-    print(without, found)
+    without, actual = (error_after(device, weight) for weight in (0.0, 1.0))
+    print(without, actual)
     assert without > 0.5 * (DEPTH - BEGUN), "colors alone do not tell it"
-    assert found < 0.5 * without
+    assert actual < 0.5 * without

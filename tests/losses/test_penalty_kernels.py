@@ -32,9 +32,9 @@ def inputs_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
 
 
 def check(
-    inputs: PenaltyInputs, found: LossValue, value: float, gradient: np.ndarray, parameter: str = "log_scales"
+    inputs: PenaltyInputs, actual: LossValue, value: float, gradient: np.ndarray, parameter: str = "log_scales"
 ) -> None:
-    assert found.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
+    assert actual.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
     planes, count = inputs.gradients[parameter].get(), inputs.gaussians.count
     added = planes[:, :count].T.astype(np.float64) - 0.25
     np.testing.assert_allclose(added, gradient, rtol=1e-4, atol=1e-6 * max(1, np.abs(gradient).max()))
@@ -44,10 +44,10 @@ def check(
 @on_devices("count", COUNTS)
 def test_covariance_trace(device, rng, count):
     inputs, log_scales = inputs_of(device, rng, count)
-    found = CovarianceTrace(weight=3.0, above=0.02).add(inputs)
+    result = CovarianceTrace(weight=3.0, above=0.02).add(inputs)
     value, gradient = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(inputs, found, 3 * value, 3 * gradient)
+    check(inputs, result, 3 * value, 3 * gradient)
 
 
 @on_devices("count", COUNTS)
@@ -57,11 +57,11 @@ def test_covariance_trace_in_pixels(device, rng, count):
     interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
     inputs.gaussians.add(INTERVAL2, 1)
     inputs.gaussians.set(INTERVAL2, interval[:, None] ** 2)
-    found = CovarianceTrace(weight=2.0, above=9.0, pixels=4.0).add(inputs)
+    result = CovarianceTrace(weight=2.0, above=9.0, pixels=4.0).add(inputs)
     each = [ref.covariance_trace(log_scales[n : n + 1], 3 * (4.0 * interval[n]) ** 2, EXTENT) for n in range(count)]
     value, gradient = (sum(v for v, _ in each) / count, np.concatenate([g for _, g in each]) / count)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(inputs, found, 2 * value, 2 * gradient)
+    check(inputs, result, 2 * value, 2 * gradient)
 
 
 @on_one_setting
@@ -75,10 +75,10 @@ def test_two_penalties_keep_separate_values(device, rng):
 @on_devices("count", COUNTS)
 def test_anisotropy(device, rng, count):
     inputs, log_scales = inputs_of(device, rng, count)
-    found = Anisotropy(weight=0.1, above=8.0).add(inputs)
+    result = Anisotropy(weight=0.1, above=8.0).add(inputs)
     value, gradient = ref.anisotropy(log_scales, 8.0)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(inputs, found, 0.1 * value, 0.1 * gradient)
+    check(inputs, result, 0.1 * value, 0.1 * gradient)
 
 
 @on_devices("count", COUNTS)

@@ -97,8 +97,8 @@ def test_view_without_a_time_shows_time_0_with_a_warning(finished, scene, caplog
     motion._warn_of_first_timestamp.cache_clear()
     model, view = load(finished), clsplat.read_scene(scene).split("test")[0]
     renderer = Renderer(model)
-    found = [renderer.render(replace(view, time=time)).image for time in (None, 0.0, None)]
-    np.testing.assert_array_equal(found[0], found[1])
+    actual = [renderer.render(replace(view, time=time)).image for time in (None, 0.0, None)]
+    np.testing.assert_array_equal(actual[0], actual[1])
     assert [record.message for record in caplog.records].count(caplog.records[-1].message) == 1
     assert "first timestamp" in caplog.text
 

@@ -98,8 +98,8 @@ def test_gain_is_relative_to_the_summed_errors(device):
     """Over all views, also those that do not see it, times their number: twice as many photographs promise twice."""
     mask = np.arange(32 * 48).reshape(32, 48) % 5 > 0
     stats = stats_of(device, 60, 1.0, [L1(weight=0.8), Dssim(weight=0.2)], mask, views=3)
-    seen = stats.gaussians.get("stats/seen")[:, 0] > 0
-    assert 0 < seen.sum() < 60
+    visible = stats.gaussians.get("stats/seen")[:, 0] > 0
+    assert 0 < visible.sum() < 60
     error, gain = (stats.gaussians.get(f"stats/{name}")[:, 0] for name in ("view_error", "gain"))
     assert len(set(error)) == 1
     np.testing.assert_allclose(stats.mean("gain"), gain / error, rtol=1e-6)
@@ -137,9 +137,9 @@ def test_gain_is_the_largest_change_over_all_directions(device, rng, count):
 @on_one_setting
 def test_invisible_gaussians_do_not_grow(device):
     stats = stats_of(device, 60, 1.0, [L1()])
-    seen = stats.gaussians.get("stats/seen")[:, 0] > 0
+    visible = stats.gaussians.get("stats/seen")[:, 0] > 0
     chosen = np.array(rows_of(stats, "gain", 1e-30)) > 1
-    assert not chosen[~seen].any()
+    assert not chosen[~visible].any()
     assert chosen.any()
 
 

@@ -120,7 +120,7 @@ def test_zero_error_keeps_visible_gaussians(device, rng):
 @pytest.mark.parametrize(("count", "limit"), [(0, 0), (1, 0), (1, 1), (7, 3), (255, 255), (1000, 600), (10**6, 123456)])
 def test_pruned_number_is_accurate_to_one_part_in_256(count, limit):
     asked = []
-    found = find_largest_allowed(lambda number: asked.append(number) or number <= limit, count)
-    assert found <= limit
-    assert limit - found < max(1, count // 256)
+    result = find_largest_allowed(lambda number: asked.append(number) or number <= limit, count)
+    assert result <= limit
+    assert limit - result < max(1, count // 256)
     assert len(asked) <= 10

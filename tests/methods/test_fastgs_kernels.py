@@ -39,11 +39,11 @@ def surveyed(device: Device, case: Case, photographs: list[np.ndarray], masks: l
 def photo_folder(rng, case: Case, number: int) -> list[np.ndarray]:
     """The image of the reference, with errors in about half of the pixels."""
     image = ref.render(case.gaussians(), case.camera(), BACKGROUND.astype(np.float64), case.degree).image
-    found = []
+    results = []
     for _ in range(number):
         error = rng.uniform(-0.3, 0.3, image.shape) * (rng.random(image.shape[1:]) < 0.5)
-        found.append(np.round(255 * np.clip(image + error, 0, 1)).astype(np.uint8))
-    return found
+        results.append(np.round(255 * np.clip(image + error, 0, 1)).astype(np.uint8))
+    return results
 
 
 def expected_wrong(
@@ -75,17 +75,17 @@ def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, mas
     case = safe_case(rng, count, width, height, MARGIN)
     photographs = photo_folder(rng, case, 4)
     masks = [rng.random((height, width)) < 0.7 if masked else None for _ in photographs]
-    found = count_wrong_pixels(surveyed(device, case, photographs, masks), 10, 0.1)
+    result = count_wrong_pixels(surveyed(device, case, photographs, masks), 10, 0.1)
     pixels, score = expected_wrong(case, photographs, masks, 0.1)
-    np.testing.assert_array_equal(found.pixels, pixels)
-    np.testing.assert_allclose(found.score, score, atol=1e-4)
+    np.testing.assert_array_equal(result.pixels, pixels)
+    np.testing.assert_allclose(result.score, score, atol=1e-4)
 
 
 @on_one_setting
 def test_no_gaussians_or_errors_give_no_wrong_pixels(device, rng):
     case = random_case(rng, 0)
-    found = count_wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
-    assert found.pixels.shape == found.score.shape == (0,)
+    result = count_wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
+    assert result.pixels.shape == result.score.shape == (0,)
     case = random_case(rng, 3)
     case.parameters["logit_opacity"][:] = -30
     black = surveyed(device, case, [np.round(255 * BACKGROUND[:, None, None] * np.ones((3, 30, 40))).astype(np.uint8)])

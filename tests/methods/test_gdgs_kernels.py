@@ -100,14 +100,14 @@ def test_rule_acts_above_its_ratio(device, rng):
 
 @on_one_setting
 def test_moves_depend_only_on_the_step(device, rng):
-    state, found = rng.bit_generator.state, []
+    state, results = rng.bit_generator.state, []
     for step in (700, 700, 800):
         rng.bit_generator.state = state
         gaussians = crowded(device, rng, 100)
         apply(gaussians, CloneDense(ratio_above=0.0), step=step)
-        found.append(gaussians.get("means"))
-    np.testing.assert_array_equal(found[0], found[1])
-    assert (found[0] != found[2]).any()
+        results.append(gaussians.get("means"))
+    np.testing.assert_array_equal(results[0], results[1])
+    assert (results[0] != results[2]).any()
 
 
 @on_one_setting
@@ -122,10 +122,10 @@ def test_cells_of_flat_and_broken_scenes():
     assert grid_cells(np.zeros((0, 3)), 4).shape == (0,)
     assert (grid_cells(np.ones((5, 3)), 4) == 0).all()
     flat = np.stack([np.linspace(0, 1, 101), np.zeros(101), np.zeros(101)], axis=1)
-    found = grid_cells(flat, 4)
-    assert (found[[0, 100]] == -1).all()
-    assert found[1:100].tolist() == sorted(found[1:100])
-    assert set(found[1:100]) == {0, 16, 32, 48}
+    result = grid_cells(flat, 4)
+    assert (result[[0, 100]] == -1).all()
+    assert result[1:100].tolist() == sorted(result[1:100])
+    assert set(result[1:100]) == {0, 16, 32, 48}
     flat[50] = np.nan, 0, np.inf
     assert grid_cells(flat, 4)[50] == -1
     assert (grid_cells(np.full((3, 3), np.nan), 4) == -1).all()

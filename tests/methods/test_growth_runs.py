@@ -74,7 +74,7 @@ def times(scene, factor, folder):
 
 def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
     """Within 0.02 dB, in ten times the units: rates, noise, penalties and sizes are shares of the scene's extent."""
-    found = []
+    results = []
     for factor in (1, 10):
         scene = times(tiny_scene, factor, tmp_path / f"scene{factor}")
         settings = (
@@ -83,9 +83,9 @@ def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
             *("add_noise.stop=60", "add_noise.opacity_below=0.6"),  # where the opacities of so short a run are
         )
         run = train(scene, tmp_path / f"run{factor}", *settings, pipeline="mcmc_7k")
-        found.append(json.loads((run.out / "metrics.json").read_text())["test"]["1"]["psnr"])
-    assert found[0] > 13
-    assert found[1] == pytest.approx(found[0], abs=0.02)
+        results.append(json.loads((run.out / "metrics.json").read_text())["test"]["1"]["psnr"])
+    assert results[0] > 13
+    assert results[1] == pytest.approx(results[0], abs=0.02)
 
 
 def test_growth_stops_at_a_number_of_gaussians_per_pixel(tiny_scene, tmp_path):

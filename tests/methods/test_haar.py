@@ -71,8 +71,8 @@ def test_unfiltered_haar_is_the_identity(device, rng, masked):
     squares = np.where(mask, image, np.nan).reshape(3, 5, 2, 11, 2)
     count = mask.reshape(5, 2, 11, 2).sum(axis=(1, 3))
     mean = np.nansum(squares, axis=(2, 4), dtype=np.float64) / np.maximum(count, 1)
-    found = apply_haar(device, image, (0.0, 0.0), mask if masked else None)[:, mask]
-    np.testing.assert_allclose(found, np.kron(mean, np.ones((2, 2)))[:, mask], rtol=1e-6)
+    actual = apply_haar(device, image, (0.0, 0.0), mask if masked else None)[:, mask]
+    np.testing.assert_allclose(actual, np.kron(mean, np.ones((2, 2)))[:, mask], rtol=1e-6)
     np.testing.assert_allclose(
         apply_haar(device, image, HAAR, mask if masked else None)[:, mask], image[:, mask], atol=3e-7
     )
@@ -142,9 +142,9 @@ def test_gradient_is_the_sum_over_all_losses(device, rng, learn, masked):
 
     def total(scalars: dict[str, float]) -> float:
         taps = taps_of(scalars)
-        found = ref.haar_filter(colors, taps, counted) * (1 if counted is None else counted)
+        actual = ref.haar_filter(colors, taps, counted) * (1 if counted is None else counted)
         parts = ((0.8, ref.l1), (0.2, ref.dssim), (3.0, ref.l2))
-        images = sum(weight * loss(image, found)[0] for weight, loss in parts)
+        images = sum(weight * loss(image, actual)[0] for weight, loss in parts)
         return images + 0.01 * 2 * ((taps - HAAR) ** 2).sum()
 
     expected = {}
@@ -232,5 +232,5 @@ def test_recipe_trains(tiny_scene, tmp_path):
     assert scalars["haar/scale"] == pytest.approx(30 * 4.3e-4, rel=0.1)
     assert abs(scalars["haar/leak"]) < 30 * 4.3e-4
     plain = train(tiny_scene, tmp_path / "plain", *short, pipeline="splat_7k")
-    psnr = [one.metrics["test"]["1"]["psnr"] for one in (run, plain)]
+    psnr = [item.metrics["test"]["1"]["psnr"] for item in (run, plain)]
     assert psnr[0] == pytest.approx(psnr[1], abs=1.5)

@@ -105,7 +105,7 @@ def test_source_isolated_by_a_later_rule_does_not_change(device, rng):
     alone = np.flatnonzero(copies[30:] == 1) + 30
     assert len(alone) > 10
     assert (copies[30:] > 1).any()
-    rows = [int(np.flatnonzero(source == one)[0]) for one in alone]
+    rows = [int(np.flatnonzero(source == item)[0]) for item in alone]
     for name, table in before.items():
         np.testing.assert_array_equal(gaussians.get(name)[rows], table[alone])
 
@@ -183,7 +183,7 @@ def test_systematic_draws_are_equally_spaced(rng, count, draws):
     """Against places on the line of weights one by one, in Python's whole numbers."""
     weights = rng.integers(0, 2**24, count).astype(np.uint64)
     weights[0], weights[-1] = 2**24, 1
-    found = sample_systematically(weights, draws, np.random.default_rng(5))
+    result = sample_systematically(weights, draws, np.random.default_rng(5))
     start, total, ends = (
         int(np.random.default_rng(5).integers(0, int(weights.sum()))),
         int(weights.sum()),
@@ -192,17 +192,17 @@ def test_systematic_draws_are_equally_spaced(rng, count, draws):
     expected = np.zeros(count, int)
     for j in range(draws):
         expected[np.searchsorted(ends, (j * total + start) // draws, side="right")] += 1
-    np.testing.assert_array_equal(found, expected)
-    assert found.sum() == draws
+    np.testing.assert_array_equal(result, expected)
+    assert result.sum() == draws
     share = draws * weights.astype(float) / total
-    assert (np.abs(found - share) < 1 + 1e-9).all()
+    assert (np.abs(result - share) < 1 + 1e-9).all()
 
 
 def test_positions_of_many_draws_do_not_overflow():
     """A hundred million weights of 2^24: their products are beyond 64 bits."""
     weights = np.full(3, 2**24 * 33_333_333, np.uint64)
-    found = sample_systematically(weights, 2_000_003, np.random.default_rng(1))
-    assert sorted(found) == [666667, 666668, 666668]
+    result = sample_systematically(weights, 2_000_003, np.random.default_rng(1))
+    assert sorted(result) == [666667, 666668, 666668]
 
 
 @pytest.mark.parametrize(("opacity", "rows"), each_once([0.05, 0.3, 0.73, 0.95, 0.999], [1, 2, 50, 20, 5]))

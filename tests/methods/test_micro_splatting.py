@@ -40,14 +40,14 @@ def test_every_rule_and_penalty_has_an_effect(finished):
         total, grown = (sum(edit[key][name] for edit in edits) for key in ("causes", "grown"))
         assert total > 0, name
         assert 0 < grown <= total if name in growing else grown == 0, name
-    found = [line for line in lines if line["kind"] == "distribution"]
-    assert found[-1]["step"] == 50
-    assert all(len(line["anisotropy"]) == len(QUANTILES) for line in found)
+    actual = [line for line in lines if line["kind"] == "distribution"]
+    assert actual[-1]["step"] == 50
+    assert all(len(line["anisotropy"]) == len(QUANTILES) for line in actual)
     page = (finished.out / "report.html").read_text()
     assert "anisotropy" in page
     assert re.search("changed by each rule.*split_oversized", page)
-    shown = re.findall(r"<figcaption>(\S+) ", page)
-    assert len(shown) == len(set(shown)) > 0, "a view is shown twice"
+    matches = re.findall(r"<figcaption>(\S+) ", page)
+    assert len(matches) == len(set(matches)) > 0, "a view is shown twice"
 
 
 def test_legends_stay_below_the_title_and_break_into_rows():
@@ -106,7 +106,7 @@ def test_distribution_of_known_gaussians(device, rng):
     case = random_case(rng, 5)
     case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
     case.parameters["logit_opacity"][:] = 0
-    found = distribution(case.model(device).gaussians)
-    np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], QUANTILES), rtol=1e-6)
-    np.testing.assert_allclose(found["size"][2], np.sqrt(11 / 3), rtol=1e-6)
-    assert found["opacity"] == [0.5] * 5
+    result = distribution(case.model(device).gaussians)
+    np.testing.assert_allclose(result["anisotropy"], np.quantile([1, 2, 3, 4, 5], QUANTILES), rtol=1e-6)
+    np.testing.assert_allclose(result["size"][2], np.sqrt(11 / 3), rtol=1e-6)
+    assert result["opacity"] == [0.5] * 5

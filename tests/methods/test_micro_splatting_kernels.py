@@ -240,9 +240,9 @@ def test_merged_covariance_is_that_of_the_mixture(rng):
         "sh_base": rng.normal(size=(2 * count, 3)),
         "sh_rest": rng.normal(size=(2 * count, 45)),
     }
-    found = merge(tables, np.arange(count), np.arange(count, 2 * count))
-    np.testing.assert_allclose(np.linalg.norm(found["quats"], axis=1), 1, rtol=1e-9)
-    assert all(np.isfinite(values).all() for values in found.values())
+    result = merge(tables, np.arange(count), np.arange(count, 2 * count))
+    np.testing.assert_allclose(np.linalg.norm(result["quats"], axis=1), 1, rtol=1e-9)
+    assert all(np.isfinite(values).all() for values in result.values())
 
     def mixture_of(values, rows):
         axes = Rotation.from_quat(np.roll(values["quats"][rows], -1, axis=1)).as_matrix()
@@ -254,7 +254,7 @@ def test_merged_covariance_is_that_of_the_mixture(rng):
     total = sum(mass for _, _, mass in halves)
     mean = sum(mass[:, None] * mean for mean, _, mass in halves) / total[:, None]
     second = sum(mass[:, None, None] * (own + _outer(mean)) for mean, own, mass in halves) / total[:, None, None]
-    got = mixture_of(found, slice(None))
+    got = mixture_of(result, slice(None))
     np.testing.assert_allclose(got[0], mean, rtol=1e-9)
     np.testing.assert_allclose(got[1], second - _outer(mean), atol=1e-9 * np.abs(second).max())
 

@@ -46,9 +46,9 @@ def loss_of(alpha: np.ndarray, splats: ref.Splats, weights: np.ndarray) -> float
 
 def split_planes(alpha: np.ndarray, n: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """The planes with that of one splat replaced by two, one in front of the other."""
-    found = alpha.copy()
-    found[n] = 1 - (1 - one[n]) * (1 - other[n])
-    return found
+    result = alpha.copy()
+    result[n] = 1 - (1 - one[n]) * (1 - other[n])
+    return result
 
 
 def uncapped_case(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.ndarray]:
@@ -84,9 +84,9 @@ def test_two_half_opacities_equal_the_mean_to_second_order(rng):
         again = np.random.default_rng(7)
         _, splats, weights, matrices = uncapped_case(again, (opacity, opacity))
         v, step, worst = again.normal(size=2), 0.02, 0.0
-        one = replace(splats, opacity=splats.opacity / 2)
-        alpha, both = alphas(splats, 24, 20), alphas(one, 24, 20)
-        moved = [alphas(one, 24, 20, sign * step * v) for sign in (1, -1)]
+        first = replace(splats, opacity=splats.opacity / 2)
+        alpha, both = alphas(splats, 24, 20), alphas(first, 24, 20)
+        moved = [alphas(first, 24, 20, sign * step * v) for sign in (1, -1)]
         for n in range(6):
             change = loss_of(split_planes(alpha, n, *moved), splats, weights)
             change -= loss_of(split_planes(alpha, n, both, both), splats, weights)
@@ -118,8 +118,8 @@ def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
         v = rng.normal(size=3)
         mean = alpha.copy()
         mean[n] = sum(alphas(projected(sign * step * v), 24, 20)[n] for sign in (1, -1)) / 2
-        found = (loss_of(mean, still, weights) - before) / step**2
-        error = abs(found - v @ matrices[n] @ v / 2)
+        actual = (loss_of(mean, still, weights) - before) / step**2
+        error = abs(actual - v @ matrices[n] @ v / 2)
         assert error < bound * np.abs(matrices[n]).max() * (v @ v)
 
 
@@ -148,12 +148,12 @@ def test_column_matches_the_reference_matrix(device, rng, count):
     """Some Gaussians lie behind the camera and some beside the picture: nothing is added to them."""
     case = safe_case(rng, count, 33, 31, change=lambda p: p["means"].__setitem__(slice(2, None, 7), [0, 0, -9]))
     weights = rng.normal(size=(3, 31, 33)).astype(np.float32)
-    found, stats = added_up(device, case, weights, views=2)
+    actual, stats = added_up(device, case, weights, views=2)
     on_screen = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
     expected = ref.splitting(case.gaussians(), case.camera(), on_screen)
-    assert relative_error(found, 2 * expected[:, *np.triu_indices(3)]) < GRADIENT
-    assert (found[2::7] == 0).all()
-    np.testing.assert_allclose(stats.means("splitting"), np.where(stats.means("screen_grad") > 0, found / 2, 0))
+    assert relative_error(actual, 2 * expected[:, *np.triu_indices(3)]) < GRADIENT
+    assert (actual[2::7] == 0).all()
+    np.testing.assert_allclose(stats.means("splitting"), np.where(stats.means("screen_grad") > 0, actual / 2, 0))
     stats.clear()
     assert not stats.means("splitting").any()
 
@@ -162,17 +162,17 @@ def test_nonfinite_gaussian_adds_nothing(device, rng):
     case = random_case(rng, 20)
     for name, row, value in (("means", 3, np.nan), ("quats", 5, np.nan), ("log_scales", 7, np.inf)):
         case.parameters[name][row] = value
-    found, _ = added_up(device, case, rng.normal(size=(3, 30, 40)).astype(np.float32))
-    assert (found[[3, 5]] == 0).all()
-    assert np.isfinite(np.delete(found, 7, axis=0)).all()
+    actual, _ = added_up(device, case, rng.normal(size=(3, 30, 40)).astype(np.float32))
+    assert (actual[[3, 5]] == 0).all()
+    assert np.isfinite(np.delete(actual, 7, axis=0)).all()
 
 
 @on_one_setting
 def test_schedules_agree(device, rng):
     case, weights = random_case(rng, 200, 60, 50), rng.normal(size=(3, 50, 60)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
-    found, again = (added_up(one, case, weights)[0] for one in (device, other))
-    assert relative_error(found, again) < 1e-4
+    actual, again = (added_up(item, case, weights)[0] for item in (device, other))
+    assert relative_error(actual, again) < 1e-4
 
 
 def test_smallest_axes_belong_to_each_matrix(rng):
@@ -311,8 +311,8 @@ def test_undone_or_pruned_split_leaves_other_gaussians(device, rng):
         if len(rows) == 1:
             np.testing.assert_array_equal(case.gaussians.get("means")[rows], case.before["means"][[n]])
         halved = n % 2 == 1 and len(rows) == 2
-        found = 1 / (1 + np.exp(-case.gaussians.get("logit_opacity")[rows, 0]))
-        np.testing.assert_allclose(found, (0.5 if halved else 1) / (1 + np.exp(-1)), rtol=1e-5)
+        actual = 1 / (1 + np.exp(-case.gaussians.get("logit_opacity")[rows, 0]))
+        np.testing.assert_allclose(actual, (0.5 if halved else 1) / (1 + np.exp(-1)), rtol=1e-5)
 
 
 class Double(Rule):

@@ -42,8 +42,8 @@ def test_scores_follow_the_formula(device, rng):
 
     splats, background = case.project(), BACKGROUND.astype(np.float64)
     image = ref.blend(splats, 33, 17, background)[0]
-    weight, seen = ref.blend_weights(splats, 33, 17), splats.radius > 0
-    assert not seen[4]
+    weight, visible = ref.blend_weights(splats, 33, 17), splats.radius > 0
+    assert not visible[4]
     kernel = np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]])
     expected, total = np.zeros(30), 0.0
     for colors in photographs:
@@ -56,10 +56,10 @@ def test_scores_follow_the_formula(device, rng):
         values |= {"pixels": (blended * plane).sum(axis=(1, 2)), "weight": weight.sum(axis=(1, 2))}
         factors = {"depth": 5, "radius": 10, "pixels": 10, "number": 0.1, "weight": 50}
         for name, factor in factors.items():
-            value = np.where(seen, values[name], 0)
+            value = np.where(visible, values[name], 0)
             expected += loss * factor * value / np.median(value[value > 0])
         total += loss
-    np.testing.assert_allclose(losses, total * seen, rtol=1e-5)
+    np.testing.assert_allclose(losses, total * visible, rtol=1e-5)
     np.testing.assert_allclose(terms, expected, rtol=1e-3)
 
 

@@ -32,9 +32,9 @@ def all_pixels(image: np.ndarray) -> np.ndarray:
 def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
     photograph = to_8_bits(image * GAINS.astype(np.float32))
     assert psnr(image, photograph) < 25
-    found = color_metrics(image, photograph, None, Gain())
-    assert found["psnr_color"] > 50
-    assert found["psnr_affine"] > 50
+    result = color_metrics(image, photograph, None, Gain())
+    assert result["psnr_color"] > 50
+    assert result["psnr_affine"] > 50
 
 
 def test_equal_images_stay_equal(image):
@@ -69,9 +69,9 @@ def test_half_with_too_few_pixels_has_no_color_metric(image, model, numbers, hal
     rows, columns = np.nonzero(~counted)
     for number, has in ((PIXELS_PER_PARAMETER * numbers - 1, False), (PIXELS_PER_PARAMETER * numbers, True)):
         counted[rows[:number], columns[:number]] = True
-        found = color_metrics(image, photograph, counted, model)
-        assert ("psnr_color" in found) == has
-        assert "psnr_affine" in found
+        result = color_metrics(image, photograph, counted, model)
+        assert ("psnr_color" in result) == has
+        assert "psnr_affine" in result
 
 
 @pytest.mark.parametrize("model", [Gain(), Affine()])
@@ -93,16 +93,16 @@ def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
 
 
 def test_mean_reports_its_number_of_views():
-    both, one = {"psnr_color": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
+    both, first = {"psnr_color": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
     assert mean_color_metrics([both, both]) == both
     assert mean_color_metrics([{}, {}]) == {}
-    assert mean_color_metrics([both, one]) == {
+    assert mean_color_metrics([both, first]) == {
         "psnr_color": 30.0,
         "psnr_affine": 26.0,
         "psnr_color_views": 1,
         "psnr_color_reason": "1 of 2 views have a half with too few pixels to fit colors to",
     }
-    none = mean_color_metrics([one])
+    none = mean_color_metrics([first])
     assert (none["psnr_color"], none["psnr_color_views"]) == (None, 0)
 
 

@@ -34,9 +34,9 @@ def stacks(rng):
 
 
 def gathered(views, renders, photographs, counted=None):
-    found = FlickerMeter(views)
-    rows = [found.add(*one, counted) for one in zip(views, renders, photographs, strict=True)]
-    return rows, found.flicker()
+    result = FlickerMeter(views)
+    rows = [result.add(*item, counted) for item in zip(views, renders, photographs, strict=True)]
+    return rows, result.flicker()
 
 
 def test_flicker_is_the_deviation_over_time_of_one_camera(rng, static):
@@ -44,7 +44,7 @@ def test_flicker_is_the_deviation_over_time_of_one_camera(rng, static):
     views = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     rows, figures = gathered(views, renders, photographs)
     assert set(figures) == {view.name for view in views}
-    expected = [float(one[:, :, :4].astype(np.float64).std(axis=0).mean()) for one in (renders, photographs)]
+    expected = [float(item[:, :, :4].astype(np.float64).std(axis=0).mean()) for item in (renders, photographs)]
     assert [figures["3"][key] for key in ("flicker", "flicker_photographs")] == pytest.approx(expected, rel=1e-12)
     assert figures["3"]["static_share"] == pytest.approx(4 / 9)
     error = ((renders[:, :, :4].astype(np.float64) - photographs[:, :, :4]) ** 2).mean(axis=(1, 2, 3))
@@ -57,7 +57,7 @@ def test_order_of_times_and_other_cameras_do_not_matter(rng, static):
     other = [moment(f"o{i}", i / (MOMENTS - 1), x=1.0, static_path=static) for i in range(MOMENTS)]
     order = rng.permutation(MOMENTS)
     _, figures = gathered(views, renders, photographs)
-    mixed = [one for i in order for one in (views[i], other[i])]
+    mixed = [item for i in order for item in (views[i], other[i])]
     _, again = gathered(mixed, np.repeat(renders[order], 2, axis=0), np.repeat(photographs[order], 2, axis=0))
     assert {name: again[name] for name in figures} == figures
 
@@ -107,8 +107,8 @@ def test_held_out_times_are_measured_separately():
     psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
     moments = psnr_by_time(psnr, views, [views[0], views[2]])
     assert moments == {"0": {OTHERS: 20.0}, "1": {HELD_OUT: 21.0}, "2": {OTHERS: 22.0}}
-    found = mean([ViewMetrics(name, value, 0.9, moments=moments[name]) for name, value in psnr.items()])
-    assert (found["psnr"], found[HELD_OUT], found[OTHERS]) == (21, 21, 21)
+    result = mean([ViewMetrics(name, value, 0.9, moments=moments[name]) for name, value in psnr.items()])
+    assert (result["psnr"], result[HELD_OUT], result[OTHERS]) == (21, 21, 21)
     for trained in (views, [moment("x", 0.2)], [moment("y", None)], []):
         assert not psnr_by_time(psnr, views, trained)
 

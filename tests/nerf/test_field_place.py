@@ -38,13 +38,13 @@ def test_cube_is_seen_if_a_view_samples_it(tmp_path):
     samples = (places - view.world_to_camera[:, 3]) @ view.world_to_camera[:, :3]
     for _ in range(150):
         corner, side = rng.uniform(-3, 2, 3), float(rng.uniform(0.2, 2))
-        found = is_seen(scene_of(tmp_path, view), corner, side)
+        result = is_seen(scene_of(tmp_path, view), corner, side)
         inside, within = (
             bool(((samples > corner - slack) & (samples < corner + side + slack)).all(axis=1).any())
             for slack in (0, 0.1)
         )
-        assert inside <= found <= within
-        seen += found
+        assert inside <= result <= within
+        seen += result
     assert 15 < seen < 100
 
 

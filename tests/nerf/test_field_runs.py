@@ -57,7 +57,7 @@ def test_field_run_writes_the_usual_outputs(finished):
     assert metrics["gaussians"] is None
     assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, color_width=16).parameter_count
     assert set(metrics["test"]) == {"1", "2", "4"}
-    assert all(one["views"] == 2 for one in metrics["test"].values())
+    assert all(value["views"] == 2 for value in metrics["test"].values())
     assert json.loads((finished / "status.json").read_text())["state"] == "done"
     assert len(list((finished / "renders").rglob("*.png"))) == 2
     page = (finished / "report.html").read_text()
@@ -79,8 +79,8 @@ def test_renders_match_the_field(finished, tiny_scene, pipeline):
 def test_field_trains_longer_with_more_steps(finished, tmp_path):
     assert RunState.read(finished).steps_key == "train_field.steps"
     assert RunState.read(tmp_path).steps_key == "optimize.steps"
-    told = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
-    assert "14 steps" in told
+    output = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
+    assert "14 steps" in output
     assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))
 
 
@@ -97,9 +97,9 @@ def test_images_of_all_sizes_count_equally(finished, tiny_scene, pipeline):
     (stage, *_) = load(pipeline).stages
     assert isinstance(stage, TrainField)
     pool = ViewPool(run.scene.split("train"), run.seed)
-    shown = [one for step in range(1, 5) for one in stage._sample(run, pool, step)]
-    assert {one.camera.width for one in shown} == {40, 20}
-    assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
+    shown = [item for step in range(1, 5) for item in stage._sample(run, pool, step)]
+    assert {item.camera.width for item in shown} == {40, 20}
+    assert {(item.rays, item.weight) for item in shown} == {(32, 1600)}
 
 
 def test_killed_run_resumes_to_the_same_bits(finished, tiny_scene, tmp_path, pipeline):
@@ -118,9 +118,9 @@ def test_comparison_accepts_fields_and_gaussians(finished, few_steps, tmp_path):
 
 
 def test_files_of_a_field_run_are_verified(finished):
-    found = verify(RunState.read(finished))
-    assert found["whole"]
-    details = [one["detail"] for one in found["objects"]]
+    result = verify(RunState.read(finished))
+    assert result["whole"]
+    details = [item["detail"] for item in result["objects"]]
     assert [text for text in details if text.startswith("step 12, ") and text.endswith(" parameters")]
 
 
@@ -136,23 +136,23 @@ def test_model_commands_refuse_field_runs(finished):
 def test_field_file_gives_the_metrics_and_images_of_its_run(finished, tmp_path):
     """To the bit, from the run folder and from the file, which knows its run."""
     recorded = json.loads((finished / "metrics.json").read_text())
-    found = clsplat.evaluate(finished / "field.npz", downscales=[1, 2])
-    assert {size: found["test"][size] for size in ("1", "2")} == {size: recorded["test"][size] for size in ("1", "2")}
-    assert (found["gaussians"], found["parameters"]) == (None, recorded["parameters"])
+    result = clsplat.evaluate(finished / "field.npz", downscales=[1, 2])
+    assert {size: result["test"][size] for size in ("1", "2")} == {size: recorded["test"][size] for size in ("1", "2")}
+    assert (result["gaussians"], result["parameters"]) == (None, recorded["parameters"])
     assert clsplat.render_views(finished, out=tmp_path / "images", depth=True) == 4
     for path in (finished / "renders").rglob("*.png"):
         assert next((tmp_path / "images").rglob(path.name)).read_bytes() == path.read_bytes()
 
 
 def test_dry_run_estimates_the_training_time(tiny_scene, tmp_path, pipeline):
-    told = clsplat.describe_run(pipeline, tiny_scene, tmp_path / "run")
-    assert re.search(r"expected: 0\.1 min, .*\n  train_field +0\.1 min: 12 steps of .* ms, of 128 rays", told)
+    text = clsplat.describe_run(pipeline, tiny_scene, tmp_path / "run")
+    assert re.search(r"expected: 0\.1 min, .*\n  train_field +0\.1 min: 12 steps of .* ms, of 128 rays", text)
 
 
 def test_field_trains_for_a_time_budget(tiny_scene, tmp_path, pipeline, monkeypatch):
     """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
-    found = Rehearsal(12, [0.01], during=0.0, after=0.0)
-    monkeypatch.setattr("clsplat.runs.time_budget.rehearse_enough", lambda *given: found)
+    rehearsal = Rehearsal(12, [0.01], during=0.0, after=0.0)
+    monkeypatch.setattr("clsplat.runs.time_budget.rehearse_enough", lambda *given: rehearsal)
     monkeypatch.setattr(Rehearsal, "steps_in", lambda *given: 24)
     out = clsplat.run(pipeline, tiny_scene, tmp_path / "run", minutes=0.002)
     (stage, *_) = load(str(out / "pipeline.yaml")).stages

@@ -55,8 +55,8 @@ def test_grid_bits_do_not_depend_on_the_thread_count(finished, tiny_scene, tmp_p
 
 def test_grid_file_gives_the_metrics_of_its_run(finished):
     recorded = json.loads((finished / "metrics.json").read_text())
-    found = clsplat.evaluate(finished / "field.npz", downscales=[2])
-    assert found["test"]["2"] == recorded["test"]["2"]
+    result = clsplat.evaluate(finished / "field.npz", downscales=[2])
+    assert result["test"]["2"] == recorded["test"]["2"]
 
 
 def test_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):

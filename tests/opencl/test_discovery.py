@@ -187,10 +187,10 @@ def test_broken_runtime_is_reported_and_isolated(monkeypatch, info, caplog):
     monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
     (set_devices,) = discovery.list_devices()
     assert (set_devices.name, set_devices.index) == (info.name, (2, 1))
-    told = [record.getMessage() for record in caplog.records]
-    assert len(told) == 2, "one without a device is no fault"
-    assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]
-    assert "OpenCL platform 2: its device 0 cannot be queried (clGetInfo failed: INVALID_VALUE" in told[1]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2, "one without a device is no fault"
+    assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in messages[0]
+    assert "OpenCL platform 2: its device 0 cannot be queried (clGetInfo failed: INVALID_VALUE" in messages[1]
 
 
 @pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])

@@ -34,8 +34,8 @@ def test_image_and_derivatives(device, rng, width, height):
 def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera = make_camera(device, 33, 18)
-    found = transform_colors(Workspace(device), camera, to_planes(device, camera, image), IDENTITY).get()
-    assert (found[:, :18, :33] == np.minimum(image, 1)).all()
+    result = transform_colors(Workspace(device), camera, to_planes(device, camera, image), IDENTITY).get()
+    assert (result[:, :18, :33] == np.minimum(image, 1)).all()
 
 
 class Case:
@@ -64,13 +64,13 @@ class Case:
 @on_devices("colors, share", product([Gain(), Affine(weight=0.3)], [None, 0.7]))
 def test_step_gradient_is_that_of_its_losses(device, rng, monkeypatch, colors, share):
     """By finite differences of the loss; l2 is smooth."""
-    case, found = Case(device, rng, colors, share=share), []
+    case, results = Case(device, rng, colors, share=share), []
     table, step = case.trainer.modules[0].table, 2e-3
     numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
     case.trainer.modules[0].scalars = case.scalars
-    monkeypatch.setattr(ViewTable, "update", lambda self, scalars, view, gradient, rate: found.append((view, gradient)))
+    monkeypatch.setattr(ViewTable, "update", lambda self, scalars, view, gradient, rate: results.append((view, gradient)))
     case.trainer.step(case.photograph, 1)
-    ((view, gradient),) = found
+    ((view, gradient),) = results
     assert view == "b"
     assert gradient == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
 
@@ -82,8 +82,8 @@ def gradients_of(device, rng, colors, losses) -> dict[str, np.ndarray]:
     for name in ("sh_base", "sh_rest"):  # no pixel is beyond white, where the image would be cut
         gaussians.set(name, gaussians.get(name) * np.float32(0.2))
     view = trainer.differentiate(case.photograph, 1)
-    found = trainer.rasterizer.gradients(trainer.model, view.frame, view.pixel_sums)
-    return {name: found[name].get() for name in ("means", "sh_base", "logit_opacity")}
+    result = trainer.rasterizer.gradients(trainer.model, view.frame, view.pixel_sums)
+    return {name: result[name].get() for name in ("means", "sh_base", "logit_opacity")}
 
 
 @on_one_setting
@@ -93,9 +93,9 @@ def test_identity_parameters_leave_the_gradients(device, rng, monkeypatch):
     state = rng.bit_generator.state
     plain = gradients_of(device, rng, None, losses)
     rng.bit_generator.state = state
-    found = gradients_of(device, rng, Gain(), losses)
+    gradients = gradients_of(device, rng, Gain(), losses)
     for name, expected in plain.items():
-        assert np.linalg.norm(found[name] - expected) < 1e-4 * np.linalg.norm(expected), name
+        assert np.linalg.norm(gradients[name] - expected) < 1e-4 * np.linalg.norm(expected), name
 
 
 def test_mask_hides_pixels_regardless_of_their_colors(device, rng):

@@ -108,15 +108,15 @@ def rms(values: np.ndarray) -> float:
 
 def test_known_exposures_are_found_again(rng, info):
     truth = draw_gains(rng, 0.25, 0.05)
-    found = Capture(rng, info, truth).learned(rng)
+    result = Capture(rng, info, truth).learned(rng)
     assert rms(truth) > 0.15
-    assert rms(found - truth) < 0.02
-    assert found @ LUMINANCE == pytest.approx(truth @ LUMINANCE, abs=0.04)
+    assert rms(result - truth) < 0.02
+    assert result @ LUMINANCE == pytest.approx(truth @ LUMINANCE, abs=0.04)
 
 
 def test_images_of_equal_exposure_stay_equal(rng, info):
-    found = Capture(rng, info, np.zeros((VIEWS, 3))).learned(rng)
-    assert rms(found @ LUMINANCE) < 0.01
+    result = Capture(rng, info, np.zeros((VIEWS, 3))).learned(rng)
+    assert rms(result @ LUMINANCE) < 0.01
 
 
 def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
@@ -126,11 +126,11 @@ def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
     truth -= truth.mean(axis=0)
     capture = Capture(rng, info, truth, bright=1.0)
     assert capture.white > 0.05
-    found = capture.learned(rng)
-    assert rms(found - truth) < 0.03
+    result = capture.learned(rng)
+    assert rms(result - truth) < 0.03
     model = capture.model.gaussians.get("sh_base")
-    seen = np.abs(model - capture.colors).max(axis=1) < 0.25
-    assert np.median((model - capture.colors)[seen]) == pytest.approx(0, abs=0.03)
+    visible = np.abs(model - capture.colors).max(axis=1) < 0.25
+    assert np.median((model - capture.colors)[visible]) == pytest.approx(0, abs=0.03)
 
 
 def test_grids_find_known_exposures_too(rng, info):
@@ -139,11 +139,11 @@ def test_grids_find_known_exposures_too(rng, info):
     capture = Capture(rng, info, truth)
     trainer = capture.trained(rng, GridState(BilateralGrid(), NAMES, capture.rasterizer.device))
     assert capture.fit(trainer) > 45
-    found = []
+    results = []
     for number, photograph in enumerate(capture.photographs):
         own, image = capture.rendered(photograph.camera), capture.shown(trainer, number)
-        found.append(np.log(np.diag(Gain().fit_matrix(own.reshape(-1, 3), image.reshape(-1, 3)))))
-    assert rms(np.array(found) - truth) < 0.02
+        results.append(np.log(np.diag(Gain().fit_matrix(own.reshape(-1, 3), image.reshape(-1, 3)))))
+    assert rms(np.array(results) - truth) < 0.02
 
 
 def test_grids_follow_a_local_tone_mapping_that_gains_cannot(rng, info):

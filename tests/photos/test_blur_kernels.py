@@ -21,19 +21,19 @@ SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2),
 def test_blur_matches_the_reference(device, rng, width, height, sigma, share):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     mask = None if share is None else rng.random((height, width)) < share
-    found = colors_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
-    np.testing.assert_allclose(found, blur(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
+    colors = colors_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(colors, blur(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
 
 
 def test_pixel_without_counted_neighbors_is_unchanged(device, rng):
     image = rng.uniform(0, 1, (3, 20, 40)).astype(np.float32)
     mask = np.zeros((20, 40), bool)
     mask[10, 5] = True
-    found = colors_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
+    colors = colors_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
     near = np.zeros((20, 40), bool)
     near[7:14, 2:9] = True
-    np.testing.assert_array_equal(found[:, ~near], image[:, ~near])
-    np.testing.assert_allclose(found[:, near], np.broadcast_to(image[:, 10, 5, None], (3, 49)), rtol=1e-6)
+    np.testing.assert_array_equal(colors[:, ~near], image[:, ~near])
+    np.testing.assert_allclose(colors[:, near], np.broadcast_to(image[:, 10, 5, None], (3, 49)), rtol=1e-6)
 
 
 @on_devices("masked", [False, True])
@@ -42,8 +42,8 @@ def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
     mask = rng.random((18, 33)) < 0.5 if masked else None
     if mask is not None:
         image[:, ~mask] = 0
-    found = colors_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
-    np.testing.assert_allclose(found, 0.75, rtol=1e-6)
+    colors = colors_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(colors, 0.75, rtol=1e-6)
 
 
 def test_zero_sigma_leaves_the_image(device, rng):
@@ -61,10 +61,10 @@ def test_zero_sigma_leaves_the_image(device, rng):
 def test_mean_filter_matches_the_reference(device, rng, share, reach, masked):
     image = rng.uniform(0, 1, (3, 17, 20)).astype(np.float32)
     mask = rng.random((17, 20)) < 0.5 if masked else None
-    found = colors_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
+    colors = colors_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
     if reach == 0:
-        np.testing.assert_array_equal(found, image)
-    np.testing.assert_allclose(found, masked_mean(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)
+        np.testing.assert_array_equal(colors, image)
+    np.testing.assert_allclose(colors, masked_mean(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(("recipe", "end"), [("opti3dgs", 12000), ("opti3dgs_7k", 2800)])

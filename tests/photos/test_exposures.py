@@ -31,11 +31,11 @@ def table(exposures: Exposures) -> np.ndarray:
 
 def test_gains_are_recovered(rng):
     wall = Wall(rng)
-    found = wall.measured()
-    assert table(found) == pytest.approx(wall.log_gains, abs=2e-3)
-    assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
-    assert found.explained_variance > 0.95
-    assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
+    result = wall.measured()
+    assert table(result) == pytest.approx(wall.log_gains, abs=2e-3)
+    assert result.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
+    assert result.explained_variance > 0.95
+    assert f"exposures of 8 photographs differ by {result.spread:.1%} at 400 points" in result.text
 
 
 def test_exif_fills_in_for_photographs_without_tracks(rng):
@@ -47,14 +47,14 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
     assert shown.log_gains.keys() == {f"{i}.png" for i in (0, 1, 3, 4, 6, 7)}
     truth = dict(zip(seen, wall.log_gains, strict=True))
     told = Exposures({name: truth[name] + 0.7 for name in ("0.png", "2.png", "3.png", "5.png")}, "as noted")
-    found = complete_exposures(shown, told)
-    assert found.log_gains.keys() == truth.keys()
+    result = complete_exposures(shown, told)
+    assert result.log_gains.keys() == truth.keys()
     for name, gains in truth.items():
-        assert found.log_gains[name] == pytest.approx(gains, abs=3e-3)
-    assert table(found).mean(axis=0) == pytest.approx(0, abs=1e-12)
-    assert found.text.startswith("exposures of 8 photographs differ by")
-    assert found.text.endswith(", those of 2 as noted")
-    assert found.explained_variance == shown.explained_variance
+        assert result.log_gains[name] == pytest.approx(gains, abs=3e-3)
+    assert table(result).mean(axis=0) == pytest.approx(0, abs=1e-12)
+    assert result.text.startswith("exposures of 8 photographs differ by")
+    assert result.text.endswith(", those of 2 as noted")
+    assert result.explained_variance == shown.explained_variance
 
 
 class Photograph:
@@ -83,16 +83,16 @@ def test_run_starts_from_tracks_and_exif(rng, tmp_path):
         photographs=SimpleNamespace(get=lambda view: Photograph(load_image(view)[..., :3])),
         status=SimpleNamespace(counted=lambda views, *_: views),
     )
-    found = estimate_exposures(run)
-    assert found.text.endswith("those of 1 by EXIF")
-    assert found.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
+    result = estimate_exposures(run)
+    assert result.text.endswith("those of 1 by EXIF")
+    assert result.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
 
 
 def test_unusable_exif_leaves_the_gains_of_tracks(rng):
     shown = Wall(rng).measured()
     apart = Exposures({"other.png": np.zeros(3)}, "as noted")
-    for told in (UNKNOWN, Exposures(dict(shown.log_gains), "as noted"), apart):
-        assert complete_exposures(shown, told) is shown
+    for message in (UNKNOWN, Exposures(dict(shown.log_gains), "as noted"), apart):
+        assert complete_exposures(shown, message) is shown
     assert complete_exposures(Exposures({}, "at 0 points"), apart) is apart
 
 
@@ -135,9 +135,9 @@ def test_view_dependent_light_is_not_exposure(rng):
         wall.colors = glossy[view.name]
         return Wall.photograph(wall, view)
 
-    found = measure_exposures(wall.tracks, wall.views, lambda view: (photograph(view), None))
-    assert found.explained_variance < 0.1
-    assert found.spread < 0.05
+    exposures = measure_exposures(wall.tracks, wall.views, lambda view: (photograph(view), None))
+    assert exposures.explained_variance < 0.1
+    assert exposures.spread < 0.05
 
 
 def test_undetermined_gains_are_omitted(rng):
@@ -189,6 +189,6 @@ def test_undistorted_scenes_keep_tracks(rng, tmp_path):
     wall.write(tmp_path / "scene")
     assert undistort_scene(tmp_path / "scene", tmp_path / "out", long_side=32) == 3
     scene = read_scene(tmp_path / "out", holdout=0)
-    found = measure_exposures(scene.tracks, scene.views, lambda view: (load_image(view), None))
+    exposures = measure_exposures(scene.tracks, scene.views, lambda view: (load_image(view), None))
     assert scene.views[0].camera.width == 32
-    assert table(found) == pytest.approx(wall.log_gains, abs=0.1), "squares of 1.5 px"
+    assert table(exposures) == pytest.approx(wall.log_gains, abs=0.1), "squares of 1.5 px"

@@ -23,10 +23,10 @@ def any_device(info: DeviceInfo) -> Device:
 def test_live_buffers_are_counted(device):
     gc.collect()
     before = device.allocated
-    one, two = device.empty(1000), device.zeros((3, 500), np.uint32)
+    first, two = device.empty(1000), device.zeros((3, 500), np.uint32)
     assert device.allocated - before == 4032 + 6016  # whole lines of 64 bytes
     assert device.peak >= device.allocated
-    del one
+    del first
     assert device.allocated - before == 6016
     del two
     assert device.allocated == before
@@ -52,9 +52,9 @@ def test_photograph_has_the_camera_of_the_requested_view(any_device, tiny_scene,
         view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + np.float64([0, 0, 0, 0.1])
     )
     photographs = Photographs(any_device, "white", budget=kept << 20)
-    for one in (other, view, other):
-        expected = upload_camera(any_device, one)
-        for camera in (photographs.get(one).camera, photographs.camera(one)):
+    for item in (other, view, other):
+        expected = upload_camera(any_device, item)
+        for camera in (photographs.get(item).camera, photographs.camera(item)):
             assert camera.values == expected.values
             np.testing.assert_array_equal(camera.array.get(), expected.array.get())
 

@@ -66,12 +66,12 @@ def test_view_settings_change_training_except_defaults(tiny_scene, few_steps, tm
     same = "{order: {type: uniform}, resolution: 1.0, transforms: [{type: blur, sigma: 0.0}]}"
     train(tiny_scene, tmp_path / "same", *FEW, f"optimize.views={same}")
     assert digest(tmp_path / "same") == digest(few_steps)
-    found = {digest(few_steps)}
+    actual = {digest(few_steps)}
     for name, setting in (("resolution", RESOLUTION), ("blur", BLUR), ("order", "optimize.views.order=shuffle")):
         run = train(tiny_scene, tmp_path / name, *FEW, setting)
-        found.add(digest(tmp_path / name))
+        actual.add(digest(tmp_path / name))
         assert run.metrics["test"].keys() == {"1"}, "what is measured keeps its size"
-    assert len(found) == 4
+    assert len(actual) == 4
 
 
 def masked_everywhere(source: Path, out: Path, name: str) -> Path:

@@ -38,10 +38,10 @@ def test_image_gradient(device, rng, width, height):
         rows=camera.rows,
         stride=camera.stride,
     )
-    found = magnitude.get()
-    np.testing.assert_allclose(found[:height, :width], magnitude_of(image), atol=1e-6)
-    found[:height, :width] = 0
-    assert (found == 0).all()
+    result = magnitude.get()
+    np.testing.assert_allclose(result[:height, :width], magnitude_of(image), atol=1e-6)
+    result[:height, :width] = 0
+    assert (result == 0).all()
 
 
 @on_devices("width, height", SIZES)
@@ -50,7 +50,7 @@ def test_masked_pixels_have_no_texture(device, rng, width, height):
     camera, workspace = make_camera(device, width, height), Workspace(device)
     mask = rng.random((height, width)) < 0.9
     known = ndimage.minimum_filter(mask, 3, mode="nearest")
-    found = []
+    results = []
     for filling in (rng.integers(0, 256, (3, height, width)) for _ in range(2)):
         pixels = np.where(mask, np.arange(3 * width * height).reshape(3, height, width) * 37 % 256, filling)
         photograph = Photograph(
@@ -62,10 +62,10 @@ def test_masked_pixels_have_no_texture(device, rng, width, height):
         np.testing.assert_allclose(texture[:height, :width], expected, atol=1e-6)
         texture[:height, :width] = 0
         assert (texture == 0).all()
-        found.append(texture_quantile(workspace, [photograph], 0.5))
-    assert found[0] == found[1]
+        results.append(texture_quantile(workspace, [photograph], 0.5))
+    assert results[0] == results[1]
     if known.any():
-        assert found[0] == pytest.approx(
+        assert results[0] == pytest.approx(
             np.quantile(magnitude_of(pixels / 255)[known], 0.5, method="inverted_cdf"), abs=3e-4
         )
 
@@ -92,5 +92,5 @@ def test_sample_at_projected_means(device, rng, count):
         )
     x, y = frame.splats.get()[:count, :2].T
     column, row = np.clip(x, 0, 39).astype(int), np.clip(y, 0, 29).astype(int)
-    seen = frame.radius.get()[:count] > 0
-    np.testing.assert_allclose(total.get()[:count], 2 * np.maximum(magnitude[row, column], 0) * seen, rtol=1e-6)
+    visible = frame.radius.get()[:count] > 0
+    np.testing.assert_allclose(total.get()[:count], 2 * np.maximum(magnitude[row, column], 0) * visible, rtol=1e-6)

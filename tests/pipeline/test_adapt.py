@@ -68,9 +68,9 @@ def test_photos_recipe_adapts_to_image_count_and_sky(photographs, sky, most):
 
 
 def test_photos_recipe_shortens_schedules_with_steps():
-    asked = load("photos")
-    short = replace(asked, settings=stretch_to_steps(asked.settings, 1700))
-    modules = {one.type: one for one in apply_adaptation(short, Measures(9, 2.0)).settings.optimize.modules}
+    pipeline = load("photos")
+    short = replace(pipeline, settings=stretch_to_steps(pipeline.settings, 1700))
+    modules = {module.type: module for module in apply_adaptation(short, Measures(9, 2.0)).settings.optimize.modules}
     assert at_step(modules["dropout"].probability, 730) == 0.2
     assert (modules["camera_optimizer"].start, modules["exposure"].min_spread) == (250, 0.03)
 
@@ -86,14 +86,14 @@ def test_photos_recipe_shortens_schedules_with_steps():
 )
 def test_set_key_is_not_adapted(override, kept, tmp_path):
     """Around a key of a decision or inside of it; also where a run has decided."""
-    found = adapted_pipeline("smoke", ADAPT, override)
-    assert found.settings.adapt.keep == kept
-    assert not {one.key for one in found.decisions} & {*kept}
+    result = adapted_pipeline("smoke", ADAPT, override)
+    assert result.settings.adapt.keep == kept
+    assert not {decision.key for decision in result.decisions} & {*kept}
     (tmp_path / "run.yaml").write_text(adapted_pipeline("smoke", ADAPT).text())
     again = load(str(tmp_path / "run.yaml"), [override])
     assert (again.settings.adapt.keep, again.undecided) == (kept, [])
-    assert [one.key for one in again.decisions] == [one.key for one in found.decisions]
-    assert again.settings.model == found.settings.model
+    assert [decision.key for decision in again.decisions] == [decision.key for decision in result.decisions]
+    assert again.settings.model == result.settings.model
 
 
 @pytest.mark.parametrize("override", ["adapt.keep=[model.near]", "adapt.decisions=[{key: seed, value: 3, reason: x}]"])
@@ -119,7 +119,7 @@ def test_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=[*FEW, ADAPT])
     assert "INFO 8 photographs\n" in (out / "log.txt").read_text()
     written = load(str(out / "pipeline.yaml"))
-    assert [one.key for one in written.decisions] == ["model.sh_degree", "optimize.modules.dropout"]
+    assert [decision.key for decision in written.decisions] == ["model.sh_degree", "optimize.modules.dropout"]
     assert written.settings.plugins.keys() == {"counted"}
     plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "optimize.modules.dropout.probability=0.1")
     assert digest(plain.out) == digest(out)
@@ -133,10 +133,10 @@ def test_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
 
 
 def test_undecided_keys_are_listed_before_preparation():
-    found = clsplat.check("photos")
-    assert found["adapts"][:2] == ["init.transparent", "init.count"]
+    result = clsplat.check("photos")
+    assert result["adapts"][:2] == ["init.transparent", "init.count"]
     assert clsplat.check("fast")["adapts"] == []
-    assert load("photos", ["init.count=3"]).undecided == [key for key in found["adapts"] if key != "init.count"]
+    assert load("photos", ["init.count=3"]).undecided == [key for key in result["adapts"] if key != "init.count"]
     assert load("photos", ["adapt=null"]).undecided == []
 
 

@@ -21,11 +21,11 @@ from tests.support.pipelines import SCHEDULED
 def edits(training: Training, recipe: Training) -> list[tuple[int, int]]:
     """The step and the place in the list of each edit, but for those that the recipe makes at each step, in order; the
     size of photographs that follows from their detail changes before all."""
-    found = [(int(step), -1) for step in training.views.changes]
+    actual = [(int(step), -1) for step in training.views.changes]
     for place, stage in enumerate(training.during):
         if stage.edits and recipe.during[place].every != 1:
-            found += [(step, place) for step in range(1, training.steps) if stage.is_due(step)]
-    return sorted(found)
+            actual += [(step, place) for step in range(1, training.steps) if stage.is_due(step)]
+    return sorted(actual)
 
 
 @functools.cache
@@ -68,8 +68,8 @@ def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     steps = data.draw(st.integers(1, min_steps(recipe.training)))
     factor = Axis.from_factor(Fraction(steps, recipe.training.steps)).factor
     old, new = (
-        {(step, place) for step, place in one if place != -1}  # at least one change of the size stays
-        for one in (old, edits(stretch_to_steps(recipe, steps).training, recipe.training))
+        {(step, place) for step, place in item if place != -1}  # at least one change of the size stays
+        for item in (old, edits(stretch_to_steps(recipe, steps).training, recipe.training))
     )
     assert new == {(math.floor(step * factor), place) for step, place in old if step * factor >= 1}
 

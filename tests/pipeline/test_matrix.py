@@ -23,14 +23,14 @@ def write(tmp_path):
 
 
 def test_cells_of_a_file_with_stages(write):
-    found = load_experiment(write(SMALL))
-    assert names(found) == [
+    experiment = load_experiment(write(SMALL))
+    assert names(experiment) == [
         "steps=4-opacity=0.1-seed=0",
         "steps=4-opacity=0.1-seed=1",
         "steps=6-opacity=0.1-seed=0",
         "steps=6-opacity=0.1-seed=1",
     ]
-    settings = [cell.pipeline.settings for cell in found.cells]
+    settings = [cell.pipeline.settings for cell in experiment.cells]
     assert [(s.stages[1].steps, s.seed) for s in settings] == [(4, 0), (4, 1), (6, 0), (6, 1)]
     assert all(s.name == "sweep" for s in settings)
 
@@ -38,12 +38,12 @@ def test_cells_of_a_file_with_stages(write):
 def test_cells_of_pipelines_and_scenes(write, tmp_path):
     other = write("name: other\n" + STAGES, "other.yaml")
     scenes = [str(tmp_path / "a" / "images"), str(tmp_path / "b" / "images")]
-    found = load_experiment(
+    experiment = load_experiment(
         write(f"name: both\nmatrix:\n  pipelines: [smoke, {other}]\n  scenes: {json.dumps(scenes)}\n")
     )
-    assert names(found) == ["smoke-a-images", "smoke-b-images", "other-a-images", "other-b-images"]
-    assert [cell.pipeline.settings.scene.path for cell in found.cells] == scenes * 2
-    assert [cell.pipeline.settings.name for cell in found.cells] == ["smoke", "smoke", "other", "other"]
+    assert names(experiment) == ["smoke-a-images", "smoke-b-images", "other-a-images", "other-b-images"]
+    assert [cell.pipeline.settings.scene.path for cell in experiment.cells] == scenes * 2
+    assert [cell.pipeline.settings.name for cell in experiment.cells] == ["smoke", "smoke", "other", "other"]
 
 
 def test_cells_with_other_step_counts(write):
@@ -84,16 +84,16 @@ def test_ambiguous_short_keys_are_distinguished(write):
 
 def test_values_that_are_lists_or_text(write):
     text = "name: s\nmatrix: {set: {evaluate.downscales: [[1], [1, 2]], init.source: [auto, random]}}\n" + STAGES
-    found = load_experiment(write(text))
-    assert names(found)[:2] == ["downscales=1-source=auto", "downscales=1-source=random"]
-    assert names(found)[3] == "downscales=1+2-source=random"
-    assert found.cells[3].pipeline.settings.stages[2].downscales == [1, 2]
+    experiment = load_experiment(write(text))
+    assert names(experiment)[:2] == ["downscales=1-source=auto", "downscales=1-source=random"]
+    assert names(experiment)[3] == "downscales=1+2-source=random"
+    assert experiment.cells[3].pipeline.settings.stages[2].downscales == [1, 2]
 
 
 def test_options_reach_every_cell(write):
-    found = load_experiment(write(SMALL), ["optimize.log_every=3", "scene.downscale=2"])
-    assert {cell.pipeline.settings.stages[1].log_every for cell in found.cells} == {3}
-    assert {cell.pipeline.settings.scene.downscale for cell in found.cells} == {2}
+    experiment = load_experiment(write(SMALL), ["optimize.log_every=3", "scene.downscale=2"])
+    assert {cell.pipeline.settings.stages[1].log_every for cell in experiment.cells} == {3}
+    assert {cell.pipeline.settings.scene.downscale for cell in experiment.cells} == {2}
 
 
 def test_files_without_a_matrix_are_pipelines(write):

@@ -90,7 +90,7 @@ def kinds_of(node: object) -> set[str]:
 
 def test_representative_recipes_cover_all_kinds():
     kinds = {name: kinds_of(shipped(name).settings.model_dump(mode="json")) for name in SHIPPED}
-    trained = [found for found in kinds.values() if "optimize" in found]
+    trained = [value for value in kinds.values() if "optimize" in value]
     assert set().union(*trained) - set().union(*(kinds[name] for name in KINDS)) == set()
 
 
@@ -133,7 +133,7 @@ def rules(stage: str, **keys: str) -> set[str]:
     return {
         f"{stage}.rules.{rule}{key}"
         for rule, named in keys.items()
-        for key in ("", *(f".{one}" for one in named.split()))
+        for key in ("", *(f".{item}" for item in named.split()))
     }
 
 
@@ -263,10 +263,10 @@ DIFFERENCES = {
 
 
 def test_recipes_differ_only_as_their_headers_state():
-    found = {pair: changes(*pair) for pair in DIFFERENCES}
+    actual = {pair: changes(*pair) for pair in DIFFERENCES}
     faults = [
         f"{base}-{recipe}: {sorted(places ^ DIFFERENCES[base, recipe])}"
-        for (base, recipe), places in found.items()
+        for (base, recipe), places in actual.items()
         if places != DIFFERENCES[base, recipe]
     ]
     assert not faults, "\n".join(faults)

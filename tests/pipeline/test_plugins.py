@@ -142,10 +142,10 @@ def test_exception_of_a_plugin_names_its_file_and_line(tmp_path):
     try:
         variants(Rule)["raising"]().mark(None)
     except ZeroDivisionError as error:
-        found = as_clsplat_error(error)
+        result = as_clsplat_error(error)
     line = text.splitlines().index("        1 / 0") + 1
-    assert str(found) == f"{path}:{line}: ZeroDivisionError: division by zero"
-    assert found.exit_code == 2
+    assert str(result) == f"{path}:{line}: ZeroDivisionError: division by zero"
+    assert result.exit_code == 2
 
 
 def test_plugin_output_does_not_reach_stdout(tmp_path, capsys):
@@ -216,8 +216,8 @@ def install(tmp_path, monkeypatch):
         for name, text in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text)
-        found = [EntryPoint(name, module, plugins.GROUP) for name, module in entries.items()]
-        monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+        actual = [EntryPoint(name, module, plugins.GROUP) for name, module in entries.items()]
+        monkeypatch.setattr(plugins, "entry_points", lambda group: actual)
 
     monkeypatch.syspath_prepend(str(folder))
     yield install
@@ -346,9 +346,9 @@ def replace_public_imports(text: str) -> str:
     """Replace imports from clsplat.plugin by those from the modules that define the names."""
     plugin = ast.parse((ROOT / "clsplat" / "plugin.py").read_text("utf-8"))
     places = {name.name: node.module for node in plugin.body if isinstance(node, ast.ImportFrom) for name in node.names}
-    found = re.search(r"^from clsplat.plugin import (.+)\n", text, re.M)
-    lines = [f"from {places[name]} import {name}\n" for name in found[1].split(", ")]
-    return text.replace(found[0], "".join(lines))
+    match = re.search(r"^from clsplat.plugin import (.+)\n", text, re.M)
+    lines = [f"from {places[name]} import {name}\n" for name in match[1].split(", ")]
+    return text.replace(match[0], "".join(lines))
 
 
 def test_plugin_gives_the_bits_of_built_in_code(tiny_scene, tmp_path):
@@ -409,13 +409,13 @@ def test_comparison_lists_missing_plugins(tiny_scene, tmp_path, caplog):
 def imported(text: str) -> set[str]:
     """The modules of clsplat that a text of Python imports."""
     nodes = list(ast.walk(ast.parse(text)))
-    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    actual = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module == "clsplat":
-            found |= {f"clsplat.{alias.name}" for alias in node.names}
+            actual |= {f"clsplat.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found.add(node.module or "")
-    return {name for name in found if name.partition(".")[0] == "clsplat"}
+            actual.add(node.module or "")
+    return {name for name in actual if name.partition(".")[0] == "clsplat"}
 
 
 def test_examples_and_docs_import_only_the_public_module():
@@ -424,7 +424,7 @@ def test_examples_and_docs_import_only_the_public_module():
     for path in EXAMPLES.rglob("*.ipynb"):
         cells = json.loads(path.read_text("utf-8"))["cells"]
         texts[path.name] = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    faults = {name: found for name, text in texts.items() if (found := imported(text) - allowed)}
+    faults = {name: actual for name, text in texts.items() if (actual := imported(text) - allowed)}
     page = (ROOT / "docs" / "extending.md").read_text("utf-8")
     assert '--8<-- "clsplat/' not in page, "the package's own files import other modules"
     dotted = set(re.findall(r"clsplat\.(\w+)\.\w+", page)) - {"plugin", "schema"}

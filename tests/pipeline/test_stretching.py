@@ -20,7 +20,7 @@ STEPS = ("steps", "start", "stop", "over", "until", "every")
 def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
     pipeline = load(name)
     old, new = (
-        flat(one.resolved()) for one in (pipeline, replace(pipeline, settings=stretch(pipeline.settings, factor)))
+        flat(item.resolved()) for item in (pipeline, replace(pipeline, settings=stretch(pipeline.settings, factor)))
     )
     assert old.keys() == new.keys()
     return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
@@ -40,8 +40,8 @@ def test_stretched_long_recipe_equals_the_short_one():
 @pytest.mark.parametrize("name", KINDS)
 def test_only_steps_change_and_all_of_them(name):
     """What acts at multiples of a cadence ends one step after the last; a rate of what is learned falls."""
-    found = changes(name, 2.0)
-    for place, (old, new) in found.items():
+    result = changes(name, 2.0)
+    for place, (old, new) in result.items():
         if isinstance(old, list):
             assert new == [[2 * step, value] for step, value in old], place
         elif place.endswith(".haar.rate"):
@@ -54,7 +54,7 @@ def test_only_steps_change_and_all_of_them(name):
         for place, value in flat(load(name).resolved()).items()
         if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
     ]
-    assert set(stretchable) <= found.keys()
+    assert set(stretchable) <= result.keys()
 
 
 @pytest.mark.parametrize(

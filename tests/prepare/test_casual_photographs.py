@@ -113,7 +113,7 @@ def test_photographs_share_cameras_by_size_and_lens(tmp_path, cameras, groups, c
     if cameras == "auto":
         shared = {image.name: image.camera_id for image in images}
         assert shared["0.jpg"] == shared["2.jpg"] != shared["1.jpg"] == shared["3.jpg"]
-        assert {(one.width, one.height) for one in cameras_found} == {(96, 72), (72, 96)}
+        assert {(item.width, item.height) for item in cameras_found} == {(96, 72), (72, 96)}
         assert (
             "2 photographs have no lens data in EXIF, so those of the same size share a camera (1 camera" in caplog.text
         )
@@ -213,8 +213,8 @@ def matched(tmp_path: Path) -> MatchGraph:
 
 
 def test_each_unregistered_photograph_has_a_reason(tmp_path):
-    found = explain_unplaced(matched(tmp_path), [{"a", "b", "c"}])
-    assert found == {
+    result = explain_unplaced(matched(tmp_path), [{"a", "b", "c"}])
+    assert result == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
         "elsewhere": "matches no other photograph; it may be blurred",
@@ -229,7 +229,7 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
         explain_unplaced(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"]
         == "in another model, with other"
     )
-    figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
+    figures = {"registered": 3, "not_registered": ["plain"], "reasons": result, "other_models": [2]}
     missing, others = warnings_for(figures)
     assert "1 of 4 photographs could not be placed and are not used: plain (only 40 features: blurred" in missing
     assert missing.endswith("viewpoints in between, or find more features (find_features.long_side)")
@@ -243,14 +243,14 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
 
 
 def test_failed_mapping_is_described_by_groups(tmp_path):
-    found = matched(tmp_path)
-    assert diagnose(found) == (
+    result = matched(tmp_path)
+    assert diagnose(result) == (
         "they do not connect: 2 groups with good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
         "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
     )
-    joined = replace(found, pairs={**found.pairs, ("a", "pair"): 30})
+    joined = replace(result, pairs={**result.pairs, ("a", "pair"): 30})
     assert diagnose(joined).startswith("take more sharp photographs"), "seven of twelve belong together"
-    weak = replace(found, pairs={("a", "b"): 20, ("b", "c"): 29})
+    weak = replace(result, pairs={("a", "b"): 20, ("b", "c"): 29})
     assert diagnose(weak).startswith("no two of them overlap enough: 29 matches at most; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
     assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
@@ -268,8 +268,8 @@ def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
         cv2.imwrite(str(tmp_path / "photographs" / name), pixels)
     find_features(tmp_path / "photographs", tmp_path / "features", FeatureOptions(700, 3000))
     match_features(tmp_path / "features", tmp_path / "matches")
-    found = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
-    assert explain_unplaced(found, [{"0.png", "1.png", "2.png"}]) == {
+    result = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
+    assert explain_unplaced(result, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
         "elsewhere.png": "matches no other photograph; it may be blurred",
     }
@@ -417,11 +417,11 @@ def test_unrelated_photographs_are_not_searched_again(tmp_path, dense, monkeypat
 )
 def test_unrelated_photographs_are_detected(tmp_path, features, pairs, expected):
     """Ten photographs; however few matches a pair has."""
-    found = MatchGraph(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
-    assert found.has_unrelated_photographs() == expected
+    graph = MatchGraph(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
+    assert graph.has_unrelated_photographs() == expected
 
 
 @pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
 def test_photographs_are_related_if_two_of_few_match(tmp_path, names, pairs):
-    found = MatchGraph(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
-    assert not found.has_unrelated_photographs()
+    graph = MatchGraph(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
+    assert not graph.has_unrelated_photographs()

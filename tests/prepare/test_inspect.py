@@ -451,13 +451,13 @@ def test_command_line(scene, tmp_path):
 
 
 def test_json_and_the_exit_code(scene):
-    found = json.loads(clsplat("inspect", scene, "--json").stdout)
-    assert (found["trainable"], found["verdict"], found["facts"]["registered"]) == (True, "ready to train", 24)
+    data = json.loads(clsplat("inspect", scene, "--json").stdout)
+    assert (data["trainable"], data["verdict"], data["facts"]["registered"]) == (True, "ready to train", 24)
     (scene / "images" / "03.png").unlink()
     done = clsplat("inspect", scene, "--json", expect=3)
-    found = json.loads(done.stdout)
-    assert not found["trainable"]
-    assert [finding["level"] for finding in found["findings"]] == ["error"]
+    data = json.loads(done.stdout)
+    assert not data["trainable"]
+    assert [finding["level"] for finding in data["findings"]] == ["error"]
     assert done.stderr.startswith("error: cannot train: 1 of 24")
 
 

@@ -158,9 +158,9 @@ def test_brightness_step_is_a_hint_without_exif_exposure(tmp_path):
     (note,) = texts(Inspection.from_folder(tmp_path), "note")
     assert note.startswith("1 photograph is more than twice as bright or dark as the one before (1.png to 2.png: 0.45")
     told = CameraExposure(0.01, 2.0, 100.0)
-    found = compare_photos(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
-    assert not found.steps
-    assert [(a, b) for a, b, _ in found.jumps] == [("1.png", "2.png"), ("2.png", "3.png")]
+    result = compare_photos(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
+    assert not result.steps
+    assert [(a, b) for a, b, _ in result.jumps] == [("1.png", "2.png"), ("2.png", "3.png")]
     assert [(a, b) for a, b, _ in compare_photos(files, {"1.png": told}).steps] == [("1.png", "2.png")], (
         "one alone tells none"
     )

@@ -87,14 +87,14 @@ def test_steps_after_a_change_are_redone(photos, tmp_path):
 
 def test_plan_gives_reasons(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    assert [one.why for one in plan(steps, photos, root)] == ["no result yet"] * 2
+    assert [item.why for item in plan(steps, photos, root)] == ["no result yet"] * 2
     run_steps(steps, photos, root)
-    assert [one.why for one in plan(steps, photos, root)] == ["", ""]
+    assert [item.why for item in plan(steps, photos, root)] == ["", ""]
     changed = plan([steps[0], Copy(letter="z")], photos, root)
-    assert [one.why for one in changed] == ["", "letter is z, was b"]
+    assert [item.why for item in changed] == ["", "letter is z, was b"]
     (photos / "p.txt").write_text("P")
     assert plan(steps, photos, root)[0].why == "letter is a, was b"  # the newest of that step
-    assert [one.why for one in plan(steps[1:], photos, root)] == ["its input has changed"]
+    assert [item.why for item in plan(steps[1:], photos, root)] == ["its input has changed"]
 
 
 def test_missing_intermediate_results_are_not_redone(photos, tmp_path):
@@ -132,7 +132,7 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     caplog.set_level("INFO")
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     run_steps(steps, photos, root)
-    last = next(one.folder for one in plan(steps, photos, root) if one.step.letter == "b")
+    last = next(item.folder for item in plan(steps, photos, root) if item.step.letter == "b")
     damaged = "record.json" if fault in ("no record", "no JSON", "a list") else "x.txt"
     (last / damaged).unlink()
     if fault == "a folder":
@@ -141,7 +141,7 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
         (last / damaged).write_text({"no JSON": "{", "a list": "[]"}.get(fault, ""))
     why = {"a file less": "x.txt is missing", "an empty file": "x.txt was changed", "a folder": "x.txt is missing"}
     why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is recomputed"
-    assert [one.why for one in plan(steps, photos, root)] == ["", why]
+    assert [item.why for item in plan(steps, photos, root)] == ["", why]
     assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
     assert run_steps(steps, photos, root) == ("pab", ["b"])
     assert f"copy runs again: {why}" in caplog.messages
@@ -169,10 +169,10 @@ Settings.subclasses.remove(Linked)
 def test_result_without_its_images_is_redone(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Linked(letter="a"), Linked(letter="b")]
     prepare(plan(steps, photos, root), photos, root)
-    assert [one.why for one in plan(steps, photos, root)] == ["", ""]
+    assert [item.why for item in plan(steps, photos, root)] == ["", ""]
     shutil.rmtree(plan(steps, photos, root)[0].folder)
     planned = plan(steps, photos, root)
-    assert [one.why for one in planned] == ["letter is a, was b", "images/p.txt is missing; the result is recomputed"]
+    assert [item.why for item in planned] == ["letter is a, was b", "images/p.txt is missing; the result is recomputed"]
     assert (prepare(planned, photos, root) / "images" / "p.txt").read_text() == "p"
     assert Linked.calls == ["a", "b", "a"], "the link of the second leads to images again"
 
@@ -185,7 +185,7 @@ def test_results_moved_with_their_photographs_are_complete(tmp_path):
     prepare(plan(steps, photos, root), photos, root)
     (tmp_path / "work").rename(tmp_path / "moved")
     planned = plan(steps, tmp_path / "moved" / "photos", tmp_path / "moved" / "runs" / "prepared")
-    assert [one.why for one in planned] == ["", "", ""]
+    assert [item.why for item in planned] == ["", "", ""]
     assert (planned[-1].folder / "images" / "p.txt").read_text() == "p"
 
 
@@ -245,7 +245,7 @@ def test_record_left_by_a_killed_call_is_not_part_of_the_result(photos, tmp_path
     left.mkdir(parents=True)
     (left / "record.json").write_text("{}")  # killed between the record and the renaming
     prepare(plan(steps, photos, root), photos, root)
-    assert [one.why for one in plan(steps, photos, root)] == [""]
+    assert [item.why for item in plan(steps, photos, root)] == [""]
 
 
 def test_partial_results_of_other_photographs_are_discarded(photos, tmp_path, monkeypatch):
@@ -341,19 +341,19 @@ def test_run_does_not_resume_with_other_photographs(pipeline, photos, tmp_path):
 
 def test_concurrent_processes_prepare_a_result_once(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
-    (one,) = checked.preparation(tmp_path / "runs" / "a")
+    (first,) = checked.preparation(tmp_path / "runs" / "a")
     other = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3", "find_features.long_side=50"])
-    one.folder.parent.mkdir(parents=True)
-    with lock.lock_folder(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
-        with pytest.raises(OutputError, match=f"{one.folder.name}: is in use by this process"):
+    first.folder.parent.mkdir(parents=True)
+    with lock.lock_folder(first.folder, first.folder.with_name(f".{first.folder.name}.lock")):
+        with pytest.raises(OutputError, match=f"{first.folder.name}: is in use by this process"):
             opening.open_run(checked, tmp_path / "runs" / "a", None)
         opening.open_run(other, tmp_path / "runs" / "c", None)  # another result
     opening.open_run(checked, tmp_path / "runs" / "a", None)
     with lock.lock_folder(
-        one.folder, one.folder.with_name(f".{one.folder.name}.lock")
+        first.folder, first.folder.with_name(f".{first.folder.name}.lock")
     ):  # where all is there, nobody waits
         opening.open_run(checked, tmp_path / "runs" / "b", None)
-    assert not list(one.folder.parent.glob(".*")), "no lock is left"
+    assert not list(first.folder.parent.glob(".*")), "no lock is left"
 
 
 def test_runs_of_different_photographs_prepare_concurrently(pipeline, photos, tmp_path, monkeypatch):

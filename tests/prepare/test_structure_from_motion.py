@@ -62,9 +62,9 @@ def mapped(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return map_photographs(photos, tmp_path_factory.mktemp("placed"))
 
 
-def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def aligned_errors(actual: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Distances after the best similarity transform (Umeyama 1991), [N]."""
-    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    a, b = actual - actual.mean(axis=0), truth - truth.mean(axis=0)
     u, d, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     scale = (d * np.diag(sign)).sum() / (a**2).sum()
@@ -255,9 +255,9 @@ def test_pairs_are_matched_once(photos, mapped, tmp_path):
         opened.execute("create trigger counts after insert on matches begin insert into counted values (1); end")
         opened.commit()
     match_features(source, half)
-    found = rows(half / "database.db")
-    assert len(found.pop("counted")) == 14 * 13 // 2 - 13
-    assert found == rows(whole / "database.db")
+    actual = rows(half / "database.db")
+    assert len(actual.pop("counted")) == 14 * 13 // 2 - 13
+    assert actual == rows(whole / "database.db")
     (tmp_path / "cameras").mkdir()
     map_cameras(half, tmp_path / "cameras")
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
@@ -287,9 +287,9 @@ matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
         opened.commit()
     assert 5 <= kept < 14 * 13 // 2, "it was killed in the middle"
     match_features(source, tmp_path)
-    found = rows(database)
-    assert len(found.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
-    assert found == rows(mapped.parent / "matches" / "database.db")
+    actual = rows(database)
+    assert len(actual.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
+    assert actual == rows(mapped.parent / "matches" / "database.db")
 
 
 def test_counting_pairs_loses_none(mapped, tmp_path, monkeypatch):

@@ -67,8 +67,8 @@ def test_statistics_declare_that_they_read_conics():
 @pytest.mark.parametrize("name", ["a.ply", "a.sog", "a.glb"])
 def test_formats_with_settings_keep_the_box_filter(name, rng, tmp_path, caplog):
     boxed(rng).save(tmp_path / name)
-    found = load(tmp_path / name).rendering
-    assert (found.pixel_box, found.compensate, found.screen_variance) == (1.0, 1.0, 1 / 12)
+    actual = load(tmp_path / name).rendering
+    assert (actual.pixel_box, actual.compensate, actual.screen_variance) == (1.0, 1.0, 1 / 12)
     assert read(tmp_path / name).mode == "mip", "the nearest for programs that know no box"
     assert not caplog.messages
 

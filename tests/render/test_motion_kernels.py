@@ -76,15 +76,15 @@ def test_static_motion_has_the_bits_of_no_motion(device, rng):
     still = np.zeros((65, 5), np.float32)
     still[:, 3], still[:, 4] = rng.uniform(0, 1, 65), STATIC_LOG_DURATION
     moving = replace(case, parameters={**case.parameters, MOTION: still}, view=replace(case.view, time=0.625))
-    found = []
+    results = []
     for one in (case, moving):
         rasterizer, model, camera = Rasterizer(device, "radix"), one.model(device), one.device_camera(device)
         frame = rasterizer.forward(model, camera, device.zeros(3))
         sums = rasterizer.pixel_sums(model, frame, device.upload(np.ones(frame.image.shape, np.float32)))
         gradients = rasterizer.gradients(model, frame, sums)
         radius = frame.radius.get()[:65]
-        found.append([frame.image.get(), radius, *(gradients[name].get()[:, :65] for name in case.parameters)])
-    for one, other in zip(*found, strict=True):
+        results.append([frame.image.get(), radius, *(gradients[name].get()[:, :65] for name in case.parameters)])
+    for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -102,7 +102,7 @@ def test_splitting_matrices_belong_to_the_time_of_the_view(device, rng):
     case = moving_case(rng, 65, motion_width(3, True))
     camera, background = case.device_camera(device), device.zeros(3)
     weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))
-    rasterizer, found = Rasterizer(device, "radix"), []
+    rasterizer, results = Rasterizer(device, "radix"), []
     moment = evaluate_motion(rasterizer.workspace, case.model(device), camera).gaussians
     static = Gaussians(device, {name: moment.get(name) for name in PARAMETERS})
     for model in (case.model(device), replace(case.model(device), gaussians=static)):
@@ -111,6 +111,6 @@ def test_splitting_matrices_belong_to_the_time_of_the_view(device, rng):
         stats = SplatStats(model.gaussians, ("splitting",))
         comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
         stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
-        found.append(model.gaussians.get("stats/splitting"))
-    assert np.abs(found[1]).max() > 0
-    np.testing.assert_array_equal(*found)
+        results.append(model.gaussians.get("stats/splitting"))
+    assert np.abs(results[1]).max() > 0
+    np.testing.assert_array_equal(*results)

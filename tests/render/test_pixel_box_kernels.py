@@ -104,8 +104,8 @@ def test_formula_is_continuous_where_the_axes_swap(rng):
     v = covariance(0.4, 4, 45)
     dx, dy = pixels_around(v, rng)
     by = 1e-9 * np.array([1, 0, -1])
-    one, other = box_response(v + by, dx, dy), box_response(v - by, dx, dy)
-    assert 0 < np.linalg.norm(one - other) < 0.01 * np.linalg.norm(one)
+    first, other = box_response(v + by, dx, dy), box_response(v - by, dx, dy)
+    assert 0 < np.linalg.norm(first - other) < 0.01 * np.linalg.norm(first)
 
 
 def test_reference_gradients_match_finite_differences(rng):
@@ -118,7 +118,7 @@ def test_reference_gradients_match_finite_differences(rng):
 
     gaussians = case.gaussians()
     splats = rendered(gaussians).splats
-    found, _ = render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH)
+    actual, _ = render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH)
     for name in ("means", "quats", "log_scales", "logit_opacity"):
         table = getattr(gaussians, name)
         truth = np.zeros_like(table)
@@ -129,7 +129,7 @@ def test_reference_gradients_match_finite_differences(rng):
                 moved[place] += sign * 1e-5
                 ends.append(np.sum(weights * rendered(replace(gaussians, **{name: moved})).image))
             truth[place] = (ends[0] - ends[1]) / 2e-5
-        assert np.linalg.norm(found[name] - truth) < 1e-4 * np.linalg.norm(truth), name
+        assert np.linalg.norm(actual[name] - truth) < 1e-4 * np.linalg.norm(truth), name
 
 
 def assert_within_bounds(deviations) -> None:

@@ -73,11 +73,11 @@ def test_sky_gradient_matches_the_losses(device, rng, share):
     view = scene.trainer.backward(view)
     skies, sky = scene.trainer.rasterizer.skies, scene.model.sky
     shown = skies.runs(scene.photograph.camera, 8).shown.get()
-    found = scene.trainer.rasterizer.workspace.array("texels", (3, len(shown))).get()
-    places = [(int(np.abs(found[channel]).argmax()), channel) for channel in range(3)]
+    result = scene.trainer.rasterizer.workspace.array("texels", (3, len(shown))).get()
+    places = [(int(np.abs(result[channel]).argmax()), channel) for channel in range(3)]
     for place, channel in places:
         expected = numeric(scene, sky.texels, (channel, int(shown[place])), 0.02)
-        assert found[channel, place] == pytest.approx(expected, rel=0.01, abs=1e-6)
+        assert result[channel, place] == pytest.approx(expected, rel=0.01, abs=1e-6)
 
 
 @on_one_setting
@@ -96,12 +96,12 @@ def test_opacity_gradient_includes_the_cover(device, rng):
     gaussians, rasterizer = scene.model.gaussians, scene.trainer.rasterizer
     view = scene.trainer.backward(scene.trainer.compare(scene.photograph, 1))
     assert {value.name for value in view.losses} == {"l2", "sky"}
-    found = rasterizer.gradients(scene.model, view.frame, view.pixel_sums)["logit_opacity"].get()[0]
+    actual = rasterizer.gradients(scene.model, view.frame, view.pixel_sums)["logit_opacity"].get()[0]
     without = rasterizer.pixel_sums(scene.model, view.frame, view.comparison.gradient)
     plain = rasterizer.gradients(scene.model, view.frame, without)["logit_opacity"].get()[0]
-    row = int(np.abs(found - plain).argmax())
+    row = int(np.abs(actual - plain).argmax())
     expected = numeric(scene, gaussians["logit_opacity"], (0, row), 0.02)
-    assert found[row] == pytest.approx(expected, rel=0.03)
+    assert actual[row] == pytest.approx(expected, rel=0.03)
     assert abs(plain[row] - expected) > 0.2 * abs(expected)
 
 

@@ -152,9 +152,9 @@ def test_listing_and_counting_may_disagree(device, rng, monkeypatch, rounds):
     monkeypatch.setattr(program, "flatten", other)
     different = Device(device.info, device.schedule)
     different.tuning.update(device.tuning)
-    found = _listed(different, case)
-    assert found == _listed(different, case) != expected
-    for tiles, before in zip(found, expected, strict=True):
+    result = _listed(different, case)
+    assert result == _listed(different, case) != expected
+    for tiles, before in zip(result, expected, strict=True):
         assert len(tiles) == len(set(tiles)) == len(before)
         assert max(tiles, default=0) < 90, "tiles of the image"
 
@@ -235,8 +235,8 @@ def _listed(device, case):
     """Tiles of each Gaussian, with some large ones."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
-    found = (rasterizer.workspace._arrays[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
-    box, mask, count = found
+    actual = (rasterizer.workspace._arrays[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
+    box, mask, count = actual
     assert ((count > 0) & (box >> 24 == 33)).any()
     return _emitted(device, frame, box, mask, count)
 

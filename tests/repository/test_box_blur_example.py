@@ -37,5 +37,5 @@ def window_mean(image: np.ndarray, reach: int) -> np.ndarray:
 def test_box_blur_is_the_window_mean(device, rng, width, height, reach):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     transform = variants(PhotographTransform)["box_blur"](reach=reach)
-    found = colors_of(transform.apply(planes_of(device, image), step=1))
-    np.testing.assert_allclose(found, window_mean(image.astype(np.float64), round(reach)), rtol=1e-5)
+    colors = colors_of(transform.apply(planes_of(device, image), step=1))
+    np.testing.assert_allclose(colors, window_mean(image.astype(np.float64), round(reach)), rtol=1e-5)

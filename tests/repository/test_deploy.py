@@ -32,8 +32,8 @@ def steps() -> list[tuple[str, str]]:
 
 def copied() -> list[str]:
     """The paths of this repository that the container file copies."""
-    found = [shlex.split(rest) for name, rest in steps() if name == "COPY" and "--from" not in rest]
-    return [path for words in found for path in words[:-1]]
+    actual = [shlex.split(rest) for name, rest in steps() if name == "COPY" and "--from" not in rest]
+    return [path for words in actual for path in words[:-1]]
 
 
 def test_containerfile_copies_existing_files_for_the_wheel():

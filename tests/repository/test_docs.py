@@ -63,8 +63,8 @@ def text_of(page: Path) -> str:
 
 def blocks(language: str) -> list[tuple[str, str]]:
     """Code of a language on all pages, with the page's name."""
-    found = re.compile(rf"^ *```{language}\b[^\n]*\n(.*?)^ *```", re.M | re.S)
-    return [(page.name, code) for page in PAGES for code in found.findall(text_of(page))]
+    pattern = re.compile(rf"^ *```{language}\b[^\n]*\n(.*?)^ *```", re.M | re.S)
+    return [(page.name, code) for page in PAGES for code in pattern.findall(text_of(page))]
 
 
 def check_manual_and_example(pages, base, kind):
@@ -122,18 +122,18 @@ def test_reference_lists_every_reader_and_schedule_notation():
 def test_examples_of_schedules_are_valid():
     for _, sample in (*EXAMPLES.values(), *(("", text) for text in SAMPLES.values())):
         ((name, value),) = YAML(typ="safe").load(sample).items()
-        (kind,) = [one for one in (Loss, Rates, ViewSettings) if name in one.model_fields]
+        (kind,) = [item for item in (Loss, Rates, ViewSettings) if name in item.model_fields]
         kind.model_validate({name: value})
 
 
 def test_every_page_is_in_the_navigation():
-    shown = re.findall(r": (\S+\.md)$", text_of(ROOT / "mkdocs.yml"), re.M)
+    matches = re.findall(r": (\S+\.md)$", text_of(ROOT / "mkdocs.yml"), re.M)
     assert f"{FOLDER}/\n" in text_of(ROOT / "mkdocs.yml")
     listed = re.findall(r"\((\w+\.md)\)", other_pages()[f"{FOLDER}/SUMMARY.md"])
-    shown += [f"{FOLDER}/{name}" for name in ("SUMMARY.md", *listed)]
+    matches += [f"{FOLDER}/{name}" for name in ("SUMMARY.md", *listed)]
     written = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
-    assert set(shown) == written | reference_pages().keys() | other_pages().keys()
-    assert len(shown) == len(set(shown))
+    assert set(matches) == written | reference_pages().keys() | other_pages().keys()
+    assert len(matches) == len(set(matches))
 
 
 def test_how_to_pages_are_short_and_have_no_measurements():
@@ -167,8 +167,8 @@ def test_every_included_file_exists():
 
 def test_documented_kernel_test_passes():
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "examples/test_opacity_entropy.py"]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert found.returncode == 0, found.stdout
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stdout
 
 
 def test_paths_and_bases_on_pages_exist():
@@ -312,7 +312,7 @@ def test_issue_forms_are_complete():
 )
 def test_pycolmap_is_required_where_it_has_wheels(system, machine, python, wheels):
     project = tomllib.loads(text_of(ROOT / "pyproject.toml"))["project"]
-    (needed,) = [one for one in map(Requirement, project["dependencies"]) if one.name == "pycolmap"]
+    (needed,) = [item for item in map(Requirement, project["dependencies"]) if item.name == "pycolmap"]
     place = {"sys_platform": system, "platform_machine": machine, "python_version": python}
     assert needed.marker
     assert needed.marker.evaluate({**place, "platform_python_implementation": "CPython"}) == wheels

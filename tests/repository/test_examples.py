@@ -54,8 +54,8 @@ def folder(tiny_scene, tmp_path, monkeypatch) -> Path:
 
 def python_lines() -> list[tuple[str, str]]:
     """Blocks of Python, with the page's name."""
-    found = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
-    return [(page, code) for page in PAGES for code in found.findall((ROOT / page).read_text())]
+    pattern = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
+    return [(page, code) for page in PAGES for code in pattern.findall((ROOT / page).read_text())]
 
 
 def test_every_example_has_a_test():
@@ -206,9 +206,9 @@ def test_documented_edit_methods_match_the_class():
     gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), 1, 0, Survey(None, None, None, [], 0, 1))
     page = (ROOT / "docs" / "plugin_examples.md").read_text()
-    found = re.findall(r"`edit\.([\w.]+)(?:\(([^)`]*)\))?", page)
-    assert {name for name, _ in found} >= {"mark", "choose", "set_rows", "room", "scene_scale.extent"}
-    for name, arguments in found:
+    matches = re.findall(r"`edit\.([\w.]+)(?:\(([^)`]*)\))?", page)
+    assert {name for name, _ in matches} >= {"mark", "choose", "set_rows", "room", "scene_scale.extent"}
+    for name, arguments in matches:
         verb = operator.attrgetter(name)(edit)
         if arguments:
             known = inspect.signature(verb).parameters

@@ -27,15 +27,15 @@ SCENE = ["--size", "8", "--train", "1", "--test", "1"]
 
 def pythons() -> dict[str, str]:
     """The Pythons of this machine that clsplat is for, by version; the running one first.  None of them is started."""
-    found = {"{}.{}".format(*sys.version_info): sys.executable}
+    actual = {"{}.{}".format(*sys.version_info): sys.executable}
     for python in sorted(Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")).glob("versions/3.*/bin/python")):
         version = python.parts[-3].rpartition(".")[0]
         if int(version.split(".")[1]) >= 11:
-            found.setdefault(version, str(python))
+            actual.setdefault(version, str(python))
     for version in (f"3.{minor}" for minor in range(11, 20)):
         if python := shutil.which(f"python{version}"):
-            found.setdefault(version, python)
-    return found
+            actual.setdefault(version, python)
+    return actual
 
 
 RUNNING, *OTHERS = pythons()
@@ -102,8 +102,8 @@ def test_wheel_installs_only_clsplat_and_its_commands_run(version, way, built, c
     call(*pip, *what, path=backend)
     appeared = {path.name.partition("-")[0] for path in site.iterdir()} - {"__pycache__"}
     assert {name for name in appeared if not name.startswith("__editable__")} == {"clsplat"}, appeared
-    found = call(python, "-c", PROBE, cwd=tmp_path).splitlines()
-    assert found == [f"{clsplat.__version__} True True", "[]", "True"]
+    result = call(python, "-c", PROBE, cwd=tmp_path).splitlines()
+    assert result == [f"{clsplat.__version__} True True", "[]", "True"]
     if Path(pythons()[version]) == Path(sys.executable):  # which has what clsplat depends on
         (site / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
         command = tmp_path / "env" / "bin" / "clsplat"

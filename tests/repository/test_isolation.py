@@ -24,15 +24,15 @@ def executables(tree: ast.AST) -> list[ast.expr]:
 def isolated(tree: ast.Module) -> list[ast.expr]:
     """Return those that begin a command with -P or -I; a constant of the module may hold the words."""
     constants = {ast.unparse(node.targets[0]): node.value for node in tree.body if isinstance(node, ast.Assign)}
-    found = []
+    results = []
     for command in (node for node in ast.walk(tree) if isinstance(node, ast.List) and len(node.elts) > 1):
         first, second = command.elts[:2]
         if isinstance(second, ast.Starred):
             words = constants.get(ast.unparse(second.value))
             second = words.elts[0] if isinstance(words, ast.Tuple) else second
         if isinstance(second, ast.Constant) and second.value in ISOLATED:
-            found.append(first)
-    return found
+            results.append(first)
+    return results
 
 
 def test_every_child_command_is_isolated():

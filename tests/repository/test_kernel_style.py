@@ -24,10 +24,10 @@ def code(path: Path) -> str:
 def kernels(path: Path) -> list[tuple[str, str, str]]:
     """(name, parameters with comments, body) of every kernel."""
     text = path.read_text()
-    found = []
+    results = []
     for match in re.finditer(r"__kernel[^{]*?void\s+(\w+)\(\n(.*?\)[^\n]*)\n\{\n(.*?)\n\}\n", text, re.DOTALL):
-        found.append((match[1], match[2], match[3]))
-    return found
+        results.append((match[1], match[2], match[3]))
+    return results
 
 
 def test_lines():
@@ -52,8 +52,8 @@ def test_header_describes_the_computation():
 
 
 def test_words():
-    found = {path.name: re.findall(FORBIDDEN, path.read_text()) for path in FILES}
-    assert not any(found.values()), "\n".join(f"{name}: {words}" for name, words in found.items() if words)
+    actual = {path.name: re.findall(FORBIDDEN, path.read_text()) for path in FILES}
+    assert not any(actual.values()), "\n".join(f"{name}: {words}" for name, words in actual.items() if words)
 
 
 def test_float_literals_have_a_suffix():
@@ -70,10 +70,10 @@ def test_float_literals_have_a_suffix():
 def test_pointers_of_kernels_are_restrict_and_have_a_shape():
     faults = []
     for path in KERNEL_FILES:
-        found = kernels(path)
-        if {name for name, *_ in found} != set(parse_kernels(path.read_text())):
+        result = kernels(path)
+        if {name for name, *_ in result} != set(parse_kernels(path.read_text())):
             faults.append(f"{path.name}: layout of a kernel is not recognized")
-        for name, parameters, _ in found:
+        for name, parameters, _ in result:
             for line in parameters.splitlines():
                 if "*" in line.split("//")[0] and not ("restrict" in line and re.search(r"//.*\[", line)):
                     faults.append(f"{path.name}: {name}: no restrict or no shape: {line.strip()}")
@@ -103,10 +103,10 @@ def test_no_return_in_a_kernel_with_a_barrier():
 
 
 def test_includes_are_local():
-    found = [(path, include) for path in FILES for include in re.findall(r"#include\s+(\S+)", path.read_text())]
+    actual = [(path, include) for path in FILES for include in re.findall(r"#include\s+(\S+)", path.read_text())]
     faults = [
         f"{path.name}: {include}"
-        for path, include in found
+        for path, include in actual
         if not (include.startswith('"') and (path.parent / include.strip('"')).is_file())
     ]
     assert not faults, "\n".join(faults)

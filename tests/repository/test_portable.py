@@ -179,17 +179,17 @@ def has_implicit_encoding(call: ast.Call) -> bool:
 
 
 def test_implicit_text_encoding_is_detected():
-    found = "a.read_text()|a.write_text(b)|open(a)|open(a, 'w')|p.open('a')|subprocess.run(a, text=True)"
+    actual = "a.read_text()|a.write_text(b)|open(a)|open(a, 'w')|p.open('a')|subprocess.run(a, text=True)"
     fine = "a.read_text('utf-8')|write_text(a, b)|open(a, 'rb')|p.open('ab')|Job.open(a, b)|open(a, encoding='utf-8')"
-    for code in found.split("|"):
+    for code in actual.split("|"):
         assert has_implicit_encoding(ast.parse(code).body[0].value), code
     for code in fine.split("|"):
         assert not has_implicit_encoding(ast.parse(code).body[0].value), code
 
 
 def test_text_files_name_their_encoding():
-    found = [(path, call.lineno) for path in FILES for call in calls(path) if has_implicit_encoding(call)]
-    assert not found, "\n".join(f"{path}:{line}: takes the encoding of the system; name utf-8" for path, line in found)
+    actual = [(path, call.lineno) for path in FILES for call in calls(path) if has_implicit_encoding(call)]
+    assert not actual, "\n".join(f"{path}:{line}: takes the encoding of the system; name utf-8" for path, line in actual)
 
 
 def test_modules_of_some_systems_are_imported_where_used():

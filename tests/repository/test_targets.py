@@ -91,13 +91,13 @@ def test_different_builds_are_distinguished():
 
 
 def test_every_call_with_extra_defines_is_listed():
-    found = set()
+    actual = set()
     for text in map(Path.read_text, (ROOT / "clsplat").rglob("*.py")):
         for node in ast.walk(ast.parse(text)) if ".program" in text else ():
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "program" and node.keywords:
                 name = ast.unparse(node.args[0]).lstrip("f").strip("'")
-                found |= {file.name for file in KERNELS.glob(re.sub(r"\{.*?\}", "*", name))}
-    assert found == PASSED.keys()
+                actual |= {file.name for file in KERNELS.glob(re.sub(r"\{.*?\}", "*", name))}
+    assert actual == PASSED.keys()
 
 
 AMD_SAMPLE = """\
@@ -175,11 +175,11 @@ __kernel __attribute__((reqd_work_group_size(64, 1, 1))) void other() {}
 
 
 def test_statistics_are_read_from_ptx_and_ptxas():
-    found = nvidia.parse(TEXT_SAMPLE, PTX_SAMPLE, PTXAS_SAMPLE, "sm_86")
-    of = found["scale"]
+    result = nvidia.parse(TEXT_SAMPLE, PTX_SAMPLE, PTXAS_SAMPLE, "sm_86")
+    of = result["scale"]
     assert (of.registers, of.spills, of.scratch, of.local, of.group) == (38, 8, 200, 16388, 256)
     assert [of.counts[name] for name in page.COUNTS] == [1, 1, 1, 1]
-    assert (found["other"].registers, found["other"].local, found["other"].group) == (12, 0, 64)
+    assert (result["other"].registers, result["other"].local, result["other"].group) == (12, 0, 64)
     with pytest.raises(CompileError, match="names no kernel"):
         nvidia.parse(TEXT_SAMPLE, PTX_SAMPLE, "", "sm_86")
 
@@ -304,7 +304,7 @@ def test_accepted_faults_must_still_occur():
     assert accepted.unexpected_failures([fault + "0"], everything=False) == [fault + "0"]
     gone = accepted.unexpected_failures([fault], everything=True)
     assert len(gone) == len(rest)
-    assert all("is accepted, and was not seen" in one for one in gone)
+    assert all("is accepted, and was not seen" in item for item in gone)
 
 
 @vendors
@@ -328,19 +328,19 @@ def test_largest_kernels_stay_within_the_limits(vendor, target):
 )
 def test_planted_fault_is_detected(vendor, target, source, words, tmp_path):
     require_compiler(vendor)
-    found = compile_one((planted(tmp_path, source), target))
-    assert not isinstance(found, str), found
-    (fault,) = figures.faults({Place(target, "simt", name): of for name, of in found.items()})
+    result = compile_one((planted(tmp_path, source), target))
+    assert not isinstance(result, str), result
+    (fault,) = figures.faults({Place(target, "simt", name): of for name, of in result.items()})
     assert words in fault
 
 
 @vendors
 def test_kernel_build_error_names_kernel_and_line(vendor, target, tmp_path):
     require_compiler(vendor)
-    found = compile_one((planted(tmp_path, LOCAL.format(group=64, floats=64) + "int broken(\n"), target))
-    assert isinstance(found, str)
-    assert found.startswith(f"{target}: planted.cl (simt) does not compile: planted.cl:")
-    assert "\n" not in found
+    result = compile_one((planted(tmp_path, LOCAL.format(group=64, floats=64) + "int broken(\n"), target))
+    assert isinstance(result, str)
+    assert result.startswith(f"{target}: planted.cl (simt) does not compile: planted.cl:")
+    assert "\n" not in result
 
 
 def command(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

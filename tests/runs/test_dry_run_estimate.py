@@ -82,12 +82,12 @@ def test_estimated_growth_follows_the_number_of_images(photos):
     ],
 )
 def test_unprepared_photographs_give_the_training_count(photos, sets, training):
-    asked = load("photos", [f"scene.path='{photos}'", *sets])
+    pipeline = load("photos", [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
-    names = photo_names(asked, asked.preparation(out), out)
+    names = photo_names(pipeline, pipeline.preparation(out), out)
     assert len(names) == COUNT
-    assert expected_measures(asked, names).photographs == training
-    assert expected_measures(asked, []) is None
+    assert expected_measures(pipeline, names).photographs == training
+    assert expected_measures(pipeline, []) is None
 
 
 def as_cell(asked, state, device, start):
@@ -114,28 +114,28 @@ def as_cell(asked, state, device, start):
     ],
 )
 def test_impossible_split_is_refused_before_preparation(photos, begin, sets, complaint):
-    asked = load("photos", [sets, f"scene.path='{photos}'"])
+    pipeline = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
-        begin(asked, RunState.read(photos.parent / "runs" / "a"), None, "new")
+        begin(pipeline, RunState.read(photos.parent / "runs" / "a"), None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
 def test_split_that_depends_on_cameras_is_not_refused_early(photos, caplog):
     """Which photographs a number holds out follows from those that are placed."""
-    asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
+    pipeline = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
     (photos / "left.heic").write_bytes(b"")
     out = photos.parent / "runs" / "a"
-    check_preparation(asked, out)
+    check_preparation(pipeline, out)
     assert "HEIC" not in caplog.text, "the step that leaves it out says so"
     apart = "scene={train: {every: 2}, validation: {names: ['02', '05']}}"
     left_out = load("photos", [apart, f"scene.path='{photos}'"])
     check_preparation(left_out, out)
     assert "is refused: " in (described := describe(left_out, RunState.read(out), None, "new"))
     assert "'02' is left out by scene.train" in described
-    told = describe(asked, RunState.read(out), None, "new")
-    assert "if all 23 photos get a camera, the run is refused:" in told
-    assert "'00.png' is a test view" in told
-    assert "the photos decide init.transparent, " in told, "what they will decide"
+    text = describe(pipeline, RunState.read(out), None, "new")
+    assert "if all 23 photos get a camera, the run is refused:" in text
+    assert "'00.png' is a test view" in text
+    assert "the photos decide init.transparent, " in text, "what they will decide"
 
 
 def test_skipped_files_are_reported_once(photos, caplog):
@@ -145,13 +145,13 @@ def test_skipped_files_are_reported_once(photos, caplog):
 
 
 def test_dry_run_lists_the_undecided_settings(photos):
-    asked = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
+    pipeline = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
     lines = [
-        line.strip() for line in describe(asked, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
+        line.strip() for line in describe(pipeline, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
     ]
-    (found,) = [line for line in lines if line.startswith("adapt ")]
-    assert "the photos decide init.transparent, init.count, " in found
-    assert "dropout" not in found
+    (actual,) = [line for line in lines if line.startswith("adapt ")]
+    assert "the photos decide init.transparent, init.count, " in actual
+    assert "dropout" not in actual
 
 
 def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
@@ -160,8 +160,8 @@ def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
     parts = text[text.index("expected:") :].splitlines()
     assert [line.split()[0] for line in parts] == ["expected:", "optimize"]
     assert not list(tmp_path.iterdir())
-    asked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    assert "expected" not in describe(asked, RunState.read(tmp_path / "run"), None, "new"), "cells of a matrix are many"
+    pipeline = load("smoke", [f"scene.path='{tiny_scene}'"])
+    assert "expected" not in describe(pipeline, RunState.read(tmp_path / "run"), None, "new"), "cells of a matrix are many"
 
 
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])

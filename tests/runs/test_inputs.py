@@ -164,7 +164,7 @@ def test_damaged_files_are_decoded_each_time(scene, decoded):
 def test_unwritable_cache_costs_only_time(scene, decoded, cache):
     cache.write_text("a file cannot hold a folder")
     for _ in range(2):
-        assert not any(found.fault for found in decode_all(views(scene)).values())
+        assert not any(value.fault for value in decode_all(views(scene)).values())
     assert len(decoded) == 20
 
 
@@ -174,7 +174,7 @@ def test_damaged_cache_is_ignored(scene, decoded, cache):
     lines = file.read_bytes().splitlines(keepends=True)
     file.write_bytes(b"\xff\xfe " + b"".join(lines[:4]) + b"what\n" + lines[4].replace(b" ", b"") + lines[5][:-2])
     decoded.clear()
-    assert not any(found.fault for found in decode_all(views(scene)).values())
+    assert not any(value.fault for value in decode_all(views(scene)).values())
     assert len(decoded) == 7
     decoded.clear()
     decode_all(views(scene))
@@ -262,9 +262,9 @@ def test_every_input_change_is_named(scene, tmp_path):
     train, test = opened.split("train"), opened.split("test")
 
     def said(changed: Scene) -> str:
-        found = identity(changed)
-        assert found.digest != before.digest
-        return ", ".join(found.changes(before))
+        result = identity(changed)
+        assert result.digest != before.digest
+        return ", ".join(result.changes(before))
 
     def with_view(index: int, **change: object) -> Scene:
         return replace(

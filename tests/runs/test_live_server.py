@@ -26,10 +26,10 @@ def exchange(server: Server, data: bytes) -> bytes:
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(data)
         connection.shutdown(socket.SHUT_WR)
-        found = b""
+        actual = b""
         while more := connection.recv(1 << 16):
-            found += more
-        return found
+            actual += more
+        return actual
 
 
 def test_server_listens_only_on_loopback(server):
@@ -37,8 +37,8 @@ def test_server_listens_only_on_loopback(server):
 
 
 def test_requests_of_one_connection_are_answered_in_order(server):
-    one = b"GET /token/%s HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    answers = exchange(server, one % b"a" + one % b"b")
+    first = b"GET /token/%s HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    answers = exchange(server, first % b"a" + first % b"b")
     assert answers.count(b"HTTP/1.1 200 OK") == 2
     assert answers.index(b"\r\n\r\na") < answers.index(b"\r\n\r\nb")
 
@@ -47,10 +47,10 @@ def test_requests_of_one_connection_are_answered_in_order(server):
 def test_other_methods_are_refused_and_close_the_connection(server, method):
     body = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n"
     head = method + b" /token/ HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(body)
-    found = exchange(server, head + body)
-    assert found.startswith(b"HTTP/1.1 501")
-    assert found.count(b"HTTP/1.1") == 1
-    assert b"<" not in found
+    result = exchange(server, head + body)
+    assert result.startswith(b"HTTP/1.1 501")
+    assert result.count(b"HTTP/1.1") == 1
+    assert b"<" not in result
 
 
 def test_answer_forbids_frames_caches_and_referrers(server):
@@ -75,7 +75,7 @@ def test_server_closes_its_connections_at_its_end(server):
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(request)
         assert connection.recv(1 << 16).startswith(b"HTTP/1.1 200")
-        (thread,) = (one for one in threading.enumerate() if "process_request_thread" in one.name)
+        (thread,) = (item for item in threading.enumerate() if "process_request_thread" in item.name)
         server.stop()
         with suppress(OSError):
             connection.sendall(request)
@@ -99,12 +99,12 @@ def test_final_answer_is_complete_and_the_last():
         given.wait(10)
         server.stop()
         going.set()
-        found = b""
+        actual = b""
         with suppress(ConnectionError):
             while more := connection.recv(1 << 16):
-                found += more
-    assert found.endswith(b"farewell")
-    assert found.count(b"HTTP/1.1 200") == 1
+                actual += more
+    assert actual.endswith(b"farewell")
+    assert actual.count(b"HTTP/1.1 200") == 1
 
 
 def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):

@@ -59,7 +59,7 @@ stages:
 
 
 def damaged(out: Path) -> list[str]:
-    return [one["file"] for one in clsplat.check(out)["objects"] if not one["whole"]]
+    return [item["file"] for item in clsplat.check(out)["objects"] if not item["whole"]]
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,8 @@ def take_folder(out: Path) -> dict[str, bytes]:
 
 def files(out: Path) -> dict[str, bytes]:
     """What lies in a run folder, but for the log, to which lines are added."""
-    found = (path for path in out.rglob("*") if path.is_file() and path.name != "log.txt")
-    return {path.relative_to(out).as_posix(): path.read_bytes() for path in found}
+    actual = (path for path in out.rglob("*") if path.is_file() and path.name != "log.txt")
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in actual}
 
 
 def removed(out: Path) -> dict[str, bytes]:

@@ -67,8 +67,8 @@ def test_world_coordinates_need_doubles(runs, tmp_path):
     data = (tmp_path / "a.ply").read_bytes()
     header = parse_ply_header(tmp_path, data)
     rows = np.frombuffer(data, header.dtype, header.count, header.start)
-    found, expected = np.stack([rows[axis] for axis in "xyz"], axis=1), load(runs / "world").means + ORIGIN
-    np.testing.assert_array_equal(found, expected)
+    result, expected = np.stack([rows[axis] for axis in "xyz"], axis=1), load(runs / "world").means + ORIGIN
+    np.testing.assert_array_equal(result, expected)
     with pytest.raises(
         ConfigError, match=r"a\.spz: world coordinates around \(500000, 4500000, 100\) exceed the precision"
     ):
@@ -85,12 +85,12 @@ def test_boxes_are_in_world_coordinates(runs, tmp_path):
 
 
 def test_merged_models_have_one_origin(runs, tmp_path):
-    one = load(runs / "world")
-    moved = one.with_origin(ORIGIN + np.array([1, 2, 3]))
+    pipeline = load(runs / "world")
+    moved = pipeline.with_origin(ORIGIN + np.array([1, 2, 3]))
     moved.save(tmp_path / "moved.ply")
     convert([runs / "world", tmp_path / "moved.ply"], tmp_path / "both.ply")
     both = load(tmp_path / "both.ply")
-    np.testing.assert_allclose(both.means[: len(one)], both.means[len(one) :], atol=1e-6)
+    np.testing.assert_allclose(both.means[: len(pipeline)], both.means[len(pipeline) :], atol=1e-6)
     np.testing.assert_array_equal(both.origin, ORIGIN)
 
 
@@ -102,8 +102,8 @@ def test_camera_path_is_in_world_coordinates(runs, tmp_path):
         frames = [{"camera_to_world": pose.ravel().tolist(), "fov": 60}]
         path = tmp_path / f"{name}.json"
         path.write_text(json.dumps({"camera_path": frames, "render_width": 64, "render_height": 48}))
-        found = render_path(runs / name, video=None, out=tmp_path / name, path=str(path))
-        pictures[name] = [read_image(Path(file)) for file in found["files"]]
+        result = render_path(runs / name, video=None, out=tmp_path / name, path=str(path))
+        pictures[name] = [read_image(Path(file)) for file in result["files"]]
     np.testing.assert_array_equal(pictures["local"], pictures["world"])
     assert np.std(pictures["world"]) > 1
 
@@ -114,8 +114,8 @@ def test_page_names_the_origin(runs, tmp_path):
 
 
 def test_foreign_floats_in_world_coordinates_get_an_origin(runs, tmp_path, caplog):
-    one = load(runs / "world")
-    Model(**{**one.tables(), "means": one.means + ORIGIN}).save(tmp_path / "a.ply")
-    found = load(tmp_path / "a.ply")
-    assert np.abs(found.means).max() < 100
-    np.testing.assert_allclose(found.means + found.origin, one.means + ORIGIN, atol=0.3)
+    first = load(runs / "world")
+    Model(**{**first.tables(), "means": first.means + ORIGIN}).save(tmp_path / "a.ply")
+    pipeline = load(tmp_path / "a.ply")
+    assert np.abs(pipeline.means).max() < 100
+    np.testing.assert_allclose(pipeline.means + pipeline.origin, first.means + ORIGIN, atol=0.3)

@@ -64,13 +64,13 @@ def text_fields() -> list[tuple[type[Settings], str]]:
 
 
 def test_every_string_setting_is_an_input_or_checked_output():
-    found = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
+    actual = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
     assert Execution in Settings.subclasses
     checked = {
         f"{kind.__name__}.{n}" for kind, n in text_fields() if issubclass(kind, Stage) and n in kind.named_outputs()
     }
     assert {"Export.file", "Render.folder", "HtmlReport.file"} <= checked
-    assert found == READ | NAMES | checked, "a new text: check it with path_in_run, or list it as one that is read"
+    assert actual == READ | NAMES | checked, "a new text: check it with path_in_run, or list it as one that is read"
 
 
 WRITING = [kind for kind in Settings.subclasses if issubclass(kind, Stage) and kind.named_outputs()]

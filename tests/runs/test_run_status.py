@@ -27,53 +27,53 @@ def write_and_read_status(folder: Path, **values) -> dict:
 
 
 def test_missing_process_counts_as_killed(tmp_path):
-    found = write_and_read_status(tmp_path)
-    assert found["state"] == "killed"
-    assert "silent" not in found
+    status = write_and_read_status(tmp_path)
+    assert status["state"] == "killed"
+    assert "silent" not in status
 
 
 @pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
 def test_remote_run_is_judged_only_by_its_heartbeat(elsewhere, tmp_path):
-    found = write_and_read_status(tmp_path, **elsewhere)
-    assert found["state"] == "running"
-    assert 199 < found["silent"] < 300
+    status = write_and_read_status(tmp_path, **elsewhere)
+    assert status["state"] == "running"
+    assert 199 < status["silent"] < 300
     place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
-    assert f"\n  no heartbeat for {found['silent']} s; {place}" in reading.status_text(found)
+    assert f"\n  no heartbeat for {status['silent']} s; {place}" in reading.status_text(status)
     assert "no heartbeat" not in reading.status_text(write_and_read_status(tmp_path, time=time.time() - 2, **elsewhere))
 
 
 def test_stopped_process_has_no_heartbeat(tmp_path):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        found = write_and_read_status(tmp_path, process=process.pid)
+        status = write_and_read_status(tmp_path, process=process.pid)
         process.communicate(b"\n")
-    assert f"no heartbeat for {found['silent']} s; process {process.pid}" in reading.status_text(found)
+    assert f"no heartbeat for {status['silent']} s; process {process.pid}" in reading.status_text(status)
 
 
 def test_status_prints_stage_and_time_left(tmp_path):
     amount = Amount(done=3, total=20, unit="views")
-    found = write_and_read_status(
+    status = write_and_read_status(
         tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6
     )
-    assert reading.status_text(found).splitlines()[0] == (
+    assert reading.status_text(status).splitlines()[0] == (
         f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
     )
 
 
 def test_status_prints_left_out_photographs(tmp_path):
-    found = write_and_read_status(tmp_path, state="done", progress=None)
+    status = write_and_read_status(tmp_path, state="done", progress=None)
     features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
-    found["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
-    assert "3 of 4 photographs placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
+    status["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
+    assert "3 of 4 photographs placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.status_text(status)
 
 
 def test_clock_ahead_is_noted_and_gives_no_negative_time(tmp_path):
-    found = write_and_read_status(tmp_path, host="a", time=time.time() + 500)
-    assert found["silent"] == 0
-    assert 490 < found["ahead"] <= 500
-    assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a; whether " in reading.status_text(found)
-    found = write_and_read_status(tmp_path, host="a", time=time.time() + 5)
-    assert "ahead" not in found
-    assert "its clock" not in reading.status_text(found)
+    status = write_and_read_status(tmp_path, host="a", time=time.time() + 500)
+    assert status["silent"] == 0
+    assert 490 < status["ahead"] <= 500
+    assert f"\n  its clock is ahead by {status['ahead']} s; it runs on a; whether " in reading.status_text(status)
+    status = write_and_read_status(tmp_path, host="a", time=time.time() + 5)
+    assert "ahead" not in status
+    assert "its clock" not in reading.status_text(status)
 
 
 @pytest.mark.parametrize("state", ["killed", "failed", "interrupted"])
@@ -127,8 +127,8 @@ def test_status_of_a_newer_version_is_refused(tmp_path):
 
 def test_status_has_no_terminal_escapes(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": ' + "9" * 4000 + "}\n")
-    found = write_and_read_status(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
-    text = reading.status_text(found)
+    status = write_and_read_status(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
+    text = reading.status_text(status)
     assert "\x1b" not in text
     assert "[31mhi" in text
     assert max(map(len, text.splitlines())) <= 1010

@@ -20,12 +20,12 @@ from tests.support.runs import digest
 
 
 def test_steps_follow_from_a_rehearsal():
-    found = Rehearsal(200, [0.01, 0.03], during=3.0, after=2.0)
-    assert found.steps_in(25.0) == 1000
-    assert found.steps_in(4.0) == 0
-    assert replace(found, trend=0.5).steps_in(5 + 600 * 0.02 * 3**0.5) == pytest.approx(600, abs=1)
-    assert found.later(0.2) == (2, 3)
-    assert found.later(0.99) == (1, 1)
+    rehearsal = Rehearsal(200, [0.01, 0.03], during=3.0, after=2.0)
+    assert rehearsal.steps_in(25.0) == 1000
+    assert rehearsal.steps_in(4.0) == 0
+    assert replace(rehearsal, trend=0.5).steps_in(5 + 600 * 0.02 * 3**0.5) == pytest.approx(600, abs=1)
+    assert rehearsal.later(0.2) == (2, 3)
+    assert rehearsal.later(0.99) == (1, 1)
 
 
 @pytest.mark.parametrize("minutes", [2.0, 10.0, 60.0])
@@ -132,10 +132,10 @@ def test_run_killed_at_a_correction_keeps_the_chosen_steps(tiny_scene, tmp_path,
 @pytest.mark.slow
 def test_too_long_rehearsal_is_shortened(tiny_scene, tmp_path, monkeypatch, few):
     """What follows them is rehearsed all the same; the rest is taken to be like the last."""
-    found: list[Rehearsal] = []
+    results: list[Rehearsal] = []
 
     def seen(rehearsal: Rehearsal, seconds: float) -> int:
-        found.append(rehearsal)
+        results.append(rehearsal)
         return 0
 
     brief = lambda pipeline, run, *given: time_budget.rehearse(pipeline, run, 10, 0.0, math.inf)  # noqa: E731
@@ -143,7 +143,7 @@ def test_too_long_rehearsal_is_shortened(tiny_scene, tmp_path, monkeypatch, few)
     monkeypatch.setattr(Rehearsal, "steps_in", seen)
     with pytest.raises(ConfigError, match="too short"):
         clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1.0)
-    (rehearsal,) = found
+    (rehearsal,) = results
     assert len(rehearsal.step_times) == 10
     assert len({*rehearsal.step_times[2:]}) == 1
     assert rehearsal.after > 0

@@ -43,9 +43,9 @@ def copy(finished: Path, tmp_path: Path) -> Path:
 
 def damaged(out: Path) -> dict[str, str]:
     """The damaged files, with reasons."""
-    found = clsplat.check(out)
-    assert found["whole"] == all(one["whole"] for one in found["objects"])
-    return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}
+    result = clsplat.check(out)
+    assert result["whole"] == all(item["whole"] for item in result["objects"])
+    return {item["file"]: item["detail"] for item in result["objects"] if not item["whole"]}
 
 
 def test_status_of_a_newer_version_is_not_damage(copy):
@@ -59,7 +59,7 @@ def test_status_of_a_newer_version_is_not_damage(copy):
     assert clsplat.status(copy)["new"] == 1
     path.write_text(json.dumps({**status, "format": 2, "step": "of words"}))
     assert damaged(copy) == {}
-    details = {one["file"]: one["detail"] for one in clsplat.check(copy)["objects"]}
+    details = {item["file"]: item["detail"] for item in clsplat.check(copy)["objects"]}
     assert details["status.json"] == "not checked further: format 2 of a newer version"
     for fault in ({"step": "of words"}, {"format": 0}, {"format": "1"}):
         path.write_text(json.dumps({**status, **fault}))
@@ -95,15 +95,15 @@ def test_checksums_match_sha256sum(finished):
 
 
 def test_changed_byte_in_any_file_is_detected(finished, copy):
-    files = [one["file"] for one in clsplat.check(finished)["objects"] if one["file"] != "status.json"]
+    files = [item["file"] for item in clsplat.check(finished)["objects"] if item["file"] != "status.json"]
     assert len(files) > 9
     for name in files:
         data = (copy / name).read_bytes()
         place = len(data) // 2
         (copy / name).write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        found = damaged(copy)
-        assert name in found or name == "checksums.json", name
-        assert found, name
+        result = damaged(copy)
+        assert name in result or name == "checksums.json", name
+        assert result, name
         (copy / name).write_bytes(data)
     assert damaged(copy) == {}
 
@@ -111,13 +111,13 @@ def test_changed_byte_in_any_file_is_detected(finished, copy):
 @pytest.mark.parametrize("content", [None, b"", b"\xff\x00", b"[]"])
 def test_missing_or_replaced_file_is_detected(content, finished, copy):
     older = min(path.relative_to(finished).as_posix() for path in finished.glob("checkpoints/*"))
-    for one in clsplat.check(finished)["objects"]:
-        path = copy / one["file"]
+    for item in clsplat.check(finished)["objects"]:
+        path = copy / item["file"]
         data = path.read_bytes()
         path.unlink() if content is None else path.write_bytes(content)
-        found = damaged(copy)
-        if not (content is None and one["file"] == older):
-            assert found, one["file"]
+        result = damaged(copy)
+        if not (content is None and item["file"] == older):
+            assert result, item["file"]
         path.write_bytes(data)
 
 
@@ -176,19 +176,19 @@ KINDS = {
 def test_wrong_kind_of_file_is_reported(kind, finished, copy):
     if (make := KINDS[kind]) is None:
         pytest.skip("this system has no pipes with names")
-    for name in [one["file"] for one in clsplat.check(finished)["objects"]]:
+    for name in [item["file"] for item in clsplat.check(finished)["objects"]]:
         (copy / name).unlink()
         make(copy / name)
-        found = damaged(copy)
-        assert found.keys() == {name}
-        assert kind in found[name], (name, found[name])
+        result = damaged(copy)
+        assert result.keys() == {name}
+        assert kind in result[name], (name, result[name])
         (copy / name).rmdir() if kind == "is a folder" else (copy / name).unlink()
         shutil.copyfile(finished / name, copy / name)
 
 
 def test_every_missing_file_is_named(finished, copy):
     """The list of checksums tells them, or the pipeline, or what every run has."""
-    files = {one["file"] for one in clsplat.check(finished)["objects"]}
+    files = {item["file"] for item in clsplat.check(finished)["objects"]}
     outputs = {name for name in files if name.endswith((".ply", ".html", ".png"))}
     of_every_run = {"inputs.json", "metrics.json", "metrics.jsonl"}
     newest = {"checkpoints/step_000020.npz"}
@@ -216,7 +216,7 @@ def test_run_without_checksums_is_not_reported_as_complete(copy):
 
 
 def test_every_file_has_one_line(finished):
-    files = [one["file"] for one in clsplat.check(finished)["objects"]]
+    files = [item["file"] for item in clsplat.check(finished)["objects"]]
     assert len(files) == len(set(files))
 
 
@@ -288,8 +288,8 @@ def test_check_of_a_matrix_includes_its_cells(tiny_scene, tmp_path):
     assert f"`clsplat resume {cell}`" in command("check", out, expect=7).stderr
     shutil.rmtree(cell)
     (out / "compare.html").unlink()
-    found = damaged(out)
-    assert {f"{cell.name}/pipeline.yaml", "compare.html"} <= set(found)
+    result = damaged(out)
+    assert {f"{cell.name}/pipeline.yaml", "compare.html"} <= set(result)
     assert f"`clsplat resume {out}`" in command("check", out, expect=7).stderr
     (out / "pipeline.yaml").unlink()
     assert "inputs.json" not in damaged(out), "which is of a run, not of a matrix"

@@ -89,20 +89,20 @@ def test_colmap_round_trip(model, lenses, scene_of, tmp_path):
     files = clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
     assert [file.name for file in files] == ["cameras.bin", "images.bin", "points3D.bin"]
     assert len(read_cameras(tmp_path / "out/sparse/0")) == lenses
-    found = clsplat.read_scene(tmp_path / "out")
-    assert_same_scene(scene, found)
-    assert [view.lens for view in found.views] == [view.lens for view in scene.views]
+    actual = clsplat.read_scene(tmp_path / "out")
+    assert_same_scene(scene, actual)
+    assert [view.lens for view in actual.views] == [view.lens for view in scene.views]
 
 
 @pytest.mark.parametrize(("model", "lenses"), list(zip(DISTORTION, cycle((3, 1)), strict=False)))
 def test_nerfstudio_round_trip(model, lenses, scene_of, tmp_path, rng):
     scene = scene_of(model, lenses)
     clsplat.write_cameras(scene, tmp_path / "out", "nerfstudio", images="copy")
-    found = clsplat.read_scene(tmp_path / "out")
-    assert_same_scene(scene, found, "images/")
-    assert (found.train, found.test) == (scene.train, scene.test)
+    actual = clsplat.read_scene(tmp_path / "out")
+    assert_same_scene(scene, actual, "images/")
+    assert (actual.train, actual.test) == (scene.train, scene.test)
     rays = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
-    for a, b in zip(scene.views, found.views, strict=True):
+    for a, b in zip(scene.views, actual.views, strict=True):
         if a.lens is not None:
             np.testing.assert_allclose(b.lens.project(rays), a.lens.project(rays), rtol=1e-13)
 
@@ -143,8 +143,8 @@ def test_cameras_json_has_undistorted_cameras(model, scene_of, tmp_path, caplog)
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
     assert "the principal point at the center of the image; it is up to" in caplog.text
-    found = camera_files.read_inria(tmp_path / "cameras.json")
-    for a, b in zip(scene.views, found, strict=True):
+    result = camera_files.read_inria(tmp_path / "cameras.json")
+    for a, b in zip(scene.views, result, strict=True):
         assert (b.name, b.camera) == (a.name, a.camera)
         np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-14)
     first = json.loads((tmp_path / "cameras.json").read_text())[0]
@@ -230,11 +230,11 @@ def with_tracks(scene, rng):
 def test_colmap_keeps_observations(model, scene_of, tmp_path, rng):
     scene = with_tracks(scene_of(model), rng)
     clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
-    found = clsplat.read_scene(tmp_path / "out").tracks
-    np.testing.assert_array_equal(found.positions, scene.tracks.positions)
+    actual = clsplat.read_scene(tmp_path / "out").tracks
+    np.testing.assert_array_equal(actual.positions, scene.tracks.positions)
     for view in scene.views:
-        np.testing.assert_array_equal(found.rows[view.name], scene.tracks.rows[view.name])
-        np.testing.assert_allclose(found.residuals[view.name], scene.tracks.residuals[view.name], atol=1e-9)
+        np.testing.assert_array_equal(actual.rows[view.name], scene.tracks.rows[view.name])
+        np.testing.assert_allclose(actual.residuals[view.name], scene.tracks.residuals[view.name], atol=1e-9)
     data, at, images = (tmp_path / "out/sparse/0/points3D.bin").read_bytes(), 8, read_images(tmp_path / "out/sparse/0")
     while at < len(data):
         (point,), (count,) = struct.unpack_from("<Q", data, at), struct.unpack_from("<Q", data, at + 43)
@@ -258,8 +258,8 @@ def test_optimized_cameras_keep_observations(model, scene_of, tmp_path, rng):
         clsplat.write_cameras(one, tmp_path / name, "colmap", images="copy")
     pixels = [[image.pixels for image in read_images(tmp_path / name / "sparse/0")] for name in "ab"]
     np.testing.assert_allclose(pixels[1], pixels[0], atol=1e-9)
-    (one, *_), found = scene.views, clsplat.read_scene(tmp_path / "b").tracks
-    assert np.abs(found.residuals[one.name] - scene.tracks.residuals[one.name]).max() > 1, "px"
+    (one, *_), actual = scene.views, clsplat.read_scene(tmp_path / "b").tracks
+    assert np.abs(actual.residuals[one.name] - scene.tracks.residuals[one.name]).max() > 1, "px"
 
 
 @pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
@@ -268,11 +268,11 @@ def test_exposures_are_written_next_to_copied_images(form, scene_of, tmp_path, r
     noted = {view.name: CameraExposure(0.01 * (i + 1), 2.0, 100.0) for i, view in enumerate(scene.views[1:])}
     write_exposures(tmp_path / "photographs", noted)
     clsplat.write_cameras(scene, tmp_path / "out", form, images="copy")
-    found = clsplat.read_scene(tmp_path / "out")
-    told = dict(zip([view.name for view in found.views], load_exposures(found.views), strict=True))
+    actual = clsplat.read_scene(tmp_path / "out")
+    told = dict(zip([view.name for view in actual.views], load_exposures(actual.views), strict=True))
     prefix = "images/" if form == "nerfstudio" else ""
     assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
-    assert (found.tracks is None) == (form == "nerfstudio")
+    assert (actual.tracks is None) == (form == "nerfstudio")
     said = "nerfstudio does not store which points the photographs show; colmap does"
     assert (said in caplog.text) == (form == "nerfstudio")
     clsplat.write_cameras(scene, tmp_path / "alone", form)
@@ -282,11 +282,11 @@ def test_exposures_are_written_next_to_copied_images(form, scene_of, tmp_path, r
 def test_blender_scene_converts_to_colmap(tiny_scene, tmp_path):
     clsplat.write_cameras(tiny_scene, tmp_path / "out", images="copy")
     old, new = clsplat.read_scene(tiny_scene), clsplat.read_scene(tmp_path / "out")
-    found = {view.name: view for view in new.views}
-    assert found.keys() == {f"{view.name}.png" for view in old.views}
+    actual = {view.name: view for view in new.views}
+    assert actual.keys() == {f"{view.name}.png" for view in old.views}
     for view in old.views:
-        np.testing.assert_allclose(found[f"{view.name}.png"].world_to_camera, view.world_to_camera, atol=1e-14)
-        np.testing.assert_array_equal(found[f"{view.name}.png"].photograph(0.0), view.photograph(0.0))
+        np.testing.assert_allclose(actual[f"{view.name}.png"].world_to_camera, view.world_to_camera, atol=1e-14)
+        np.testing.assert_array_equal(actual[f"{view.name}.png"].photograph(0.0), view.photograph(0.0))
 
 
 @pytest.mark.slow
@@ -298,15 +298,15 @@ def test_command_accepts_a_dataset_or_a_run(few_steps, tiny_scene, tmp_path):
     ]
     assert files[0] == files[1]
     assert (tmp_path / "run/transforms.json").read_bytes() == (tmp_path / "set/transforms.json").read_bytes()
-    told = command("data", "cameras", tmp_path / "none", tmp_path / "x", expect=3).stderr
-    assert "no such folder" in told
+    output = command("data", "cameras", tmp_path / "none", tmp_path / "x", expect=3).stderr
+    assert "no such folder" in output
 
 
 @pytest.mark.parametrize(("format_", "images"), [("nerfstudio", "none"), ("colmap", "none"), ("colmap", "copy")])
 def test_folder_without_images_is_reported(format_, images, tiny_scene, tmp_path):
     words = ["data", "cameras", str(tiny_scene), str(tmp_path / "out"), "--format", format_, "--images", images]
-    told = CliRunner().invoke(cli.app, words).output
-    assert ("with --images copy" in told) == (images == "none")
+    output = CliRunner().invoke(cli.app, words).output
+    assert ("with --images copy" in output) == (images == "none")
 
 
 @pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "brighton"])
@@ -314,9 +314,9 @@ def test_datasets_survive_both_round_trips(name, tmp_path):
     scene = clsplat.read_scene(data_set(name))
     for form in ("colmap", "nerfstudio"):
         clsplat.write_cameras(scene, tmp_path / form, form, images="copy")
-        found = clsplat.read_scene(tmp_path / form)
-        assert len(found.views) == len(scene.views)
-        for a, b in zip(scene.views, found.views, strict=True):
+        actual = clsplat.read_scene(tmp_path / form)
+        assert len(actual.views) == len(scene.views)
+        for a, b in zip(scene.views, actual.views, strict=True):
             turn = a.world_to_camera[:, :3]
             rounding = np.abs(turn @ turn.T - np.eye(3)).max() if form == "colmap" else 0  # a quaternion has none
             np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=2e-13 + 10 * rounding)

@@ -59,12 +59,12 @@ def test_scene_equals_its_colmap_version(scene):
 
 @pytest.mark.usefixtures("_plugin")
 def test_inspection_matches_that_of_colmap(scene):
-    expected, found = Inspection.from_folder(scene), Inspection.from_folder(scene / "images")
-    assert (found.facts.kind, found.verdict) == ("CSV", "ready to train")
+    expected, inspection = Inspection.from_folder(scene), Inspection.from_folder(scene / "images")
+    assert (inspection.facts.kind, inspection.verdict) == ("CSV", "ready to train")
     for name in ("registered", "train", "test", "on_disk", "missing", "unregistered", "cameras", "photos"):
-        assert getattr(found.facts, name) == getattr(expected.facts, name), name
-    assert found.facts.extent == pytest.approx(expected.facts.extent)
-    assert finding_text(found, "note").startswith("there are no points")
+        assert getattr(inspection.facts, name) == getattr(expected.facts, name), name
+    assert inspection.facts.extent == pytest.approx(expected.facts.extent)
+    assert finding_text(inspection, "note").startswith("there are no points")
 
 
 @pytest.mark.usefixtures("_plugin")

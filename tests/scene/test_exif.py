@@ -59,8 +59,8 @@ def test_damaged_exif_gives_an_exposure_or_none(tmp_path):
     for at in range(2, 130):
         for damaged in (data[:at], data[:at] + b"\xff" + data[at + 1 :], data[:at] + b"\0" + data[at + 1 :]):
             (tmp_path / "a.jpg").write_bytes(damaged)
-            found = read_exif_exposure(tmp_path / "a.jpg")
-            assert found is None or np.isfinite(found.value)
+            result = read_exif_exposure(tmp_path / "a.jpg")
+            assert result is None or np.isfinite(result.value)
 
 
 def test_exposures_file_round_trip(tmp_path):
@@ -115,9 +115,9 @@ def test_exposures_file_takes_precedence_over_exif(tmp_path):
 def test_camera_gains_are_light_ratios_to_the_display_power(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exposure(iso=100))
     (tmp_path / "b.jpg").write_bytes(with_exposure(iso=400))
-    found = exif_exposures([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
+    result = exif_exposures([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
     half = np.log(4) / 2.2 / 2
-    assert found.log_gains["b.jpg"] == pytest.approx([half] * 3)
-    assert found.log_gains["a.jpg"] == pytest.approx([-half] * 3)
-    assert found.spread == pytest.approx(half)
+    assert result.log_gains["b.jpg"] == pytest.approx([half] * 3)
+    assert result.log_gains["a.jpg"] == pytest.approx([-half] * 3)
+    assert result.spread == pytest.approx(half)
     assert exif_exposures([]).log_gains == {}

@@ -33,14 +33,14 @@ def test_converged_pixels_match_the_full_iteration(lens):
     x, y = np.meshgrid(np.linspace(-40, lens.width + 40, 97), np.linspace(-40, lens.height + 40, 71))
     fx, fy, cx, cy, rest = lens._split
     goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
-    found = goal
+    actual = goal
     with np.errstate(all="ignore"):
         for _ in range(MAX_ROUNDS):
-            found = lens_room._newton_step(MODELS[lens.model][1], rest, found, goal)
-    u, v = (one.ravel() for one in lens.undistort(x, y))
+            actual = lens_room._newton_step(MODELS[lens.model][1], rest, actual, goal)
+    u, v = (item.ravel() for item in lens.undistort(x, y))
     good = np.isfinite(u)
     assert good.mean() > 0.5
-    assert np.stack([u, v])[:, good].tobytes() == found[:, good].tobytes()
+    assert np.stack([u, v])[:, good].tobytes() == actual[:, good].tobytes()
 
 
 def test_photographs_of_one_camera_share_one_map(monkeypatch):
@@ -51,9 +51,9 @@ def test_photographs_of_one_camera_share_one_map(monkeypatch):
     monkeypatch.setattr(Lens, "distort", lambda self, u, v: (computed.append(u.size), distort(self, u, v))[1])
     photograph = np.zeros((STRONG.height, STRONG.width, 3), np.uint8)
     for _ in range(3):
-        one = intern_lens(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
-        one.undistort_image(photograph)
-        assert one.shown.any()
+        first = intern_lens(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
+        first.undistort_image(photograph)
+        assert first.shown.any()
     assert drawn[0] is drawn[1] is drawn[2]
     assert len(computed) == 2  # the map, and the pixels that are shown
 
@@ -91,8 +91,8 @@ def test_wide_pinhole_covers_the_whole_image(lens):
     assert 0.5 < lens.shown.mean() < 1
     inner = (py % 7 == 0) | (px % 7 == 0)
     py, px = py[inner], px[inner]
-    found = seen[py, px, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    error = np.abs(found - np.stack([px + 0.5, py + 0.5], axis=1)).max(axis=1)
+    actual = seen[py, px, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    error = np.abs(actual - np.stack([px + 0.5, py + 0.5], axis=1)).max(axis=1)
     x, y = lens.distort((px + 0.5 - camera.cx) / camera.fx, (py + 0.5 - camera.cy) / camera.fy)
     whole = (x > 0.5) & (y > 0.5) & (x < lens.width - 0.5) & (y < lens.height - 0.5)  # not on the last half pixel
     assert error[whole].max() < 0.1

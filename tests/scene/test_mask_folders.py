@@ -70,9 +70,9 @@ def test_masks_do_not_replace_those_of_the_dataset(tmp_path):
     """Which may say what no photograph shows, as those of undistortion do."""
     scene = write(tmp_path / "scene", tiny_model())
     masks_of(scene, scene / "masks")
-    told = refusal(applied, scene, masks_of(scene, tmp_path / "elsewhere"))
-    assert told.startswith(f"{scene}: the dataset already has masks, such as {scene / 'masks'}")
-    assert "remove scene.masks" in told
+    message = refusal(applied, scene, masks_of(scene, tmp_path / "elsewhere"))
+    assert message.startswith(f"{scene}: the dataset already has masks, such as {scene / 'masks'}")
+    assert "remove scene.masks" in message
 
 
 def test_mask_folder_does_not_depend_on_the_working_folder(tiny_scene, tmp_path, monkeypatch):
@@ -102,13 +102,13 @@ def test_image_without_a_mask_counts_fully_and_is_named(tiny_scene, tmp_path, ca
 
 def test_folder_without_matching_masks_is_refused(tiny_scene, tmp_path):
     first = read_scene(tiny_scene).views[0].name
-    told = refusal(applied, tiny_scene, tmp_path / "nowhere")
-    assert told.startswith(f"{tmp_path / 'nowhere'}: no such folder; expected ")
+    message = refusal(applied, tiny_scene, tmp_path / "nowhere")
+    assert message.startswith(f"{tmp_path / 'nowhere'}: no such folder; expected ")
     store(tmp_path / "others" / "x.png", np.zeros((40, 40), np.uint8))
-    told = refusal(applied, tiny_scene, tmp_path / "others")
-    assert f"contains no mask for the photographs of {tiny_scene}; expected " in told
-    assert str((tmp_path / "others" / first).with_suffix(".png")) in told
-    assert "set scene.masks to another folder" in told
+    message = refusal(applied, tiny_scene, tmp_path / "others")
+    assert f"contains no mask for the photographs of {tiny_scene}; expected " in message
+    assert str((tmp_path / "others" / first).with_suffix(".png")) in message
+    assert "set scene.masks to another folder" in message
 
 
 def test_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp_path):
@@ -148,8 +148,8 @@ def test_run_does_not_resume_with_other_masks(tiny_scene, tmp_path):
     name = read_scene(tiny_scene).views[0].name
     store((masks / name).with_suffix(".png"), np.full((40, 40), 255, np.uint8))
     again = ["run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "optimize.steps=12", "--set"]
-    told = command(*again, place, expect=2).stderr
-    assert f"{tiny_scene}: differs from the inputs of the run: the mask of 1 view ({name}); restore them" in told
+    output = command(*again, place, expect=2).stderr
+    assert f"{tiny_scene}: differs from the inputs of the run: the mask of 1 view ({name}); restore them" in output
     command(*again, f"scene.masks='{moved}'")  # the same content elsewhere
 
 

@@ -99,10 +99,10 @@ def test_folder_is_reproducible(folder, tmp_path):
 
 
 def test_inspect_reports_timestamps_and_cameras(folder):
-    found = Inspection.from_folder(folder)
-    assert summarize(found.facts)["times"] == "6 timestamps from 3 cameras"
-    assert not found.facts.same_pose
-    assert found.trainable
+    inspection = Inspection.from_folder(folder)
+    assert summarize(inspection.facts)["times"] == "6 timestamps from 3 cameras"
+    assert not inspection.facts.same_pose
+    assert inspection.trainable
 
 
 def timed(*times: float, **values: object) -> list[dict]:
@@ -146,9 +146,9 @@ def test_invalid_times_are_refused_with_their_location(tmp_path, times, message)
     path = write(tmp_path / "a", **LENS, frames=table)
     fault = refusal(read_scene, path)
     assert all(part in fault for part in message.split(".*")), fault
-    found = Inspection.from_folder(path)
-    assert not found.trainable
-    assert any(message.split(".*")[-1] in finding.text for finding in found.findings)
+    inspection = Inspection.from_folder(path)
+    assert not inspection.trainable
+    assert any(message.split(".*")[-1] in finding.text for finding in inspection.findings)
 
 
 def test_missing_static_mask_is_refused(tmp_path):
@@ -266,11 +266,11 @@ def test_colmap_folder_with_times_is_dynamic(tiny_colmap, tmp_path):
     assert times == pytest.approx(np.linspace(0, 1, len(names)))
     undistort_scene(tmp_path / "scene", tmp_path / "pinhole")
     assert [view.time for view in read_scene(tmp_path / "pinhole", 0).views] == pytest.approx(times)
-    place = tmp_path / "scene" / "images" / "times.json"
-    place.unlink()
-    place.symlink_to("nowhere.json")
+    path = tmp_path / "scene" / "images" / "times.json"
+    path.unlink()
+    path.symlink_to("nowhere.json")
     assert "times.json" in refusal(read_scene, tmp_path / "scene"), "what is there is read, or refused"
-    place.unlink()
+    path.unlink()
     write_times(tmp_path / "scene" / "images", {name: 1e17 + 32 * i for i, name in enumerate(names)})
     assert "is 1e+17; expected a number between -1e+15 and 1e+15" in refusal(read_scene, tmp_path / "scene")
     write_times(tmp_path / "scene" / "images", {name: 5.0 for name in names[1:]})

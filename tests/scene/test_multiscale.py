@@ -135,8 +135,8 @@ def draw_views(views: list[View], order: str, steps: int | list[int], seed: int 
 
 
 def scale_fractions(views: list[View], order: str, steps: int) -> dict[float, float]:
-    found = Counter(view.downscale for view in draw_views(views, order, steps))
-    return {scale: count / steps for scale, count in found.items()}
+    result = Counter(view.downscale for view in draw_views(views, order, steps))
+    return {scale: count / steps for scale, count in result.items()}
 
 
 def test_order_decides_how_often_scales_are_drawn():
@@ -159,6 +159,6 @@ def test_order_depends_only_on_seed_and_step(order):
 
 def test_every_view_is_drawn_before_any_repeats():
     views = views_of(7, 1, 2)
-    found = draw_views(views, "uniform", 28)
-    for epoch in (found[:14], found[14:]):
+    result = draw_views(views, "uniform", 28)
+    for epoch in (result[:14], result[14:]):
         assert len({(view.name, view.downscale) for view in epoch}) == 14

@@ -47,9 +47,9 @@ def test_nearest_points_are_in_front_of_training_views(tiny_scene):
 @pytest.mark.parametrize(("near", "warned"), [(0.001, False), (3, True)])
 def test_run_warns_of_points_in_front_of_the_near_plane(tmp_path, rng, caplog, near, warned):
     Yard(rng).write(tmp_path / "yard")
-    asked = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", f"model.near={near}"])
-    describe(asked, RunState.read(tmp_path / "run"), None, "new")
+    pipeline = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", f"model.near={near}"])
+    describe(pipeline, RunState.read(tmp_path / "run"), None, "new")
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    told = [message for message in warnings if "model.near" in message]
-    assert len(told) == warned
-    assert all(f"model.near={near} scene units" in one and "set model.near to " in one for one in told)
+    messages = [message for message in warnings if "model.near" in message]
+    assert len(messages) == warned
+    assert all(f"model.near={near} scene units" in item and "set model.near to " in item for item in messages)

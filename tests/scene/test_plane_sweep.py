@@ -200,10 +200,10 @@ def test_points_and_sweep_are_combined(tiny_scene, tmp_path, caplog):
     caplog.set_level("INFO", "clsplat")
     sets = ("init.source=points+sweep", "init.sweep_points=60", "optimize.steps=1")
     train(tiny_scene, tmp_path / "run", *sets)
-    found = re.search(r"([\d,]+) Gaussians from the scene's points and a plane sweep", caplog.text)
-    assert found
+    match = re.search(r"([\d,]+) Gaussians from the scene's points and a plane sweep", caplog.text)
+    assert match
     expected = Init(source="points+sweep", sweep_points=60).expected_count(scene)
-    assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
+    assert len(scene.points) < int(match[1].replace(",", "")) <= expected == len(scene.points) + 60
 
 
 def test_empty_sweep_is_reported(tiny_scene, tmp_path, monkeypatch, caplog):

@@ -73,7 +73,7 @@ def test_transparent_level_of_a_gray_photograph_is_kept(tmp_path, bits, level, r
 
 def test_pixels_do_not_depend_on_truncated_metadata():
     data = with_chunk(encoded(KINDS["color"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
-    whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, strip_png_metadata(data)))
+    whole, cut = (cv2.imdecode(np.frombuffer(item, np.uint8), -1) for item in (data, strip_png_metadata(data)))
     np.testing.assert_array_equal(whole, cut)
     assert len(strip_png_metadata(data)) < len(data)
 

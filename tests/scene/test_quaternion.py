@@ -26,8 +26,8 @@ def test_one_and_many_rotations_have_the_same_bits(rng):
 def test_quaternions_of_rotations_are_the_same_up_to_sign(rng):
     quaternions = rng.normal(size=(50, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    found = unit_quaternions(rotation_matrix(*quaternions.T))
-    np.testing.assert_allclose(np.abs((found * quaternions).sum(axis=1)), 1, atol=1e-12)
+    result = unit_quaternions(rotation_matrix(*quaternions.T))
+    np.testing.assert_allclose(np.abs((result * quaternions).sum(axis=1)), 1, atol=1e-12)
     np.testing.assert_array_equal(unit_quaternions(np.eye(3)), [1, 0, 0, 0])
 
 

@@ -38,9 +38,9 @@ def test_error_is_the_distance_to_the_projected_point(rng, lens):
     straight = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     places = lens.project(seen) if lens else straight
     points[3, 2] = -5
-    found = reprojection_residuals(view, points, places + VECTOR)
-    assert np.isnan(found[3]).all(), "behind the camera"
-    np.testing.assert_allclose(np.delete(found, 3, axis=0), np.tile(VECTOR, (6, 1)), atol=1e-9)
+    result = reprojection_residuals(view, points, places + VECTOR)
+    assert np.isnan(result[3]).all(), "behind the camera"
+    np.testing.assert_allclose(np.delete(result, 3, axis=0), np.tile(VECTOR, (6, 1)), atol=1e-9)
     straight[:4] = [[1e7, 1e7], [-1e308, 0], [np.inf, 0], [np.nan, 1]]
     assert np.isnan(reprojection_residuals(view, points, straight)[:4]).all(), "outside the photograph"
 
@@ -61,9 +61,9 @@ def test_points_with_large_errors_give_no_depth():
     view, rows = View("a", STRONG.pinhole, np.eye(3, 4)), np.array([1, 3, 5, 6])
     missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
     tracks = Tracks(np.zeros((7, 3)), {"a": rows, "b": rows[:1], "c": rows}, missed)
-    found = filter_tracks(tracks, [view, replace(view, name="c")])
-    assert {name: rows.tolist() for name, rows in found.rows.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
-    np.testing.assert_array_equal(found.residuals["a"], missed["a"][1:3])
+    result = filter_tracks(tracks, [view, replace(view, name="c")])
+    assert {name: rows.tolist() for name, rows in result.rows.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
+    np.testing.assert_array_equal(result.residuals["a"], missed["a"][1:3])
     assert filter_tracks(tracks, [view.resized(2)]).rows["a"].tolist() == [1, 3, 5]
     assert filter_tracks(tracks, [view.resized(2), view, view.resized(4)]).rows["a"].tolist() == [3, 5], (
         "in several sizes"
@@ -105,7 +105,7 @@ def test_photos_recipe_optimizes_poses_from_one_pixel(error, learned):
         assert training.model_copy(update={"modules": []}) == load("fast").settings.training
     assert f"cameras fit the points to {error:g} px: " in chosen.decisions[-1].reason
     without = apply_adaptation(load("photos"), Measures(60)).settings.optimize
-    assert [one.type for one in without.modules] == ["exposure"]
+    assert [module.type for module in without.modules] == ["exposure"]
 
 
 @pytest.mark.parametrize(("length", "level"), [(0.5, None), (1.5, "note"), (2.5, "warning")])
@@ -113,15 +113,15 @@ def test_inspect_recommends_a_setting(tmp_path, rng, length, level):
     inspection = Inspection.from_folder(missing(tmp_path / "scene", length * VECTOR / 1.5, rng))
     assert inspection.facts.points is not None
     assert inspection.facts.points.error_mean == pytest.approx(length, rel=1e-5)
-    found = [one for one in inspection.findings if "reprojection" in one.fault]
-    assert [one.level for one in found] == ([] if level is None else [level])
-    assert all('--set "optimize.modules.camera_optimizer={start: 500}"' in one.remedy for one in found)
+    actual = [one for one in inspection.findings if "reprojection" in one.fault]
+    assert [one.level for one in actual] == ([] if level is None else [level])
+    assert all('--set "optimize.modules.camera_optimizer={start: 500}"' in one.remedy for one in actual)
 
 
 def test_inspect_and_the_photos_recipe_agree():
     for error, learned in ((POSES_ERROR - 0.01, None), (POSES_ERROR, {"start": 500})):
-        (found,) = [one for one in apply_adaptation(load("photos"), Measures(9, error)).decisions if one.key in POSES]
-        assert found.value == learned
+        (actual,) = [decision for decision in apply_adaptation(load("photos"), Measures(9, error)).decisions if decision.key in POSES]
+        assert actual.value == learned
     assert POSES == "optimize.modules.camera_optimizer={start: 500}"
 
 
@@ -135,8 +135,8 @@ def test_inspect_and_the_photos_recipe_agree():
 def test_optional_sky_is_off_with_conflicting_settings(of_step, reason, tmp_path, rng, caplog):
     folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
     caplog.set_level("DEBUG", "clsplat")
-    asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
-    describe(asked, RunState.read(tmp_path / "run"), None, "new")
+    pipeline = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
+    describe(pipeline, RunState.read(tmp_path / "run"), None, "new")
     assert f"model.background: off, since {reason}" in caplog.text
 
 
@@ -146,9 +146,9 @@ def test_pipeline_with_poses_and_sky_is_refused():
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=envmap"])
         with pytest.raises(ConfigError, match="'random_background' cannot be combined with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
-    asked = load("photos", ["model.background=envmap"])  # which may learn poses
+    pipeline = load("photos", ["model.background=envmap"])  # which may learn poses
     with pytest.raises(ConfigError, match=r"adapt: photos: .*cannot be learned together with poses.*; overrid"):
-        apply_adaptation(asked, Measures(60, 1.0))
+        apply_adaptation(pipeline, Measures(60, 1.0))
 
 
 @pytest.mark.slow
@@ -160,7 +160,7 @@ def test_enabling_poses_disables_the_sky(tmp_path, rng):
     asked += ["optimize.modules.random_background=null"]
     run_pipeline(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
     written = load(str(tmp_path / "run" / "pipeline.yaml")).settings
-    assert "camera_optimizer" in [one.type for one in written.training.modules]
+    assert "camera_optimizer" in [module.type for module in written.training.modules]
     background = written.model.background
     assert background.chosen == "off"
     assert background.reason.startswith("'camera_optimizer' cannot be combined with sky: ")

@@ -46,9 +46,9 @@ def test_every_nth_view_from_an_offset_is_for_testing(folder):
 )
 def test_split_changes_only_the_views(folder, split):
     scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
-    found = Split(**split).apply(scene)
-    assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
-    assert {view.name for view in found.views} <= {view.name for view in scene.views}
+    result = Split(**split).apply(scene)
+    assert (result.tracks, result.points, result.background) == (scene.tracks, scene.points, scene.background)
+    assert {view.name for view in result.views} <= {view.name for view in scene.views}
 
 
 @pytest.mark.parametrize("listed", ["b", "images/b.png", "images\\b.png", "b.jpg", "images/b.JPG"])
@@ -180,7 +180,7 @@ def test_too_large_fold_is_refused(folder):
 
 
 def test_run_detects_a_changed_fold(folder):
-    whole, fold = (Identity.from_scene(read_scene(folder, Split(8, None, one)), {}) for one in (0, "auto"))
+    whole, fold = (Identity.from_scene(read_scene(folder, Split(8, None, item)), {}) for item in (0, "auto"))
     assert whole.digest != fold.digest
     assert fold.changes(whole) == ["the split of 3 views (images/f.png, images/o.png, images/x.png)"]
     assert Identity.from_data(json.loads(json.dumps(fold.data()))) == fold
@@ -254,9 +254,9 @@ def test_invalid_selection_is_explained(setting, fault):
 def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, count, warned):
     scene = read_scene(tiny_scene, Split(0))
     RunScene.from_scene(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
-    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(told) == bool(warned)
-    assert all(warned in text for text in told), told
+    messages = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(messages) == bool(warned)
+    assert all(warned in text for text in messages), messages
 
 
 def test_every_nth_without_test_views_is_refused(folder):

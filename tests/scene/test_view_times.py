@@ -47,9 +47,9 @@ def test_copied_views_keep_their_time(tmp_path):
 
 
 def test_changed_time_changes_the_scene_identity(tmp_path):
-    one, other = (Identity.from_scene(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
-    assert one.digest != other.digest
-    assert other.changes(one) == ["the time of 1 view (v1)"]
+    first, other = (Identity.from_scene(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
+    assert first.digest != other.digest
+    assert other.changes(first) == ["the time of 1 view (v1)"]
     assert Identity.from_data(other.data()) == other
 
 

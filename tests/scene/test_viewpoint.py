@@ -82,5 +82,5 @@ def test_pivot_is_where_view_axes_meet():
 
 def test_parallel_axes_meet_at_the_depth_of_the_splats():
     places = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]])
-    found = nearest_to_axes(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
-    np.testing.assert_allclose(found, [1, 1, 7], atol=0.02)
+    result = nearest_to_axes(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
+    np.testing.assert_allclose(result, [1, 1, 7], atol=0.02)

@@ -102,12 +102,12 @@ def test_energy_of_bands_is_the_mean_square_over_directions(rng, degree):
     rest = rng.normal(size=(4, columns)).astype(np.float32)
     directions = rng.normal(size=(200_000, 3))
     basis = ref.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True), degree)[:, 1:]
-    found = compute_band_energy(rest)
-    assert found.shape == (4, degree)
+    result = compute_band_energy(rest)
+    assert result.shape == (4, degree)
     for band in range(degree):
         only = np.where(expand_bands(np.arange(degree)[None].repeat(4, axis=0) == band), rest, 0)
         colors = np.einsum("dk,nkc->dnc", basis, only.reshape(4, -1, 3).astype(np.float64))
-        np.testing.assert_allclose(found[:, band], np.square(colors).sum(axis=2).mean(axis=0), rtol=0.03)
+        np.testing.assert_allclose(result[:, band], np.square(colors).sum(axis=2).mean(axis=0), rtol=0.03)
 
 
 def test_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
@@ -134,11 +134,11 @@ def test_measured_file_is_read_back(finished, tiny_scene):
     """Metrics are those of the quantized file, not those of the model that it was made from."""
     from clsplat.api.commands import evaluate
 
-    found = json.loads((finished.out / "metrics.json").read_text())["test"]["1"]
+    actual = json.loads((finished.out / "metrics.json").read_text())["test"]["1"]
     quantized = evaluate(finished.out / "model.sog", tiny_scene)["test"]["1"]
     exact = evaluate(finished.out / "point_cloud.ply", tiny_scene)["test"]["1"]
-    assert found["psnr"] == pytest.approx(quantized["psnr"], abs=1e-6)
-    assert abs(found["psnr"] - exact["psnr"]) > 1e-4
+    assert actual["psnr"] == pytest.approx(quantized["psnr"], abs=1e-6)
+    assert abs(actual["psnr"] - exact["psnr"]) > 1e-4
 
 
 def test_final_counts_and_degrees(finished, source):
@@ -225,7 +225,7 @@ def test_sog_stores_the_trained_harmonics(varied_harmonics, tiny_scene, tmp_path
     assert len(np.unique(model.sh_rest, axis=0)) <= 1024 < len(model)
     assert len(np.unique(model.sh_rest)) <= 256
     assert not np.array_equal(model.sh_base, load(varied_harmonics).sh_base), "the other tables were trained"
-    ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
+    ours, theirs = (np.unique(item.sh_rest, axis=0, return_counts=True) for item in (model, back))
     np.testing.assert_array_equal(ours[0], theirs[0])
     np.testing.assert_array_equal(ours[1], theirs[1])
 
@@ -295,7 +295,7 @@ def test_trained_palette_is_rounded_to_sog_precision(palette_run):
     assert len(np.unique(model.sh_rest)) <= 256 < len(np.unique(after.sh_rest))
     assert len(np.unique(model.sh_rest, axis=0)) <= 1024
     np.testing.assert_allclose(model.sh_rest, after.sh_rest, atol=0.01)
-    ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
+    ours, theirs = (np.unique(item.sh_rest, axis=0, return_counts=True) for item in (model, back))
     np.testing.assert_array_equal(ours[0], theirs[0])
     np.testing.assert_array_equal(ours[1], theirs[1])
 

@@ -36,9 +36,9 @@ def visible_error(visibility: SimpleNamespace, i: int, error: np.ndarray) -> flo
 
 @pytest.mark.parametrize("coefficients", [3, 8, 15])
 def test_quadratic_form_is_the_error_visible_in_the_views(visibility, rng, coefficients):
-    found, errors = error_of(visibility, coefficients), rng.normal(size=(60, 3 * coefficients))
-    forms = (found.gradient(errors) * errors).sum(axis=1)
-    everywhere = UNSEEN / (4 * np.pi) * (found.weights + FAINT * found.weights.mean())
+    result, errors = error_of(visibility, coefficients), rng.normal(size=(60, 3 * coefficients))
+    forms = (result.gradient(errors) * errors).sum(axis=1)
+    everywhere = UNSEEN / (4 * np.pi) * (result.weights + FAINT * result.weights.mean())
     expected = [visible_error(visibility, i, errors[i]) for i in range(59)]
     np.testing.assert_allclose(
         (forms - everywhere * np.square(errors).sum(axis=1))[:59], expected, rtol=1e-6, atol=1e-9
@@ -47,8 +47,8 @@ def test_quadratic_form_is_the_error_visible_in_the_views(visibility, rng, coeff
 
 
 def test_base_color_absorbs_the_mean_error(visibility, rng):
-    found, error = error_of(visibility, 15), rng.normal(size=(60, 45))
-    change = found.base_change(error)
+    result, error = error_of(visibility, 15), rng.normal(size=(60, 45))
+    change = result.base_change(error)
     directions = visibility.means[7] - POSITIONS
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     colors = ref.sh_basis(directions, 3)[:, 1:] @ error[7].reshape(15, 3)
@@ -57,18 +57,18 @@ def test_base_color_absorbs_the_mean_error(visibility, rng):
 
 
 def test_palette_refinement_lowers_the_visible_error(visibility, rng):
-    found, rest = error_of(visibility, 15), rng.normal(0, 0.1, (60, 45)).astype(np.float32)
+    result, rest = error_of(visibility, 15), rng.normal(0, 0.1, (60, 45)).astype(np.float32)
 
     def error_with(vectors: np.ndarray) -> float:
         left = (rest[:, None] - vectors)[np.arange(60)[:, None], np.arange(len(vectors))]
-        forms = [(found.gradient(left[:, e]) * left[:, e]).sum(axis=1) for e in range(len(vectors))]
+        forms = [(result.gradient(left[:, e]) * left[:, e]).sum(axis=1) for e in range(len(vectors))]
         return float(np.min(forms, axis=0).sum())
 
     def most_alike(points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         return (points.astype(np.float64) @ vectors.T.astype(np.float64)).argmax(axis=1)
 
     first = rest[:8].astype(np.float64)
-    vectors, labels = found.palette(rest, first, nearest=most_alike)
+    vectors, labels = result.palette(rest, first, nearest=most_alike)
     assert error_with(vectors) < 0.8 * error_with(first)
     left = rest - vectors[labels]
-    assert (found.gradient(left) * left).sum() == pytest.approx(error_with(vectors), rel=1e-4), "each has its best one"
+    assert (result.gradient(left) * left).sum() == pytest.approx(error_with(vectors), rel=1e-4), "each has its best one"

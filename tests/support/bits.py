@@ -435,16 +435,16 @@ def main() -> int:
     if arguments.list:
         print(*chosen, sep="\n")
         return 0
-    found = {}
+    results = {}
     for name, digest in hashes(chosen, arguments.jobs):
-        found[name] = digest
+        results[name] = digest
         print(name, digest, flush=True)
     if arguments.out:
-        arguments.out.write_text("".join(f"{name} {digest}\n" for name, digest in found.items()))
-    differ = [name for name in found if found[name] != found.get(chosen[name].same_as, found[name])]
+        arguments.out.write_text("".join(f"{name} {digest}\n" for name, digest in results.items()))
+    differ = [name for name in results if results[name] != results.get(chosen[name].same_as, results[name])]
     for name in differ:
         print(f"{name}: other bits than {chosen[name].same_as}", file=sys.stderr)
-    return int(bool(differ) or "FAILED" in found.values())
+    return int(bool(differ) or "FAILED" in results.values())
 
 
 if __name__ == "__main__":

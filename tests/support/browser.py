@@ -84,8 +84,8 @@ class Browser:
             assert more, "the browser has ended"
             self._bytes += more
         line, _, self._bytes = self._bytes.partition(b"\0")
-        found: dict[str, Any] = json.loads(line)
-        return found
+        data: dict[str, Any] = json.loads(line)
+        return data
 
     def _note(self, event: dict[str, Any]) -> None:
         parameters = event.get("params", {})

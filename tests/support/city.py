@@ -72,14 +72,14 @@ def lot(x: int, y: int, center: tuple[float, float]) -> list[Shape]:
     height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * chance(x, y, 1) ** 2
     sides = [LOT / 2 * (0.72 + 0.28 * chance(x, y, purpose)) for purpose in (2, 3)]
     shapes = [(1.0, height, 4)] + ([(0.55, 0.5 * height, 6)] if chance(x, y, 8) < 0.4 else [])
-    found: list[Shape] = []
+    results: list[Shape] = []
     floor = 0.0
     for share, tall, purpose in shapes:
         half = (share * sides[0], share * sides[1], tall / 2)
         wall, roof = (kinds[int(4 * chance(x, y, purpose + i))] for i, kinds in enumerate((WALLS, ROOFS)))
-        found.append(Cuboid(center=(*center, floor + tall / 2), half=half, paint=partial(house, half, wall, roof)))
+        results.append(Cuboid(center=(*center, floor + tall / 2), half=half, paint=partial(house, half, wall, roof)))
         floor += tall
-    return found
+    return results
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,10 @@ def on_devices(names: str, rows: Iterable[Any]) -> pytest.MarkDecorator:
     Neighbors among the rows, which are often of one class of sizes, get different settings; where there are fewer rows
     than settings the rows come again.
     """
-    settings, found = list(TUNINGS), [joined(row) for row in rows]
+    settings, actual = list(TUNINGS), [joined(row) for row in rows]
     cases = []
     for name in NAMES:
-        for i, row in zip(range(max(len(found), len(settings))), itertools.cycle(found), strict=False):
+        for i, row in zip(range(max(len(actual), len(settings))), itertools.cycle(actual), strict=False):
             setting = settings[(i + i // len(settings)) % len(settings)]
             text = "-".join([name, setting, *map(case_name, row.values)])
             cases.append(pytest.param((name, setting), *row.values, marks=row.marks, id=text))

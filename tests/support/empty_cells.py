@@ -41,9 +41,9 @@ def measure(cells: int, workers: int, folder: Path) -> None:
     drive.run(wanted)
     seconds = time.perf_counter() - begin
     engine.close()
-    told = [event["event"] for event in store.events()]
+    messages = [event["event"] for event in store.events()]
     print(f"{cells} cells on {workers} workers: {seconds:.1f} s, {1000 * seconds / cells:.1f} ms each")
-    print({event: told.count(event) for event in sorted(set(told))})
+    print({event: messages.count(event) for event in sorted(set(messages))})
 
 
 if __name__ == "__main__":

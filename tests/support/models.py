@@ -67,11 +67,11 @@ def angles(a: SplatFile, b: SplatFile) -> np.ndarray:
     return np.degrees(2 * np.arccos(np.minimum(cosine, 1)))
 
 
-def assert_close(found: SplatFile, expected: SplatFile, turned: float, **bounds: float) -> None:
+def assert_close(actual: SplatFile, expected: SplatFile, turned: float, **bounds: float) -> None:
     """Compare two models table by table: rotations in degrees, opacities in [0, 1], others in their own units."""
-    a, b = found.parameters, expected.parameters
+    a, b = actual.parameters, expected.parameters
     assert list(a) == list(PARAMETERS)
-    assert angles(found, expected).max() <= turned
+    assert angles(actual, expected).max() <= turned
     for name, bound in bounds.items():
         if name == "opacity":
             difference = np.abs(opacities(a["logit_opacity"]) - opacities(b["logit_opacity"]))

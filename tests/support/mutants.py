@@ -49,13 +49,13 @@ def python_mutants(path: Path) -> list[Mutant]:
     starts = [0]
     for line in text.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
-    lines, found = text.splitlines(), []
+    lines, results = text.splitlines(), []
 
     def at(line: int, column: int) -> int:
         return starts[line - 1] + len(lines[line - 1].encode()[:column].decode())
 
     def add(line: int, offset: int, old: str, new: str) -> None:
-        found.append(Mutant(str(path.relative_to(ROOT)), line, offset, old, new))
+        results.append(Mutant(str(path.relative_to(ROOT)), line, offset, old, new))
 
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in OPERATORS:
@@ -79,7 +79,7 @@ def python_mutants(path: Path) -> list[Mutant]:
                 add(node.lineno, begin, text[begin:end], "False")
         elif isinstance(node, ast.Expr) and WAITS.match(lines[node.lineno - 1]) and node.lineno == node.end_lineno:
             add(node.lineno, at(node.lineno, node.col_offset), lines[node.lineno - 1].strip(), "pass")
-    return found
+    return results
 
 
 def add_operator(left: ast.expr, right: ast.expr, operator: str, text: str, at, add) -> None:  # type: ignore[no-untyped-def]
@@ -91,7 +91,7 @@ def add_operator(left: ast.expr, right: ast.expr, operator: str, text: str, at, 
 
 def kernel_mutants(path: Path) -> list[Mutant]:
     """All faults that can be planted in a kernel file, outside of comments and preprocessor lines."""
-    text, found = path.read_text(), []
+    text, results = path.read_text(), []
     bare = re.sub(
         r"//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*", lambda m: re.sub(r"[^\n]", " ", m.group()), text, flags=re.M | re.S
     )
@@ -103,10 +103,10 @@ def kernel_mutants(path: Path) -> list[Mutant]:
             new = SWAPS[old]
         else:
             new = f"{float(old.rstrip('f')) * 1.5 or 0.5}f" if "." in old else str(int(old.rstrip("f")) + 1)
-        found.append(
+        results.append(
             Mutant(str(path.relative_to(ROOT)), text.count("\n", 0, match.start()) + 1, match.start(), old, new)
         )
-    return found
+    return results
 
 
 def draw(seed: int, count: int) -> list[Mutant]:
@@ -126,8 +126,8 @@ def draw(seed: int, count: int) -> list[Mutant]:
         else:
             options = python_mutants(rng.choice(places[rooms[(i - i // 4) % len(rooms)]]))
         if options:
-            kind = rng.choice(sorted({_kind(one) for one in options}))
-            drawn.append(rng.choice([one for one in options if _kind(one) == kind]))
+            kind = rng.choice(sorted({_kind(option) for option in options}))
+            drawn.append(rng.choice([option for option in options if _kind(option) == kind]))
     return drawn
 
 

@@ -58,9 +58,9 @@ def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
 
 
 def decoded(path):
-    reader, found = cv2.VideoCapture(str(path)), []
+    reader, results = cv2.VideoCapture(str(path)), []
     while True:
         good, image = reader.read()
         if not good:
-            return found, reader.get(cv2.CAP_PROP_FPS)
-        found.append(image[:, :, ::-1])
+            return results, reader.get(cv2.CAP_PROP_FPS)
+        results.append(image[:, :, ::-1])

@@ -30,9 +30,9 @@ matrix:
 SMALL = OWN + STAGES
 
 
-def names(found: Experiment | None) -> list[str]:
-    assert found is not None
-    return [cell.name for cell in found.cells]
+def names(actual: Experiment | None) -> list[str]:
+    assert actual is not None
+    return [cell.name for cell in actual.cells]
 
 
 def flat(value: object, place: str = "") -> dict[str, object]:
@@ -43,13 +43,13 @@ def flat(value: object, place: str = "") -> dict[str, object]:
         return {k: v for key, inner in value.items() for k, v in flat(inner, f"{place}.{key}".strip(".")).items()}
     if isinstance(value, list) and all(isinstance(item, dict) for item in value):
         names: list[str] = []
-        found: dict[str, object] = {}
+        results: dict[str, object] = {}
         for item in value:
             name = item.get("type") or next(iter(item))
             names.append(name)
             key = f"{place}.{name}" + (f"~{names.count(name)}" if names.count(name) > 1 else "")
-            found |= flat(item if "type" in item else item[name], key)
-        return found
+            results |= flat(item if "type" in item else item[name], key)
+        return results
     return {place: value}
 
 

@@ -74,26 +74,26 @@ class Sweep:
 
 
 def models(out: Path) -> dict[str, str]:
-    found = sorted(out.glob("*/point_cloud.ply"))
-    return {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
+    actual = sorted(out.glob("*/point_cloud.ply"))
+    return {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in actual}
 
 
 def hashes_without_store(sweep: Sweep, out: Path) -> dict[str, str]:
     """The hashes of the same cells, run one after the other without a store."""
-    found = load_experiment(str(sweep.file))
-    assert found is not None
-    experiment.run_matrix(found, RunState.read(out), None, "new")
+    actual = load_experiment(str(sweep.file))
+    assert actual is not None
+    experiment.run_matrix(actual, RunState.read(out), None, "new")
     return models(out)
 
 
 def runs_below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
     """The processes that train."""
-    return [one for one in _below(process) if "--attended" in _words(one)]
+    return [item for item in _below(process) if "--attended" in _words(item)]
 
 
 def workers_below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
     """The processes of Dask's workers."""
-    return [one for one in _below(process) if any("spawn_main" in word for word in _words(one))]
+    return [item for item in _below(process) if any("spawn_main" in word for word in _words(item))]
 
 
 def _below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
@@ -113,9 +113,9 @@ def _words(process: "psutil.Process") -> list[str]:
 def kill(processes: "list[psutil.Process]") -> int:
     """Kill them; return their number."""
     count = 0
-    for one in processes:
+    for process in processes:
         try:
-            one.send_signal(signal.SIGKILL)
+            process.send_signal(signal.SIGKILL)
             count += 1
         except psutil.NoSuchProcess:
             pass

@@ -13,11 +13,11 @@ OTHER = DeviceSlot("w", "o", "y", memory=3)
 
 
 def states(store, options, engine, is_same=True, costs=(1,)):
-    found = []
-    Dispatcher(store, engine, is_same, options, on_end=lambda cell, end: found.append(end.state)).run(
+    results = []
+    Dispatcher(store, engine, is_same, options, on_end=lambda cell, end: results.append(end.state)).run(
         pending_cells(*costs)
     )
-    return found
+    return results
 
 
 def test_longest_cell_gets_the_largest_device(store, options):
@@ -35,8 +35,8 @@ def test_cell_that_does_not_fit_goes_to_a_larger_device(store, options, caplog):
 
 @pytest.mark.parametrize(("is_same", "ends"), [(True, ["failed"]), (False, ["published"])])
 def test_only_devices_that_may_run_a_cell_are_tried(store, options, is_same, ends):
-    (one,) = pending_cells(1)
-    store.add(one.in_class("x"))
+    (first,) = pending_cells(1)
+    store.add(first.in_class("x"))
     engine = Fake(FULL, *[DONE] * (not is_same), slots=(SMALL, OTHER) if not is_same else (SMALL,))
     assert states(store, options, engine, is_same) == ends
     assert [device for _, device, _ in engine.started] == (["s"] if is_same else ["s", "o"])

@@ -345,18 +345,18 @@ def test_sweep_stays_in_the_bits_class_of_most_devices(store, options):
 
 
 def test_cell_stays_in_the_class_it_started_in(store, options):
-    (one,) = pending_cells(9)
-    store.add(one.in_class("x"))
+    (first,) = pending_cells(9)
+    store.add(first.in_class("x"))
     engine = Fake(*[Outcome("published")] * 4, slots=SLOTS)
-    Dispatcher(store, engine, False, options).run([one, *pending_cells(1, 2, 3)])
+    Dispatcher(store, engine, False, options).run([first, *pending_cells(1, 2, 3)])
     assert engine.started[0] == ("9", "one", "x")
     assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
 
 
 @pytest.mark.parametrize("published", ["x", "y", None])
 def test_class_with_most_results_breaks_ties(store, options, published):
-    for one in pending_cells(1, 2) if published else []:
-        run_cell(one.in_class(published), store, command(WRITES), options)
+    for item in pending_cells(1, 2) if published else []:
+        run_cell(item.in_class(published), store, command(WRITES), options)
     engine = Fake(*[Outcome("published")] * 3, slots=SLOTS[1::-1])
     Dispatcher(store, engine, True, options).run(pending_cells(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {published or "x"}
@@ -425,14 +425,14 @@ def test_store_state_is_read_from_files(store, options):
     store.add(cells[2]).begin("w", options.since)
     store.add(cells[3])
     store.note_sweep("sweep", {cell.name: cell.key for cell in cells}, "")
-    found = store_status(store.root)
-    assert {cell["name"]: cell["state"] for cell in found["cells"]} == {
+    result = store_status(store.root)
+    assert {cell["name"]: cell["state"] for cell in result["cells"]} == {
         "done": "published",
         "bad": "failed",
         "on": "running",
         "new": "waiting",
     }
-    text = overview_text(found)
+    text = overview_text(result)
     store.folder(cells[1].key).begin("w", options.since)
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
     store.folder(cells[1].key).give_up(2, "of another process, which has tried it too")

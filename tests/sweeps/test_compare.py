@@ -167,29 +167,29 @@ def test_curves_of_runs_with_one_seed_are_named_by_folder(make_run, tmp_path):
 
 def test_each_scene_and_size_has_a_table(make_run, tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "second")
-    one, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)
+    first, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)
     half = make_run("half", "scene.downscale=2", psnr=40)
     shutil.rmtree(half / "renders")
-    comparison = RunComparison.read([one, two, half])
+    comparison = RunComparison.read([first, two, half])
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
-    page = page_of(tmp_path, one, two, half)
+    page = page_of(tmp_path, first, two, half)
     assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views, at the training size</p>' in page
     assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
     assert page.count("No crops: ") == 1, "only the run without renders has none"
 
 
 def test_differing_settings_are_matched_by_name():
-    one = flatten(load("splat").resolved())
-    assert one["optimize.steps"] == "30000"
-    assert one["optimize.densify.clone.gradient_above"] == "0.0002"
-    assert one["optimize.reset_opacity#2.when_background"] == "white"
-    assert one["optimize.dssim.weight"] == "0.2"
+    first = flatten(load("splat").resolved())
+    assert first["optimize.steps"] == "30000"
+    assert first["optimize.densify.clone.gradient_above"] == "0.0002"
+    assert first["optimize.reset_opacity#2.when_background"] == "white"
+    assert first["optimize.dssim.weight"] == "0.2"
     two = flatten(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved())
-    assert differing_keys([one, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
-    assert differing_keys([one, one]) == []
+    assert differing_keys([first, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
+    assert differing_keys([first, first]) == []
     short = flatten(load("smoke").resolved())
-    assert "optimize.densify.prune_large.start" in differing_keys([one, short]), "a rule that only one has"
+    assert "optimize.densify.prune_large.start" in differing_keys([first, short]), "a rule that only one has"
 
 
 def test_page_shows_only_differing_settings(make_run, tmp_path):
@@ -241,9 +241,9 @@ def crops_of(*folders: Path) -> list[crops.ImageCrop]:
 def test_crops_show_where_runs_differ(make_run, monkeypatch):
     """One run is the photograph, the other is darker in the lower right quarter."""
     monkeypatch.setattr(crops, "MIN_SIDE", 12)
-    found = crops_of(make_run("equal", error=0), make_run("darker", error=60))
-    assert len(found) == 2, "one of each test view"
-    for crop in found:
+    result = crops_of(make_run("equal", error=0), make_run("darker", error=60))
+    assert len(result) == 2, "one of each test view"
+    for crop in result:
         assert 20 <= crop.x <= 28, "from the middle to the right"
         assert 20 <= crop.y <= 28
         assert crop.frame == {"left": crop.x / 0.4, "top": crop.y / 0.4, "width": 32.5, "height": 32.5}
@@ -253,9 +253,9 @@ def test_crops_show_where_runs_differ(make_run, monkeypatch):
 
 
 def test_single_run_is_compared_with_the_photograph(make_run):
-    found = crops_of(make_run("alone", error=60))
-    assert len(found) == 2
-    assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in found)
+    result = crops_of(make_run("alone", error=60))
+    assert len(result) == 2
+    assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in result)
 
 
 def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
@@ -269,8 +269,8 @@ def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
         views.append(replace(view, lens=lens, camera=lens.pinhole))
         if (folder / "renders" / f"{view.name}.png").is_file():
             write_image(folder / "renders" / f"{view.name}.png", load_image(views[-1], WHITE))
-    found = crops.find_crops([run], replace(scene, views=tuple(views)), background)
-    assert [crop.psnrs for crop in found] == [[100.0]] * 2
+    result = crops.find_crops([run], replace(scene, views=tuple(views)), background)
+    assert [crop.psnrs for crop in result] == [[100.0]] * 2
 
 
 def test_page_of_a_single_run_has_no_best_and_no_seeds(make_run, tmp_path):
@@ -336,8 +336,8 @@ def test_lpips_of_different_ranges_is_marked(make_run, tmp_path):
     def averages(inputs: str) -> dict[str, object]:
         return {"1": {"psnr": 20, "ssim": 0.5, "lpips": 0.25, "lpips_input": inputs, "views": 2}}
 
-    one, two = make_run("one", test=averages("0..1")), make_run("two", "init.opacity=0.3", test=averages("-1..1"))
-    page = page_of(tmp_path, one, two)
+    first, two = make_run("one", test=averages("0..1")), make_run("two", "init.opacity=0.3", test=averages("-1..1"))
+    page = page_of(tmp_path, first, two)
     assert "0.2500" in page
     assert "The input range of LPIPS differs between runs (-1..1, 0..1)." in page
 
@@ -348,10 +348,10 @@ def test_means_over_other_numbers_of_views_are_marked(make_run, tmp_path, size, 
         return {size: {"psnr": 20, "ssim": 0.5, "views": 7, **figures}}
 
     few = {"psnr_color": 30.0, "psnr_color_views": 1, "psnr_color_reason": "why"}
-    one, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
+    first, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
     three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_color=25.0))
     said = f"The number of {words} with a PSNR in the photos' colors differs between runs (1, 7)."
-    assert said in html.unescape(page_of(tmp_path, one, two, three))
+    assert said in html.unescape(page_of(tmp_path, first, two, three))
     assert "differs between runs" not in page_of(tmp_path, two, three), "what has no figure is not compared"
 
 

@@ -30,20 +30,20 @@ def from_model(model: Path | str, scene: Path, notes: Path) -> str:
 
 
 def test_key_includes_the_content_of_a_folders_model(few_steps, tiny_scene, tmp_path):
-    one, other = (tmp_path / name for name in ("one", "other"))
-    for folder in (one, other):
+    first, other = (tmp_path / name for name in ("one", "other"))
+    for folder in (first, other):
         folder.mkdir()
         for name in ("point_cloud.ply", "metrics.json"):
             shutil.copy(few_steps / name, folder / name)
-    key = from_model(one, tiny_scene, tmp_path / "notes")
+    key = from_model(first, tiny_scene, tmp_path / "notes")
     assert from_model(other, tiny_scene, tmp_path / "notes") == key
     (other / "point_cloud_sky.json").write_text("{}")
     assert from_model(other, tiny_scene, tmp_path / "notes") != key, "it has a sky now"
-    (one / "point_cloud.ply").write_bytes(b"another")
-    assert from_model(one, tiny_scene, tmp_path / "notes") != key
-    (one / "point_cloud.ply").unlink()
+    (first / "point_cloud.ply").write_bytes(b"another")
+    assert from_model(first, tiny_scene, tmp_path / "notes") != key
+    (first / "point_cloud.ply").unlink()
     with pytest.raises(DataError, match="one: no model here; expected a file, or the folder of a finished run"):
-        from_model(one, tiny_scene, tmp_path / "notes")
+        from_model(first, tiny_scene, tmp_path / "notes")
 
 
 def test_unreadable_input_is_reported(few_steps, tiny_scene, tmp_path, monkeypatch):
@@ -79,8 +79,8 @@ def test_camera_path_name_is_not_a_file(tmp_path, monkeypatch):
 
 
 def test_sweep_computes_the_expected_keys(tiny_scene, store, tmp_path):
-    found = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
-    assert found.in_class("b").key == keys("smoke", tiny_scene, tmp_path)
+    result = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
+    assert result.in_class("b").key == keys("smoke", tiny_scene, tmp_path)
 
 
 def test_cell_reads_the_same_files_from_any_folder(tiny_scene, store, options, tmp_path, monkeypatch):

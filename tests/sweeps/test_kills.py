@@ -111,9 +111,9 @@ def scheduler(port: int, processes: list["subprocess.Popen[str]"]) -> Iterator["
         time.sleep(5)  # until it listens
         yield process
     finally:
-        for one in (*reversed(processes), process):
-            one.terminate()
-            one.wait(60)
+        for item in (*reversed(processes), process):
+            item.terminate()
+            item.wait(60)
 
 
 def free_port() -> int:

@@ -28,10 +28,10 @@ def finished(tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     (folder / "x.yaml").write_text(
         f"name: sweep\nscene: {{path: '{tiny_scene}'}}\n" + SMALL.removeprefix("name: sweep\n")
     )
-    found = load_experiment(str(folder / "x.yaml"))
-    assert found is not None
+    actual = load_experiment(str(folder / "x.yaml"))
+    assert actual is not None
     logging.getLogger("clsplat").setLevel(logging.INFO)
-    experiment.run_matrix(found, RunState.read(folder / "run"), None, "new")
+    experiment.run_matrix(actual, RunState.read(folder / "run"), None, "new")
     return str(folder / "x.yaml"), folder / "run"
 
 
@@ -73,9 +73,9 @@ def test_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypatc
     shutil.copytree(tiny_scene, tmp_path / "other")
     axes = f"scenes: ['{tiny_scene}', '{tmp_path / 'other'}'], seeds: [0, 1, 2], set: {{scene.downscale: [1, 2]}}"
     (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{{axes}}}\n{STAGES}")
-    found = load_experiment(str(tmp_path / "x.yaml"))
-    assert len(found.cells) == 12
-    assert "would run 12 cells" in experiment.describe_matrix(found, RunState.read(tmp_path / "run"), None, "new")
+    actual = load_experiment(str(tmp_path / "x.yaml"))
+    assert len(actual.cells) == 12
+    assert "would run 12 cells" in experiment.describe_matrix(actual, RunState.read(tmp_path / "run"), None, "new")
     assert sorted(folders) == sorted([tiny_scene.name, "other"] * 2), "at each of two sizes"
     assert not (tmp_path / "run").exists()
 

@@ -26,8 +26,8 @@ def test_cores_are_split_into_equal_contiguous_parts():
 
 
 def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
-    found = machine.limited_environment((3, 4), {"a": "b"})
-    assert found == {"a": "b", **dict.fromkeys(machine.THREAD_VARIABLES, "2")}
+    result = machine.limited_environment((3, 4), {"a": "b"})
+    assert result == {"a": "b", **dict.fromkeys(machine.THREAD_VARIABLES, "2")}
     before = code_variables()
     for name in machine.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
@@ -47,10 +47,10 @@ def test_runs_sharing_a_device_get_separate_slots(monkeypatch):
     monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
     monkeypatch.setattr(devices, "choose", lambda name: CPU)
     monkeypatch.setattr(devices, "bits_class", lambda info, infos: "b")
-    found = find_slots("local", ["a"], 2)
-    assert [slot.cores for slot in found] == [(0, 1), (2, 3)]
-    assert len({*found}) == 2
-    assert len({slot.device for slot in found}) == 1
+    result = find_slots("local", ["a"], 2)
+    assert [slot.cores for slot in result] == [(0, 1), (2, 3)]
+    assert len({*result}) == 2
+    assert len({slot.device for slot in result}) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")

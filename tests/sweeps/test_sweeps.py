@@ -109,16 +109,16 @@ def test_job_array_tasks_run_the_cells_of_a_matrix(file, runs, tmp_path):
 
 def test_run_continued_in_a_matrix_folder_is_no_cell(file, execution_file, runs, few_steps, tmp_path):
     out = commands.run(file, out=tmp_path / "out", on=execution_file)
-    one = out / "tiny-seed=0"
-    model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
+    first = out / "tiny-seed=0"
+    model, expected = first / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
     model.unlink()
     model.write_bytes(b"another")
     commands.run(file, out=out, start="resume", on=execution_file)
     assert model.read_bytes() == expected
-    pipeline = one / "pipeline.yaml"
+    pipeline = first / "pipeline.yaml"
     pipeline.unlink()
     pipeline.write_text((few_steps / "pipeline.yaml").read_text() + "# trained for longer\n")
-    (one / "checkpoints" / "step_000020.npz").write_bytes(b"later")
+    (first / "checkpoints" / "step_000020.npz").write_bytes(b"later")
     with pytest.raises(
         ClsplatError, match=r"seed=0: the run was continued with other settings .*; move that folder"
     ) as error:
@@ -127,7 +127,7 @@ def test_run_continued_in_a_matrix_folder_is_no_cell(file, execution_file, runs,
     assert "# trained" in pipeline.read_text(), "it stays"
     commands.run(file, out=out, start="restart", on=execution_file)
     assert pipeline.read_bytes() == (few_steps / "pipeline.yaml").read_bytes()
-    assert not (one / "checkpoints" / "step_000020.npz").exists()
+    assert not (first / "checkpoints" / "step_000020.npz").exists()
 
 
 def test_failing_cell_keeps_the_others_and_sets_the_exit_code(file, execution_file, runs, tmp_path):
@@ -361,11 +361,11 @@ def test_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client, sent = FakeClient(), []
     monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
-    found, starts = [SLOT] if starter == "this machine" else None, starter != "nobody"
-    scheduler.Cluster(client, Store(tmp_path), object() if starts else None, found).start(
+    actual, starts = [SLOT] if starter == "this machine" else None, starter != "nobody"
+    scheduler.Cluster(client, Store(tmp_path), object() if starts else None, actual).start(
         CellRun("a", SPEC, ""), SLOT, CellOptions(0.0)
     )
-    assert sent == [None if found else [SLOT.worker]], "the workers of this machine have the same devices"
+    assert sent == [None if actual else [SLOT.worker]], "the workers of this machine have the same devices"
 
 
 def test_lost_worker_gets_no_cell(tmp_path):
@@ -390,11 +390,11 @@ def test_stopped_scheduler_is_reported_with_a_remedy(tmp_path):
 
 def listening() -> set[str]:
     """The addresses on which this process and those that it has started listen."""
-    this, found = psutil.Process(), []
+    this, results = psutil.Process(), []
     for process in (this, *this.children(recursive=True)):
         with suppress(psutil.NoSuchProcess):  # it has ended
-            found += process.net_connections("inet")
-    return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
+            results += process.net_connections("inet")
+    return {item.laddr.ip for item in results if item.status == psutil.CONN_LISTEN}
 
 
 def test_local_engine_runs_cells_in_parallel_on_loopback(tmp_path, monkeypatch):

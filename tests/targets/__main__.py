@@ -119,12 +119,12 @@ def compile_one(job: tuple[Build, str]) -> dict[str, Figures] | str:
     build, target = job
     with tempfile.TemporaryDirectory(prefix="targets-") as folder:
         try:
-            found = VENDORS[VENDOR_OF[target]].compile_kernels(build, target, Path(folder))
+            result = VENDORS[VENDOR_OF[target]].compile_kernels(build, target, Path(folder))
         except CompileError as error:
             return f"{target}: {build.text} does not compile: {error}"
-    if lost := sorted({*build.kernels} - found.keys()):
+    if lost := sorted({*build.kernels} - result.keys()):
         return f"{target}: {build.text}: the compiler says nothing of {', '.join(lost)}"
-    return found
+    return result
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ ACCEPTED = {
 
 def unexpected_failures(failures: Iterable[str], everything: bool) -> list[str]:
     """Return the failures that are not accepted and, where `everything` was compiled, those that did not occur."""
-    found = list(failures)
-    gone = [f"'{fault}' is accepted, and was not seen: remove it" for fault in ACCEPTED if fault not in found]
-    return [failure for failure in found if failure not in ACCEPTED] + (gone if everything else [])
+    actual = list(failures)
+    gone = [f"'{fault}' is accepted, and was not seen: remove it" for fault in ACCEPTED if fault not in actual]
+    return [failure for failure in actual if failure not in ACCEPTED] + (gone if everything else [])
 
 
 def text() -> str:

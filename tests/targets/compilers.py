@@ -58,8 +58,8 @@ def find_clang(bitcode: str) -> Clang:
 
 def find_ptxas() -> str:
     """Return NVIDIA's assembler, from the path or from PyPI's package.  Raises Missing."""
-    if found := shutil.which("ptxas"):
-        return found
+    if result := shutil.which("ptxas"):
+        return result
     for folder in sys.path:
         for program in sorted(Path(folder or ".").glob("nvidia/*/bin/ptxas")):
             return str(program)
@@ -70,8 +70,8 @@ def find_ocloc() -> str:
     """Return Intel's offline compiler.  Raises Missing."""
     names = {file.name for folder in os.get_exec_path() for file in Path(folder).glob("ocloc-[0-9]*")}
     for name in ["ocloc", *sorted(names, reverse=True)]:
-        if found := shutil.which(name):
-            return found
+        if result := shutil.which(name):
+            return result
     raise Missing("ocloc is missing: apt-get install intel-opencl-icd")
 
 

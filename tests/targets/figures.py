@@ -48,15 +48,15 @@ Table = dict[Place, Figures]
 
 def faults(table: Table) -> list[str]:
     """Return a sentence about each limit that a kernel breaks; the wide schedule may spill: it is for CPUs."""
-    found = []
+    results = []
     for place, of in sorted(table.items()):
         if of.spills and place.schedule == "simt":
-            found.append(f"{place.text} spills registers ({of.spills})")
+            results.append(f"{place.text} spills registers ({of.spills})")
         if of.local > MAX_LOCAL:
-            found.append(f"{place.text} takes {of.local} bytes of local memory; at most {MAX_LOCAL} are allowed")
+            results.append(f"{place.text} takes {of.local} bytes of local memory; at most {MAX_LOCAL} are allowed")
         if of.group > MAX_GROUP:
-            found.append(f"{place.text} has groups of {of.group} items; at most {MAX_GROUP} are allowed")
-    return found
+            results.append(f"{place.text} has groups of {of.group} items; at most {MAX_GROUP} are allowed")
+    return results
 
 
 def save(table: Table, file: Path) -> None:
@@ -66,7 +66,7 @@ def save(table: Table, file: Path) -> None:
 
 def load(file: Path) -> Table:
     """Read what `save` wrote."""
-    names = {one.name for one in fields(Place)}
+    names = {item.name for item in fields(Place)}
     table = {}
     for record in json.loads(file.read_text()):
         place = Place(**{name: record.pop(name) for name in names})

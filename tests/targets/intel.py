@@ -100,7 +100,7 @@ def _figures(of: dict[str, Any], report: str, target: str) -> Figures:
     return Figures(
         registers=registers,
         spills=int(spilled[1]) if spilled else run_with.get("spill_size", 0),
-        scratch=sum(one["size"] for one in of.get("per_thread_memory_buffers", [])),
+        scratch=sum(item["size"] for item in of.get("per_thread_memory_buffers", [])),
         local=local,
         group=x * y * z,
         width=width,

@@ -103,9 +103,9 @@ def _vendor_table(simt: Table, rows: list[Row], targets: list[str], vendor: str)
     head = ["kernel", "items", "local bytes", "private bytes", *(f"{target}, {NAMES[target]}" for target in targets)]
     lines = [_line(head), _line("---" for _ in head)]
     for kernel, variant in rows:
-        found = [simt[Place(target, "simt", kernel, variant)] for target in targets]
-        facts = [_range(of.group for of in found), _range(of.local for of in found), _range(of.scratch for of in found)]
-        lines.append(_line([f"`{kernel}`" + f" {variant}".rstrip(), *facts, *(_cell(of, vendor) for of in found)]))
+        actual = [simt[Place(target, "simt", kernel, variant)] for target in targets]
+        facts = [_range(of.group for of in actual), _range(of.local for of in actual), _range(of.scratch for of in actual)]
+        lines.append(_line([f"`{kernel}`" + f" {variant}".rstrip(), *facts, *(_cell(of, vendor) for of in actual)]))
     others = {place: of for place, of in simt.items() if (place.kernel, "") not in rows and not place.variant}
     count = len({place.kernel for place in others})
     worst = [_others([of for place, of in others.items() if place.target == target], vendor) for target in targets]

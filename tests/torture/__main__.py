@@ -96,7 +96,7 @@ def cases_in(results: Path, count: int) -> int:
         return 0
     tests = ElementTree.parse(results).iter("testcase")
     recorded = (
-        [int(one.get("value", 0)) for one in test.iter("property") if one.get("name") == "cases"] for test in tests
+        [int(item.get("value", 0)) for item in test.iter("property") if item.get("name") == "cases"] for test in tests
     )
     return sum(sum(cases) if cases else count for cases in recorded)
 

@@ -54,7 +54,7 @@ class AtFile(Attempt):
 def each_file(scene: Path, folder: Path, cases: int) -> list[tuple[str, int, bool, int, bool]]:
     """Kill at the files of a run on a scene, below `folder`, and resume; return what the module's head says."""
     folder.mkdir(parents=True, exist_ok=True)
-    whole, found = folder / "whole", []
+    whole, results = folder / "whole", []
     AtFile(scene, whole).wait()
     total = int(whole.with_suffix(".count").read_text())
     stride = max(1, total // cases)
@@ -63,8 +63,8 @@ def each_file(scene: Path, folder: Path, cases: int) -> list[tuple[str, int, boo
             out = folder / f"{moment} {at}"
             killed = AtFile(scene, out, at, moment).end() == -signal.SIGKILL
             code = AtFile(scene, out).end()
-            found.append((out.name, total, killed, code, code == 0 and identity(out) == identity(whole)))
-    return found
+            results.append((out.name, total, killed, code, code == 0 and identity(out) == identity(whole)))
+    return results
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ def test_kill_during_any_write_loses_nothing(tiny_scene, tmp_path, record_proper
     command = [sys.executable, "-m", "tests.torture.each_file", tiny_scene, tmp_path / "runs", str(CASES)]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) >= 2
-    assert [case for case in found if case[2:] != [True, 0, True]] == []
-    record_property("cases", len(found))
+    data = json.loads(done.stdout.splitlines()[-1])
+    assert len(data) >= 2
+    assert [case for case in data if case[2:] != [True, 0, True]] == []
+    record_property("cases", len(data))

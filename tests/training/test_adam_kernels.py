@@ -218,11 +218,11 @@ def test_degenerate_rows_keep_their_bits(device, rng, from_memory):
     """Behind the camera, huge, faint or not numbers."""
     case = undrawable_case(rng)
     undrawn = case.model(device)
-    seen = frame_of(device, case, undrawn).depth_key.get()[:40] != 0xFFFFFFFF
+    visible = frame_of(device, case, undrawn).depth_key.get()[:40] != 0xFFFFFFFF
     before, after = updated(device, case, "seen", from_memory)
-    np.testing.assert_array_equal(changed_rows(before, after), seen)
-    assert not seen[[0, 1, 2, 3, 4, 5, 7, 8]].any()
-    assert seen.sum() > 15
+    np.testing.assert_array_equal(changed_rows(before, after), visible)
+    assert not visible[[0, 1, 2, 3, 4, 5, 7, 8]].any()
+    assert visible.sum() > 15
 
 
 @on_devices("vectors, rows", each_once([1, 2, 8, 1, 2, 8], ["all", "seen"]))
@@ -280,6 +280,6 @@ def test_nan_stays_in_its_row(device, rng):
     average.attach_average(gaussians)
     average.add_to_average(gaussians)
     average.take_average(gaussians)
-    found = gaussians.get("means")
-    assert np.isnan(found[3]).all()
-    assert np.isfinite(np.delete(found, 3, axis=0)).all()
+    result = gaussians.get("means")
+    assert np.isnan(result[3]).all()
+    assert np.isfinite(np.delete(result, 3, axis=0)).all()

@@ -69,7 +69,7 @@ def test_comparison_has_a_color_column(with_gains, few_steps):
         main_table(next(iter(RunComparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
     ]
     headings = [[column.heading for group in table.groups for column in group.columns] for table in tables]
-    assert ["PSNR, colors fitted ↑" in found for found in headings] == [True, False]
+    assert ["PSNR, colors fitted ↑" in heading for heading in headings] == [True, False]
 
 
 def test_run_folder_is_also_measured_in_image_colors(with_gains, few_steps, tmp_path):
@@ -117,14 +117,14 @@ def test_best_model_has_the_colors_of_its_step(tiny_scene, tmp_path):
 
 def test_decision_is_recorded_and_off_keeps_the_bits(tiny_scene, tmp_path, few_steps):
     """The synthetic scene has points without tracks."""
-    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.modules.exposure.when=auto"])
-    run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
-    assert found.chosen == "off"
-    assert found.reason == "neither tracks nor EXIF give exposures"
-    assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
+    pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.modules.exposure.when=auto"])
+    run_pipeline(pipeline, RunState.read(tmp_path / "run"), None, "new")
+    actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
+    assert actual.chosen == "off"
+    assert actual.reason == "neither tracks nor EXIF give exposures"
+    assert f"optimize.modules.exposure: off, since {actual.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
-    assert RunState.read(tmp_path / "run").is_complete(asked), "the same command finds it up to date"
+    assert RunState.read(tmp_path / "run").is_complete(pipeline), "the same command finds it up to date"
 
 
 def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
@@ -132,15 +132,15 @@ def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
     wall.write(tmp_path / "scene")
     settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.modules.exposure.when=auto"]
     run_pipeline(load("smoke", settings), RunState.read(tmp_path / "run"), None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
-    assert found.chosen == "on"
-    assert "exposures of 8 photographs differ by" in found.reason
+    actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
+    assert actual.chosen == "on"
+    assert "exposures of 8 photographs differ by" in actual.reason
     photographs = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
     with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
-    assert run.settings.training.modules == [found], "who goes on takes the choice"
+    assert run.settings.training.modules == [actual], "who goes on takes the choice"
 
 
 @pytest.mark.parametrize(
@@ -155,8 +155,8 @@ def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
 def test_reason_names_the_deciding_bound(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), cache={("colors", ()): exposures})
-    found = Exposure(when="auto").resolve_auto(run)
-    assert (found.chosen, found.reason) == (chosen, exposures.text + said)
+    result = Exposure(when="auto").resolve_auto(run)
+    assert (result.chosen, result.reason) == (chosen, exposures.text + said)
 
 
 def test_decision_is_not_written_as_a_setting():

@@ -52,12 +52,12 @@ def test_run_ends_with_the_average_of_the_added_steps(averaged):
     """Those at 18, 20, ... 28: no edit follows the last step."""
     run = averaged
     of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.list_files(run.out)}
-    found = read_ply(run.out / "point_cloud.ply").parameters
+    actual = read_ply(run.out / "point_cloud.ply").parameters
     for name in PARAMETERS:
         steps = [checkpoint.load(of_step[step])[1][f"gaussians/{name}"].astype(float) for step in range(18, 30, 2)]
-        np.testing.assert_allclose(found[name], np.mean(steps, axis=0), rtol=0, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(actual[name], np.mean(steps, axis=0), rtol=0, atol=1e-5, err_msg=name)
     last = checkpoint.load(of_step[STEPS])[1]["gaussians/means"]
-    assert np.abs(found["means"] - last).max() > 1e-4, "it is not the last step"
+    assert np.abs(actual["means"] - last).max() > 1e-4, "it is not the last step"
     assert not [table for table in run.model.gaussians.tables if table.startswith("average/")]
 
 
@@ -132,10 +132,10 @@ def distances(run: Run) -> np.ndarray:
 def test_training_starts_on_the_hull(tmp_path, pipeline):
     """`transparent: hull` is for photographs with alpha; `auto` alone takes random points, as published."""
     scene = ball_scene(tmp_path / "scene", 4)
-    found = distances(train(scene, tmp_path / "hull", *STILL, "init.transparent=hull", pipeline=pipeline))
-    assert np.abs(found - RADIUS).max() < 0.1
-    found = distances(train(scene, tmp_path / "random", *STILL, pipeline=pipeline))
-    assert np.abs(found - RADIUS).max() > 0.5
+    actual = distances(train(scene, tmp_path / "hull", *STILL, "init.transparent=hull", pipeline=pipeline))
+    assert np.abs(actual - RADIUS).max() < 0.1
+    actual = distances(train(scene, tmp_path / "random", *STILL, pipeline=pipeline))
+    assert np.abs(actual - RADIUS).max() > 0.5
 
 
 def test_photographs_without_transparency_have_no_hull(tmp_path, pipeline, caplog):

@@ -50,10 +50,10 @@ def test_run_repeats_bit_for_bit(tiny_scene, tmp_path):
     whole = digest(train(tiny_scene, tmp_path / "whole", *steps, RANDOM).out)
     assert digest(train(tiny_scene, tmp_path / "again", *steps, RANDOM).out) == whole
     assert digest(train(tiny_scene, tmp_path / "scene", *steps).out) != whole
-    found = train(
+    actual = train(
         tiny_scene, tmp_path / "transparent", *steps, "optimize.modules.random_background.when=transparent"
     ).out
-    assert digest(found) == whole
+    assert digest(actual) == whole
     opaque = [
         digest(
             train(
@@ -73,7 +73,7 @@ def test_run_repeats_bit_for_bit(tiny_scene, tmp_path):
 def test_model_with_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="cannot be combined with sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=envmap", "optimize.steps=2")
-    asked = load(
+    pipeline = load(
         "smoke",
         [
             f"scene.path='{tiny_scene}'",
@@ -82,4 +82,4 @@ def test_model_with_a_sky_is_refused(tiny_scene, tmp_path):
         ],
     )
     with pytest.raises(ConfigError, match="cannot be combined with sky"):
-        describe(asked, RunState.read(tmp_path / "other"), None, "new")
+        describe(pipeline, RunState.read(tmp_path / "other"), None, "new")

@@ -77,13 +77,13 @@ def metrics(out: Path) -> dict:
 
 
 def lines(out: Path, name: str = "metrics.jsonl") -> list[dict]:
-    found = [json.loads(line) for line in (out / name).read_text().splitlines()]
-    return [{key: value for key, value in line.items() if key not in TIMES} for line in found]
+    actual = [json.loads(line) for line in (out / name).read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key not in TIMES} for line in actual]
 
 
 def psnr_of(out: Path, split: str, name: str = "metrics.jsonl") -> dict[int, float]:
-    found = [line for line in lines(out, name) if line["kind"] == "evaluate" and line["split"] == split]
-    return {line["step"]: line["psnr"] for line in found}
+    actual = [line for line in lines(out, name) if line["kind"] == "evaluate" and line["split"] == split]
+    return {line["step"]: line["psnr"] for line in actual}
 
 
 def equal_ends(one: Path, other: Path) -> None:
@@ -100,25 +100,25 @@ def test_training_leaves_the_best_model_on_validation_views(best_run):
     measured = psnr_of(best_run, "validation")
     assert sorted(measured) == list(range(4, STEPS + 1, 4))
     assert max(measured, key=measured.__getitem__) == BEST
-    found = read_ply(best_run / "point_cloud.ply").parameters
+    actual = read_ply(best_run / "point_cloud.ply").parameters
     _, expected = checkpoint.load(best_run / "checkpoints" / f"step_{BEST:06d}.npz")
     for name in PARAMETERS:
-        np.testing.assert_array_equal(found[name], expected[f"gaussians/{name}"], err_msg=name)
-    assert len(found["means"]) < len(
+        np.testing.assert_array_equal(actual[name], expected[f"gaussians/{name}"], err_msg=name)
+    assert len(actual["means"]) < len(
         checkpoint.load(best_run / "checkpoints" / f"step_{STEPS:06d}.npz")[1]["gaussians/means"]
     )
 
 
 def test_metrics_are_those_of_the_best_model(best_run):
-    found = metrics(best_run)
-    assert found["kept"]["step"] == BEST
-    assert found["kept"]["ended"] == found["steps"] == STEPS
-    assert found["kept"]["evaluations"] == 5
-    assert found["validation"]["1"]["psnr"] == found["kept"]["validation"] == psnr_of(best_run, "validation")[BEST]
-    assert found["validation"]["1"]["views"] == 2
-    assert found["train"]["1"]["psnr"] == found["kept"]["train"] == psnr_of(best_run, "train")[BEST]
-    assert found["train"]["1"]["views"] == 6
-    assert found["test"]["1"]["psnr"] == psnr_of(best_run, "test")[BEST]
+    actual = metrics(best_run)
+    assert actual["kept"]["step"] == BEST
+    assert actual["kept"]["ended"] == actual["steps"] == STEPS
+    assert actual["kept"]["evaluations"] == 5
+    assert actual["validation"]["1"]["psnr"] == actual["kept"]["validation"] == psnr_of(best_run, "validation")[BEST]
+    assert actual["validation"]["1"]["views"] == 2
+    assert actual["train"]["1"]["psnr"] == actual["kept"]["train"] == psnr_of(best_run, "train")[BEST]
+    assert actual["train"]["1"]["views"] == 6
+    assert actual["test"]["1"]["psnr"] == psnr_of(best_run, "test")[BEST]
     assert f"best     model of step {BEST}" in "\n".join(summary(best_run))
     assert summary(best_run)[-1].endswith("in a browser"), "more steps were no better"
 
@@ -177,15 +177,15 @@ def test_growth_ends_without_validation_improvement(tiny_scene, tmp_path, pipeli
 
 def test_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
-    found = Scores(step=30, train=20, validation=20)
+    result = Scores(step=30, train=20, validation=20)
     best_run = Best(
-        measured=found,
+        measured=result,
         degree=0,
         metrics={},
         evaluations=9,
         since_best=2,
         first_overfit=None,
-        last=found,
+        last=result,
         growth_ended=20,
     )
     run = SimpleNamespace(best=best_run.model_copy(update={"refit": "begun"}), is_refit=True)
@@ -253,10 +253,10 @@ def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pi
     expected = train(tiny_scene, tmp_path / "plain", *plain, pipeline=pipeline).out
     assert digest(refit) == digest(expected)
     assert digest(refit) != digest(best_run)
-    found = metrics(refit)
-    assert found["steps"] == found["kept"]["step"] == BEST
-    assert found["kept"]["refit"] is True
-    assert "validation" not in found, "it has trained on those views"
+    actual = metrics(refit)
+    assert actual["steps"] == actual["kept"]["step"] == BEST
+    assert actual["kept"]["refit"] is True
+    assert "validation" not in actual, "it has trained on those views"
     own = [line for line in lines(refit) if line.get("split") != "validation"]
     assert own == lines(expected), "metrics.jsonl is of the model that is left"
     assert psnr_of(refit, "validation", "trial.jsonl") == {
@@ -337,9 +337,9 @@ def test_best_model_without_validation_is_refused(pipeline, settings, fault):
 
 def test_other_models_at_the_end_are_refused(tmp_path):
     head = "name: x\nscene: {validation: auto}\nstages:\n  - init: {}\n"
-    one = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{average: {every: 2}}]}\n"
+    first = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{average: {every: 2}}]}\n"
     two = "  - optimize: {steps: 9, losses: [l1]}\n  - optimize: {steps: 9, keep: best, refit: true, losses: [l1]}\n"
-    for stages, fault in ((one, "not an average"), (two, "expected a single stage that trains, got 2")):
+    for stages, fault in ((first, "not an average"), (two, "expected a single stage that trains, got 2")):
         (tmp_path / "x.yaml").write_text(head + stages)
         with pytest.raises(ConfigError, match=fault):
             load(str(tmp_path / "x.yaml"))
@@ -349,7 +349,7 @@ def test_other_models_at_the_end_are_refused(tmp_path):
 def test_training_is_measured_near_its_end(pipeline, steps, every):
     """A refit of a short one would be up to 99 steps shorter than it."""
     training = load(pipeline).settings.training.model_copy(update={"steps": steps, "keep": "best"})
-    assert {one.every for one in training.measurements([])} == {every}
+    assert {measurement.every for measurement in training.measurements([])} == {every}
     assert steps % every < 20
 
 

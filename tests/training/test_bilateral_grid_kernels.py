@@ -43,8 +43,8 @@ def test_identity_only_clips_white(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera, workspace = make_camera(device, 33, 18), Workspace(device)
     grids = GridState(BilateralGrid(), ("a",), device)
-    found = grids.transform(workspace, camera, to_planes(device, camera, image), 0)
-    assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
+    result = grids.transform(workspace, camera, to_planes(device, camera, image), 0)
+    assert (result.get()[:, :18, :33] == np.minimum(image, 1)).all()
     assert not grids.smoothness(workspace, 0).get().any()
 
 
@@ -56,8 +56,8 @@ def test_constant_luminance_reads_the_adjacent_levels(device):
     grids.load({}, {"values": values.reshape(grids.shape)})
     for gray, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
         planes = to_planes(device, camera, np.full((3, 5, 20), gray, np.float32))
-        found = grids.transform(Workspace(device), camera, planes, 1).get()[:, :5, :20]
-        assert found == pytest.approx(gray + expected, abs=1e-6), gray
+        actual = grids.transform(Workspace(device), camera, planes, 1).get()[:, :5, :20]
+        assert actual == pytest.approx(gray + expected, abs=1e-6), gray
 
 
 class Case:
@@ -92,9 +92,9 @@ def test_step_gradient_is_that_of_its_losses(device, rng, share):
     numeric = [(case.loss(at, step) - case.loss(at, -step)) / (2 * step) for at in places]
     case.state.load(case.state.scalars, {"values": case.values})
     case.trainer.step(case.photograph, 1)
-    found = case.state.tables()
-    assert found["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
-    assert not found["moment1"][0].any(), "the other photograph has no update"
+    result = case.state.tables()
+    assert result["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
+    assert not result["moment1"][0].any(), "the other photograph has no update"
     assert case.state.scalars["colors/b/updates"] == 1
 
 
@@ -124,9 +124,9 @@ def test_single_cell_equals_the_affine_kind(device, rng):
     affine.scalars.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = make_camera(device, 33, 18), Workspace(device)
     image, gradient = (to_planes(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
-    found = grids.transform(workspace, camera, image, 1).get()
+    result = grids.transform(workspace, camera, image, 1).get()
     expected = transform_colors(workspace, camera, image, affine.matrix(1)).get()
-    assert found == pytest.approx(expected, abs=1e-6)
+    assert result == pytest.approx(expected, abs=1e-6)
     passed, grad_grid = grids.differentiate(workspace, camera, image, gradient, 1)
     passed, grad_grid = passed.get(), grad_grid.get()
     through, grad_matrix = color_gradients(workspace, camera, image, affine.matrix(1), gradient)

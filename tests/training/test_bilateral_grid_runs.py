@@ -90,10 +90,10 @@ def test_rate_warms_up_and_decays():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
         for known, expected in ((True, published), (False, Exposure().rate_schedule(steps, 50, False))):
-            found = BilateralGrid().rate_schedule(steps, 50, known)
-            assert at_step(found, 0) == pytest.approx(at_step(expected, 0) / 100)
+            result = BilateralGrid().rate_schedule(steps, 50, known)
+            assert at_step(result, 0) == pytest.approx(at_step(expected, 0) / 100)
             for step in range(warm_up, steps + 1, 50):
-                assert at_step(found, step) == pytest.approx(at_step(expected, step), rel=0.03)
+                assert at_step(result, step) == pytest.approx(at_step(expected, step), rel=0.03)
     assert BilateralGrid(rate=0.02).rate_schedule(7000, 50) == 0.02
     assert at_step(BilateralGrid().rate_schedule(1, 1), 1) > 0
 
@@ -109,16 +109,16 @@ def test_checkpoints_contain_grids_moments_and_counts(with_grids):
 
 def bits(device: Device) -> str:
     """The SHA-256 of what two steps with a grid make of an image and of all grids."""
-    rng, found = np.random.default_rng(3), hashlib.sha256()
-    one, workspace, camera = random_grids(device, rng, (5, 4, 3)), Workspace(device), make_camera(device, 100, 70)
+    rng, result = np.random.default_rng(3), hashlib.sha256()
+    first, workspace, camera = random_grids(device, rng, (5, 4, 3)), Workspace(device), make_camera(device, 100, 70)
     planes = [to_planes(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
     for step in (1, 2):
-        image, _ = one.transform(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
-        gradient, grad_grid = one.differentiate(workspace, camera, *planes, 1)
-        one.learn(workspace, 1, grad_grid, step)
-        for array in (image, gradient, *one.arrays.values()):
-            found.update(array.get().tobytes())
-    return found.hexdigest()
+        image, _ = first.transform(workspace, camera, planes[0], 1), first.smoothness(workspace, 1)
+        gradient, grad_grid = first.differentiate(workspace, camera, *planes, 1)
+        first.learn(workspace, 1, grad_grid, step)
+        for array in (image, gradient, *first.arrays.values()):
+            result.update(array.get().tobytes())
+    return result.hexdigest()
 
 
 @pytest.mark.slow
@@ -133,13 +133,13 @@ def test_one_core_gives_the_same_bits(info):
 @pytest.mark.slow
 def test_grids_are_written_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colors.json").read_text())
-    found = np.load(with_grids / data["file"], allow_pickle=False)
+    arrays = np.load(with_grids / data["file"], allow_pickle=False)
     assert (data["type"], data["grid_shape"]) == ("bilateral_grid", [3, 2, 4])
-    assert found.shape == (8, 4, 2, 3, 3, 4)
-    assert found.dtype == np.float32
-    assert found.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
+    assert arrays.shape == (8, 4, 2, 3, 3, 4)
+    assert arrays.dtype == np.float32
+    assert arrays.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
     for row in data["photographs"].values():
-        assert row["matrix"] == pytest.approx(found[row["row"]].mean(axis=(0, 1, 2)), abs=1e-6)
+        assert row["matrix"] == pytest.approx(arrays[row["row"]].mean(axis=(0, 1, 2)), abs=1e-6)
     assert {"view_colors.json", "view_colors.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
     measured = json.loads((with_grids / "metrics.json").read_text())["test"]["1"]
     assert measured["psnr_color"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_color"], abs=1e-6)
@@ -157,8 +157,8 @@ def test_best_model_has_the_grids_of_its_step(tiny_scene, tmp_path):
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     own, _ = archive.split(tables, "modules/bilateral_grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
-    found = np.load(tmp_path / "run" / "view_colors.npy")
-    assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
+    arrays = np.load(tmp_path / "run" / "view_colors.npy")
+    assert (arrays == expected + np.eye(3, 4, dtype=np.float32)).all()
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_memory_plan_counts_grids_first(finished):
 
     def fixed(*modules) -> int:
         run, training = copy(finished), finished.settings.training.model_copy(update={"modules": [*modules]})
-        stages = [training if one.stage == "optimize" else one for one in run.settings.stages]
+        stages = [training if stage.stage == "optimize" else stage for stage in run.settings.stages]
         run.settings = run.settings.model_copy(update={"stages": stages})
         return run.memory_plan(memory.table_widths(0)).fixed
 

@@ -45,9 +45,9 @@ def test_reference_against_finite_differences(rng):
 
 def test_curves_are_monotone_and_go_from_black_to_white(rng):
     image = np.broadcast_to(np.linspace(0, 1, 200), (3, 1, 200))
-    found = apply_response(image, np.concatenate([np.zeros(5), rng.normal(0, 2, 12)]), (0.0, 0.0))
-    assert (np.diff(found) > 0).all()
-    np.testing.assert_allclose(found[..., [0, -1]], [[[0, 1]]] * 3, atol=1e-12)
+    result = apply_response(image, np.concatenate([np.zeros(5), rng.normal(0, 2, 12)]), (0.0, 0.0))
+    assert (np.diff(result) > 0).all()
+    np.testing.assert_allclose(result[..., [0, -1]], [[[0, 1]]] * 3, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

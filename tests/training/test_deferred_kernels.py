@@ -115,21 +115,21 @@ def test_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     case = random_case(rng, 100)
     seen = [seen_rows(rng, 100) for _ in range(7)]
     gradients = [rng.normal(size=(100, 45)).astype(np.float32) * mask[:, None] for mask in seen]
-    found = []
+    results = []
     for longest in (1, 2, 7, 32):
         monkeypatch.setattr("clsplat.conformance.checks.training.MAX_DEFERRED", longest)
-        found.append(train(device, case.model(device), seen, gradients, "deferred"))
+        results.append(train(device, case.model(device), seen, gradients, "deferred"))
     for name in Deferred.names:
-        for tables in found[1:]:
-            np.testing.assert_array_equal(tables[name].view(np.uint32), found[0][name].view(np.uint32))
+        for tables in results[1:]:
+            np.testing.assert_array_equal(tables[name].view(np.uint32), results[0][name].view(np.uint32))
 
 
 @on_one_setting
 def test_updates_of_invisible_rows_are_deferred(device, rng):
     """Their harmonics lie as they were, and whoever asks for them gets what they are."""
     case = random_case(rng, 150)
-    model, seen = case.model(device), np.arange(150) < 16
-    gradients = np.full((150, 45), 2, np.float32) * seen[:, None]
+    model, visible = case.model(device), np.arange(150) < 16
+    gradients = np.full((150, 45), 2, np.float32) * visible[:, None]
     adam, first = Adam(model.gaussians), np.ones((150, 45), np.float32)
     model.gaussians.set("adam/sh_rest/moment1", first)
     frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
@@ -141,7 +141,7 @@ def test_updates_of_invisible_rows_are_deferred(device, rng):
     of_loss["sh_rest"].set(planes)
     adam.step(model, frame, of_loss, Rates().at(1, 2.0), rows="deferred")
     lying = model.gaussians.deferred.array("adam/sh_rest/moment1").get()[:, :150].T
-    np.testing.assert_array_equal((lying != first).any(axis=1), seen)
+    np.testing.assert_array_equal((lying != first).any(axis=1), visible)
     assert (model.gaussians.get("adam/sh_rest/moment1") != first).all()
 
 

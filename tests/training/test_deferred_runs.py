@@ -123,7 +123,7 @@ def test_harmonics_move_to_the_host_if_the_device_is_full(spread, at_once, tiny_
     out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
     with caplog.at_level("INFO", "clsplat"):
         run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
-    (told,) = [one.message for one in caplog.records if "harmonics move to the host, since" in one.message]
+    (told,) = [record.message for record in caplog.records if "harmonics move to the host, since" in record.message]
     assert not told.startswith("step 0: ")
     assert digest(out) == digest(at_once)
     for memory in (device.memory, 8 << 30):
@@ -160,9 +160,9 @@ def test_too_large_model_starts_with_harmonics_on_the_host(spread, tiny_scene, t
         with caplog.at_level("INFO", "clsplat"):
             own = [f"scene.path='{tiny_scene}'", *spread, "densify.start=99", *more]
             run_pipeline(load("smoke", own), RunState.read(tmp_path / name), Device(small(1900)), "new")
-    told = [one.message for one in caplog.records if "harmonics move to the host" in one.message]
-    assert [one.startswith("step 0: ") for one in told] == [True, True]
-    assert ["the device can hold only 1," in one for one in told] == [True, False]
+    messages = [one.message for one in caplog.records if "harmonics move to the host" in one.message]
+    assert [one.startswith("step 0: ") for one in messages] == [True, True]
+    assert ["the device can hold only 1," in one for one in messages] == [True, False]
     assert digest(tmp_path / "auto") == digest(tmp_path / "host")
 
 
@@ -180,11 +180,11 @@ def test_harmonics_stay_on_the_device_if_the_host_is_no_help(tiny_scene, info):
     """A stage needs them on the device, there are none, or the device's memory is the host's."""
     own = f"scene.path='{tiny_scene}'"
     average = "optimize.during=[{average: {every: 2}}]"
-    found = [load("smoke", [own, *more]).settings.harmonics for more in ([], [average], ["model.sh_degree=0"])]
-    assert found == ["auto", "device", "device"]
+    actual = [load("smoke", [own, *more]).settings.harmonics for more in ([], [average], ["model.sh_degree=0"])]
+    assert actual == ["auto", "device", "device"]
     apart, shared = (replace(info, unified=unified) for unified in (False, True))
-    found = [offload_target("auto", apart), offload_target("auto", shared), offload_target("host", shared)]
-    assert found == ["host", "device", "host"]
+    actual = [offload_target("auto", apart), offload_target("auto", shared), offload_target("host", shared)]
+    assert actual == ["host", "device", "host"]
 
 
 def test_dry_run_reports_offloaded_harmonics(tiny_scene, tmp_path):
@@ -216,12 +216,12 @@ def test_settings_that_need_all_harmonics_are_refused(tiny_scene):
 def test_harmonics_on_the_host_can_be_reduced(spread, tiny_scene, tmp_path):
     """After the training, where no band is left, and in it, as on the device."""
     during = "optimize.during=[{reduce_sh: {degree: 1, every: 4, stop: 5}}, {reduce_sh: {degree: 0, every: 8}}]"
-    found = [
+    actual = [
         train(tiny_scene, tmp_path / way, *spread[:2], "optimize.steps=10", during, f"rasterizer.harmonics={way}")
         for way in ("device", "host")
     ]
-    assert [run.model.gaussians.sh_degree for run in found] == [0, 0]
-    assert digest(found[0].out) == digest(found[1].out)
+    assert [run.model.gaussians.sh_degree for run in actual] == [0, 0]
+    assert digest(actual[0].out) == digest(actual[1].out)
 
 
 class OnHarmonics(Penalty):

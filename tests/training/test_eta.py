@@ -22,7 +22,7 @@ def seconds_at(step: int) -> float:
 def forecast_at(step: int) -> Forecast:
     forecast = Forecast(LAST, GROWTH_END)
     for report in range(100, step + 1, 100):
-        seconds = sum(seconds_at(one) for one in range(report - 99, report + 1)) / 100
+        seconds = sum(seconds_at(item) for item in range(report - 99, report + 1)) / 100
         forecast.add(report, 20.0, count_at(report), seconds)
     return forecast
 

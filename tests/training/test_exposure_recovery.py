@@ -35,24 +35,24 @@ def plain_scene(tmp_path_factory) -> Path:
 def write_with_gains(source: Path, out: Path, rng: np.random.Generator) -> dict[str, float]:
     """Copy a dataset, the training photographs times gains of e^N(0, 0.25); return their logarithms by name."""
     shutil.copytree(source, out)
-    found = {}
+    results = {}
     for file in sorted((out / "train").glob("*.png")):
         pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        found[file.stem] = float(rng.normal(0, 0.25))
-        pixels[..., :3] = np.rint(np.clip(pixels[..., :3] * np.exp(found[file.stem]), 0, 255))
+        results[file.stem] = float(rng.normal(0, 0.25))
+        pixels[..., :3] = np.rint(np.clip(pixels[..., :3] * np.exp(results[file.stem]), 0, 255))
         cv2.imwrite(str(file), pixels)
-    return found
+    return results
 
 
 def held_out(run: Path) -> float:
     """The mean PSNR of the test views in the colors of their photographs, dB."""
     renderer, scene = clsplat.Renderer(clsplat.load(run)), clsplat.read_scene(run.parent / f"{run.name}_scene")
-    found = []
+    results = []
     for view in scene.split("test"):
         picture = renderer.render(view)
         photograph = np.rint(255 * view.photograph(picture.background)).astype(np.uint8)
-        found.append(color_metrics(picture.image, photograph, None, Gain())["psnr_color"])
-    return float(np.mean(found))
+        results.append(color_metrics(picture.image, photograph, None, Gain())["psnr_color"])
+    return float(np.mean(results))
 
 
 def test_known_exposures_are_found_again_from_scratch(plain_scene, rng, tmp_path):
@@ -63,9 +63,9 @@ def test_known_exposures_are_found_again_from_scratch(plain_scene, rng, tmp_path
         train(tmp_path / f"{name}_scene", tmp_path / name, *FEW, *more)
     table = json.loads((tmp_path / "gain" / "view_colors.json").read_text())["photographs"]
     names = list(table)
-    found = np.array([table[name]["exposure"] for name in names])
+    actual = np.array([table[name]["exposure"] for name in names])
     known = np.array([truth[Path(name).stem] for name in names])
-    errors = found - found.mean() - (known - known.mean())
+    errors = actual - actual.mean() - (known - known.mean())
     assert np.std(known) > 0.25
     assert np.sqrt(np.mean(errors**2)) < 0.08, "measured: 0.05"
     psnr = {name: held_out(tmp_path / name) for name in ("gain", "none")}

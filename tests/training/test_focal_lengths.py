@@ -69,9 +69,9 @@ def test_views_are_written_with_the_lens_of_their_focal_length(tmp_path):
 
 
 def test_images_of_one_camera_share_a_parameter():
-    one, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
-    views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", one), ("b", other), ("c", one))]
-    views.append(View("d", one, np.eye(3, 4), lens=STRONG))
+    first, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
+    views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", first), ("b", other), ("c", first))]
+    views.append(View("d", first, np.eye(3, 4), lens=STRONG))
     state = CameraState(CameraOptimizer(focal=0.01), views, views)
     assert state.cameras == {"a": "a", "b": "b", "c": "a", "d": "d"}
     assert [state.factor(name) for name in "abcd"] == [1, 1, 1, 1]
@@ -120,8 +120,8 @@ def test_resumed_run_has_the_same_bits(with_focals, tiny_scene, tmp_path):
     (key,) = [name for name in state.scalars if name.startswith("focal_lengths/") and name.endswith("/log")]
     assert state.scalars[f"{key}/updates"] == 12 - 2
     assert abs(state.scalars[key]) > 1e-4
-    found = learned_scene(run)
-    factors = [after.camera.fx / view.camera.fx for view, after in zip(run.original.views, found.views, strict=True)]
+    result = learned_scene(run)
+    factors = [after.camera.fx / view.camera.fx for view, after in zip(run.original.views, result.views, strict=True)]
     assert factors == pytest.approx([np.exp(state.scalars[key])] * len(factors)), "also those of test views"
     (later,) = attach_modules([], run, 24)
     assert later.factor(run.original.views[0].name) != 1, "it stays"

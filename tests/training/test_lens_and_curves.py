@@ -45,7 +45,7 @@ def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
     _, row, of_weight, (wait,) = view.step.saved_value(case.state)
-    found, numeric = case.example.row_gradient(row, wait()) + of_weight, []
+    actual, numeric = case.example.row_gradient(row, wait()) + of_weight, []
     gradients = case.trainer.rasterizer.gradients(case.trainer.model, view.frame, view.pixel_sums)["sh_base"].get()
     for key in case.keys:
         ends, value = [], case.state.scalars[key]
@@ -54,7 +54,7 @@ def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
             ends.append(case.loss())
         case.state.scalars[key] = value
         numeric.append((ends[0] - ends[1]) / (2 * change))
-    assert found == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
+    assert actual == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
     gaussians, ends = case.trainer.model.gaussians, []
     colors, direction = gaussians.get("sh_base"), rng.normal(size=(gaussians.count, 3)).astype(np.float32)
     for sign in (1, -1):

@@ -22,7 +22,7 @@ ROOMS = {"api", "metrics", "runs", "stages", "training", "workflows"}  # in whic
 
 
 def types(*settings: str) -> list[str]:
-    return [one.type for one in load("smoke", list(settings)).settings.training.modules]
+    return [module.type for module in load("smoke", list(settings)).settings.training.modules]
 
 
 def test_code_outside_its_check_names_no_module():
@@ -47,8 +47,8 @@ def test_modules_are_set_by_their_type():
     assert types(late, exposure, cameras) == ["camera_optimizer", "exposure", "transients"], "each at its place"
     assert types(late, exposure, "optimize.modules.transients=null") == ["exposure"]
     assert types("optimize.modules.exposure=null") == [], "what is not there may be removed"
-    (found,) = load("smoke", [exposure, "optimize.modules.exposure.model=affine"]).settings.training.modules
-    assert found.model.type == "affine"
+    (actual,) = load("smoke", [exposure, "optimize.modules.exposure.model=affine"]).settings.training.modules
+    assert actual.model.type == "affine"
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_modules_run_in_order_and_backward_in_reverse(device, rng):
     view = trainer.step(photograph, 1)
     assert notes == ["forward a", "forward b", "backward b", "backward a", "update b", "update a"]
     assert view.loss == pytest.approx(alone.loss + 2 * 2.0), "each loss once"
-    assert [one.name for one in view.losses[-2:]] == ["a", "b"]
+    assert [item.name for item in view.losses[-2:]] == ["a", "b"]
 
 
 def test_unknown_module_is_named():
@@ -110,17 +110,17 @@ NEEDED = {  # so that each acts within seven steps
 
 def lists() -> list[list[dict[str, Any]]]:
     """Lists of all shipped modules, each in the first one with which it goes; the second run has a sky."""
-    found: list[list[TrainingModule]] = [[], []]
+    actual: list[list[TrainingModule]] = [[], []]
     shipped = [kind for kind in variants(TrainingModule).values() if kind.__module__.startswith("clsplat.")]
     for kind in sorted(shipped, key=lambda kind: kind.order):
         module = kind.model_validate({"type": (name := kind.model_fields["type"].default), **NEEDED.get(name, {})})
-        for one, parts in zip(found, ([], ["sky"]), strict=True):
+        for one, parts in zip(actual, ([], ["sky"]), strict=True):
             if not ({*parts} & module.conflicts.keys()) and not conflict([*one, module]):
                 one.append(module)
                 break
         else:
             pytest.fail(f"{name} goes with neither list: make another")
-    return [[{"type": one.type, **NEEDED.get(one.type, {})} for one in modules] for modules in found]
+    return [[{"type": one.type, **NEEDED.get(one.type, {})} for one in modules] for modules in actual]
 
 
 def conflict(modules: list[TrainingModule]) -> bool:

@@ -26,11 +26,11 @@ def test_cameras_of_panoramas_are_found(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     write_panoramas(tmp_path / "known", 8, 512)
     place_photographs(tmp_path / "known" / "images", tmp_path / "found", camera_model="EQUIRECTANGULAR")
-    known, found = (clsplat.read_scene(tmp_path / name, holdout=0) for name in ("known", "found"))
-    assert len(found.views) == 6 * 8
+    known, actual = (clsplat.read_scene(tmp_path / name, holdout=0) for name in ("known", "found"))
+    assert len(actual.views) == 6 * 8
     pairs = [
         [view.world_to_camera[:, :3] for view in scene.views if view.name.endswith("/cube_front.png")]
-        for scene in (known, found)
+        for scene in (known, actual)
     ]
     for true, rotation in zip(*pairs, strict=True):
         turn = true @ pairs[0][0].T @ (rotation @ pairs[1][0].T).T

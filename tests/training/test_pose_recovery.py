@@ -25,13 +25,13 @@ VIEWS, STEPS, ANGLE, DEPTH = 6, 300, np.radians(0.3), 3.0
 STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown
 
 
-def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
+def errors(truth: list[View], actual: list[np.ndarray]) -> tuple[float, float]:
     """The largest angle in rad, and the largest distance of centers."""
     angles = [
         Rotation.from_matrix(pose[:, :3] @ view.world_to_camera[:, :3].T).magnitude()
-        for view, pose in zip(truth, found, strict=True)
+        for view, pose in zip(truth, actual, strict=True)
     ]
-    centers = [-pose[:, :3].T @ pose[:, 3] - view.position for view, pose in zip(truth, found, strict=True)]
+    centers = [-pose[:, :3].T @ pose[:, 3] - view.position for view, pose in zip(truth, actual, strict=True)]
     return max(angles), float(np.linalg.norm(centers, axis=1).max())
 
 
@@ -80,8 +80,8 @@ def pose_errors(
     for step in range(1, STEPS + 1):
         trainer.step(photographs[step % VIEWS], step)
     given = [view.world_to_camera for view in views]
-    found = [poses.pose(number) for number in range(VIEWS)]
-    return errors(truth, given), errors(truth, found), zoom * poses.factor(views[-1].name)
+    actual = [poses.pose(number) for number in range(VIEWS)]
+    return errors(truth, given), errors(truth, actual), zoom * poses.factor(views[-1].name)
 
 
 def test_exact_cameras_do_not_drift(rng, info):

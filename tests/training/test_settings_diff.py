@@ -16,8 +16,8 @@ from clsplat.training.stage import Scheduled, Stage
 
 def kinds(before, after) -> dict[str, str | None]:
     """The kind of each difference between two pipelines, by place."""
-    found = differences(before.resolved(), after.resolved(), after.settings)
-    return {difference.key_path: difference.kind for difference in found}
+    result = differences(before.resolved(), after.resolved(), after.settings)
+    return {difference.key_path: difference.kind for difference in result}
 
 
 @pytest.fixture
@@ -73,8 +73,8 @@ CHANGES = {
 
 
 def test_class_declares_which_keys_may_change(pipeline):
-    found = {change: set(kinds(pipeline(TRAINING), pipeline(TRAINING, change)).values()) for change in CHANGES}
-    faults = [f"{change}: {kind}" for change, kind in found.items() if kind != {CHANGES[change]}]
+    actual = {change: set(kinds(pipeline(TRAINING), pipeline(TRAINING, change)).values()) for change in CHANGES}
+    faults = [f"{change}: {kind}" for change, kind in actual.items() if kind != {CHANGES[change]}]
     assert not faults, "\n".join(faults)
 
 

@@ -48,17 +48,17 @@ def with_sky(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Yard, Path]:
-    found = Yard(np.random.default_rng(3))
-    return found, found.write(tmp_path_factory.mktemp("yard") / "scene")
+    result = Yard(np.random.default_rng(3))
+    return result, result.write(tmp_path_factory.mktemp("yard") / "scene")
 
 
 @pytest.fixture(scope="module")
 def sky_run(yard, tmp_path_factory) -> Path:
     """A run that detects the sky automatically."""
     out = tmp_path_factory.mktemp("runs") / "yard"
-    asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
-    run_pipeline(asked, RunState.read(out), None, "new")
-    assert RunState.read(out).is_complete(asked), "the same command finds it up to date"
+    pipeline = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
+    run_pipeline(pipeline, RunState.read(out), None, "new")
+    assert RunState.read(out).is_complete(pipeline), "the same command finds it up to date"
     return out
 
 
@@ -89,9 +89,9 @@ def evaluate_without(out: Path, model) -> float:
     renderer = clsplat.Renderer(model)
     settings = load(str(out / "pipeline.yaml")).settings.scene
     views = settings.read(settings.folder)[0].split("test")
-    found = [np.rint(255 * np.clip(renderer.render(view, 0.0).image, 0, 1)).astype(np.uint8) for view in views]
+    actual = [np.rint(255 * np.clip(renderer.render(view, 0.0).image, 0, 1)).astype(np.uint8) for view in views]
     photographs = [np.rint(255 * view.photograph()).astype(np.uint8) for view in views]
-    return float(np.mean([psnr(a, b) for a, b in zip(found, photographs, strict=True)]))
+    return float(np.mean([psnr(a, b) for a, b in zip(actual, photographs, strict=True)]))
 
 
 @pytest.mark.parametrize(
@@ -107,19 +107,19 @@ def test_sky_ends_at_the_horizon(pitch, rows, share):
 
 
 def test_decision_is_recorded_with_its_reason(sky_run):
-    found = load(str(sky_run / "pipeline.yaml")).settings.model.background
-    assert isinstance(found, Auto)
-    assert found.chosen == "on"
-    assert found.reason.startswith("9 of 9 photographs show bright or blue regions above the horizon, without points")
-    assert "in 15% or more" in found.reason
-    assert f"model.background: on, since {found.reason}" in (sky_run / "log.txt").read_text()
+    actual = load(str(sky_run / "pipeline.yaml")).settings.model.background
+    assert isinstance(actual, Auto)
+    assert actual.chosen == "on"
+    assert actual.reason.startswith("9 of 9 photographs show bright or blue regions above the horizon, without points")
+    assert "in 15% or more" in actual.reason
+    assert f"model.background: on, since {actual.reason}" in (sky_run / "log.txt").read_text()
 
 
 def test_key_changes_no_bits_without_visible_sky(tiny_scene, tmp_path, few_steps, rng):
-    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
-    run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
-    assert (found.chosen, found.reason) == ("off", "the photographs have transparency")
+    pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
+    run_pipeline(pipeline, RunState.read(tmp_path / "run"), None, "new")
+    actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (actual.chosen, actual.reason) == ("off", "the photographs have transparency")
     assert digest(tmp_path / "run") == digest(few_steps)
     assert not (tmp_path / "run" / "point_cloud_sky.json").exists()
     folder = Yard(rng, clear=False).write(tmp_path / "wall")
@@ -161,8 +161,8 @@ def test_counted_opaque_pixels_can_show_sky(tmp_path, rng, alpha, masked, size, 
     more = [f"scene.masks={masks}"] if masked else []
     settings = [f"scene.path='{folder}'", *FEW, "optimize.steps=1", "scene.holdout=4", "model.background=auto", *more]
     run_pipeline(load("smoke", settings), RunState.read(tmp_path / "run"), None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
-    assert (found.chosen, found.reason.startswith(why)) == (chosen, True), found.reason
+    actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (actual.chosen, actual.reason.startswith(why)) == (chosen, True), actual.reason
 
 
 def test_decision_is_not_written_as_a_setting():
@@ -251,9 +251,9 @@ def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path, 
     assert not caplog.text
     scores = []
     for view in yard[0].views:
-        splats, pixels = (clsplat.Renderer(one).render(view) for one in (model, trained))
+        splats, pixels = (clsplat.Renderer(item).render(view) for item in (model, trained))
         above = pixels.alpha < 0.05
-        images = (np.clip(one.image[above], 0, 1) for one in (splats, pixels))
+        images = (np.clip(item.image[above], 0, 1) for item in (splats, pixels))
         scores.append(-10 * np.log10(np.mean(np.subtract(*images) ** 2)))
     assert np.mean(scores) > 36
     count = f"{len(trained):,} Gaussians and 10,000 of the sky"
@@ -303,8 +303,8 @@ def test_rotated_model_has_a_rotated_sky(rng, sky_run):
     model = clsplat.load(sky_run)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     direction = np.array([0.3, -0.8, 0.2])
-    found = sample_texels(model.transformed(rotation=turn).sky.texels, turn @ direction)
-    np.testing.assert_allclose(found, sample_texels(model.sky.texels, direction), atol=0.02)
+    result = sample_texels(model.transformed(rotation=turn).sky.texels, turn @ direction)
+    np.testing.assert_allclose(result, sample_texels(model.sky.texels, direction), atol=0.02)
     assert model.transformed(scale=2.0).sky is model.sky
 
 

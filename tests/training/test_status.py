@@ -130,16 +130,16 @@ def test_steps_of_the_preparation_are_stages(written, tmp_path):
     planned = [PlannedStep(Wait(stage="wait"), "", "", tmp_path / "prepared" / "wait", "no result yet")]
     prepare(planned, tmp_path, tmp_path / "prepared", status.stage)
     status.end("done", 0)
-    assert ("preparing", "wait") in {(one["state"], one.get("stage")) for one in written}
+    assert ("preparing", "wait") in {(item["state"], item.get("stage")) for item in written}
 
 
 def test_heartbeat_continues_during_long_work(written, tmp_path):
     status = StatusFile(tmp_path)
     status.begin()
     until(lambda: len(written) > 3)
-    times = [one["time"] for one in written]
+    times = [item["time"] for item in written]
     assert times == sorted(set(times))
-    assert len({one["changed"] for one in written}) == 1
+    assert len({item["changed"] for item in written}) == 1
     status.end("done", 0)
 
 

@@ -160,12 +160,12 @@ def test_invisible_rows_do_not_change(device, rng, losses):
     trainer.step(photograph, 1)  # moments for all that a penalty gives some
     trainer.rows = "seen"
     before = {name: gaussians.get(name) for name in gaussians.tables}
-    seen = trainer.step(photograph, 2).frame.depth_key.get()[:60] != 0xFFFFFFFF
-    assert 20 < seen.sum() <= 45
+    visible = trainer.step(photograph, 2).frame.depth_key.get()[:60] != 0xFFFFFFFF
+    assert 20 < visible.sum() <= 45
     for name in ("means", "log_scales", "adam/log_scales/moment1", "adam/log_scales/moment2"):
         changed = (gaussians.get(name) != before[name]).any(axis=1)
-        assert not changed[~seen].any(), name
-        assert changed[seen].sum() > 15, name
+        assert not changed[~visible].any(), name
+        assert changed[visible].sum() > 15, name
 
 
 def test_masked_pixels_have_no_gradient(any_device, rng):
@@ -190,13 +190,13 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
 def test_numpy_loss_matches_the_device_loss(any_device, rng, width, height):
     x, y = images(rng, width, height)
     weight = [[0, 0.5], [10, 1.5]]
-    found = []
+    results = []
     for loss in (L1(weight=weight), HostLoss(mean_difference, weight)):
         comparison = make_comparison(any_device, x, y)
         comparison.step = 5
         value = loss.add(comparison)
-        found.append((value.value(), gradient_of(comparison)))
-    (l1, gradient), (host, host_gradient) = found
+        results.append((value.value(), gradient_of(comparison)))
+    (l1, gradient), (host, host_gradient) = results
     assert host == pytest.approx(l1, rel=1e-6)
     np.testing.assert_allclose(host_gradient, gradient, rtol=1e-6)
     assert value.name == "mean_difference"
@@ -205,15 +205,15 @@ def test_numpy_loss_matches_the_device_loss(any_device, rng, width, height):
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_numpy_loss_adds_to_others_in_any_order(any_device, rng, place):
     x, y = images(rng, 40, 30)
-    found = []
+    results = []
     for loss in (L1(weight=0.7), HostLoss(mean_difference, 0.7)):
         losses: list[ImageLoss] = [Dssim(weight=0.2), L2(weight=3.0)]
         losses.insert(place, loss)
         comparison = make_comparison(any_device, x, y)
-        values = [one.add(comparison).value() for one in losses]
-        found.append((sum(values), gradient_of(comparison)))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-6)
-    np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-6 * np.abs(found[0][1]).max())
+        values = [item.add(comparison).value() for item in losses]
+        results.append((sum(values), gradient_of(comparison)))
+    assert results[0][0] == pytest.approx(results[1][0], rel=1e-6)
+    np.testing.assert_allclose(results[1][1], results[0][1], atol=1e-6 * np.abs(results[0][1]).max())
 
 
 def test_numpy_loss_trains_like_the_device_loss(any_device, rng):
@@ -232,7 +232,7 @@ def test_numpy_loss_trains_like_the_device_loss(any_device, rng):
             trainer.step(photograph, step)
         tables.append(trainer.model.gaussians.get("means"))
     np.testing.assert_allclose(tables[1], tables[0], atol=1e-6)
-    assert [one[:3] for one in seen] == [((30, 40, 3), False, False)] * 3
+    assert [item[:3] for item in seen] == [((30, 40, 3), False, False)] * 3
     assert seen[0][3] > 0.9
 
 

@@ -44,9 +44,9 @@ def render(model, view):
 
 def write_page(folder: Path, model, **names) -> Path:
     """Write a page whose photographs are renders of its model, as JPEG."""
-    found = scene(folder)
-    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
-    views = view_entries(found, lambda view: render(model, view), "test")
+    result = scene(folder)
+    stand = Viewpoint.from_points(model.means, result.views, result.views[0])
+    views = view_entries(result, lambda view: render(model, view), "test")
     for view, name in zip(views, names.get("views", ()), strict=False):
         view["name"] = name
     stand = replace(stand, start=replace(stand.start, name=views[0]["name"]))
@@ -319,7 +319,7 @@ def test_two_models_share_a_camera(browser, tmp_path):
     assert np.abs(left.astype(int) - right).mean() > 5
     assert browser.run("document.getElementById('names').innerText").split() == ["a", "b"]
     told = browser.run("document.getElementById('statistics').textContent")
-    counts = [pack(one).count for one in (model, other)]
+    counts = [pack(item).count for item in (model, other)]
     assert re.match(r"a: \d+ of {} splats.* · b: \d+ of {} splats".format(*counts), told), told
     assert browser.run("document.getElementById('strip')") is None, "there are no views"
 

@@ -29,10 +29,10 @@ def poses(views):
 
 def test_path_round_trip(views, tmp_path):
     write_camera_path(tmp_path / "p.json", views, 24)
-    found = camera_path.read(tmp_path / "p.json")
-    assert (found.fps, found.size) == (24, SIZE)
-    np.testing.assert_allclose(poses(found.views), poses(views), atol=1e-12)
-    for old, new in zip(views, found.views, strict=True):
+    result = camera_path.read(tmp_path / "p.json")
+    assert (result.fps, result.size) == (24, SIZE)
+    np.testing.assert_allclose(poses(result.views), poses(views), atol=1e-12)
+    for old, new in zip(views, result.views, strict=True):
         np.testing.assert_allclose(
             [new.camera.fx, new.camera.fy, new.camera.cx], [old.camera.fy, old.camera.fy, 32], rtol=1e-12
         )
@@ -59,8 +59,8 @@ def test_nerfstudios_transform_of_poses_applies_to_the_path(views, tmp_path):
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": np.eye(3, 4).tolist(), "scale": 1}))
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "transforms.json").write_text(json.dumps({"applied_transform": applied.tolist()}))
-    found = camera_path.read(tmp_path / "p.json", tmp_path / "scene").views
-    for old, new in zip(views, found, strict=True):
+    actual = camera_path.read(tmp_path / "p.json", tmp_path / "scene").views
+    for old, new in zip(views, actual, strict=True):
         np.testing.assert_allclose(new.position, applied[:, :3] @ old.position + applied[:, 3], atol=1e-12)
         np.testing.assert_allclose(new.world_to_camera[2, :3], applied[:, :3] @ old.world_to_camera[2, :3], atol=1e-12)
 

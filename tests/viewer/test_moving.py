@@ -34,11 +34,11 @@ NEAREST = """(() => {
 
 def page_of(folder, model) -> Page:
     """A page whose photographs are renders at four moments."""
-    found = scene(folder)
-    found = replace(found, views=tuple(replace(v, time=t) for v, t in zip(found.views, MOMENTS, strict=True)))
-    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
+    result = scene(folder)
+    result = replace(result, views=tuple(replace(v, time=t) for v, t in zip(result.views, MOMENTS, strict=True)))
+    stand = Viewpoint.from_points(model.means, result.views, result.views[0])
     renderer = clsplat.Renderer(model)
-    views = view_entries(found, lambda view: to_8_bits(renderer.render(view).image), "none")
+    views = view_entries(result, lambda view: to_8_bits(renderer.render(view).image), "none")
     return Page("demo", {"demo": pack(model)}, stand, "white", views)
 
 
@@ -46,16 +46,16 @@ def page_of(folder, model) -> Page:
 def test_motion_is_packed_after_other_planes(width):
     model = moving(cloud(300), width)
     packed = pack(model)
-    found, fields = unpacked(packed), motion_fields(width)
-    order = [int(np.linalg.norm(model.means - mean, axis=1).argmin()) for mean in found.means]
+    pixels, fields = unpacked(packed), motion_fields(width)
+    order = [int(np.linalg.norm(model.means - mean, axis=1).argmin()) for mean in pixels.means]
     known = model.motion[order].astype(np.float64)
     straight = slice(0, fields["turn"].start if "turn" in fields else width)
-    np.testing.assert_allclose(found.motion[:, straight], known[:, straight], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(pixels.motion[:, straight], known[:, straight], rtol=1e-3, atol=1e-4)
     tables = {name: values[order] for name, values in model.tables().items()}
     later = evaluate_at({**tables, MOTION: np.where(np.arange(width) == 4, 12.0, known).astype(np.float32)}, 0.7)
     if "turn" in fields:
-        dt = 0.7 - found.motion[:, 3:4]
-        turned = found.quats + np.roll(found.motion[:, fields["turn"]], 1, axis=1) * dt
+        dt = 0.7 - pixels.motion[:, 3:4]
+        turned = pixels.quats + np.roll(pixels.motion[:, fields["turn"]], 1, axis=1) * dt
         same = np.abs((turned * later["quats"]).sum(axis=1))
         same /= np.linalg.norm(turned, axis=1) * np.linalg.norm(later["quats"], axis=1)
         assert same.min() > 0.999

@@ -25,9 +25,9 @@ def logarithmic(means, header):
     return np.sign(offsets) * np.log1p(np.abs(offsets))
 
 
-def matched(model, found):
+def matched(model, actual):
     """Rows of the model in the order of what was found, by the nearest mean."""
-    distances = np.linalg.norm(found.means[:, None] - model.means[None].astype(np.float64), axis=2)
+    distances = np.linalg.norm(actual.means[:, None] - model.means[None].astype(np.float64), axis=2)
     rows = distances.argmin(axis=1)
     assert sorted(rows) == list(range(len(model)))
     return model[rows]
@@ -39,19 +39,19 @@ def matched(model, found):
 def test_packing_round_trips_within_its_steps(count, degree):
     model = spread(count, degree=degree)
     packed = pack(model)
-    found = unpacked(packed)
-    model = matched(model, found)
-    before, after = (logarithmic(means, packed.header) for means in (model.means, found.means))
+    pixels = unpacked(packed)
+    model = matched(model, pixels)
+    before, after = (logarithmic(means, packed.header) for means in (model.means, pixels.means))
     for part in (slice(begin, begin + BLOCK) for begin in range(0, count, BLOCK)):
         assert (np.abs(after[part] - before[part]) <= 0.51 * np.ptp(before[part], axis=0) / STEPS + 1e-6).all()
     unit = model.quats / np.linalg.norm(model.quats, axis=1, keepdims=True)
-    assert (np.abs((found.quats * unit).sum(axis=1)) > 1 - 2e-6).all(), "0.2 degrees"
+    assert (np.abs((pixels.quats * unit).sum(axis=1)) > 1 - 2e-6).all(), "0.2 degrees"
     logs = np.maximum(model.log_scales, model.log_scales.max(axis=1, keepdims=True) - MAX_LOG_RATIO)
-    assert np.abs(np.log(found.scales) - logs).max() < 0.03
-    assert np.abs(found.opacities - model.opacities).max() < 0.003
-    assert np.abs(found.sh[:, 0] - model.sh_base).max() < 0.03
+    assert np.abs(np.log(pixels.scales) - logs).max() < 0.03
+    assert np.abs(pixels.opacities - model.opacities).max() < 0.003
+    assert np.abs(pixels.sh[:, 0] - model.sh_base).max() < 0.03
     half_steps = np.hypot(KNEE, model.sh_rest) * np.arcsinh(MIN_RANGE / KNEE) / 254  # the slope of the table's sinh
-    assert (np.abs(found.sh[:, 1:].reshape(count, -1) - model.sh_rest) <= 1.02 * half_steps).all()
+    assert (np.abs(pixels.sh[:, 1:].reshape(count, -1) - model.sh_rest) <= 1.02 * half_steps).all()
 
 
 def test_same_model_gives_the_same_bytes():
@@ -69,9 +69,9 @@ def test_file_order_does_not_matter():
 def test_first_parts_are_the_most_important():
     model = spread(800)
     packed = pack(model)
-    found = unpacked(packed)
+    pixels = unpacked(packed)
     assert packed.header["levels"] == [100 * (i + 1) for i in range(LEVELS)]
-    weight = found.opacities * np.sort(found.scales, axis=1)[:, 1:].prod(axis=1)
+    weight = pixels.opacities * np.sort(pixels.scales, axis=1)[:, 1:].prod(axis=1)
     parts = weight.reshape(LEVELS, 100)
     assert (parts[:-1].min(axis=1) >= 0.9 * parts[1:].max(axis=1)).all()
 
@@ -109,20 +109,20 @@ def test_empty_model():
 def test_coincident_splats_of_equal_size():
     model = cloud(300)
     same = {name: np.repeat(table[:1], 300, axis=0) for name, table in model.tables().items()}
-    found = unpacked(pack(replace(model, **same)))
-    np.testing.assert_allclose(found.means, same["means"], rtol=1e-6)
-    np.testing.assert_allclose(np.log(found.scales), same["log_scales"], rtol=1e-5)
+    pixels = unpacked(pack(replace(model, **same)))
+    np.testing.assert_allclose(pixels.means, same["means"], rtol=1e-6)
+    np.testing.assert_allclose(np.log(pixels.scales), same["log_scales"], rtol=1e-5)
 
 
 def test_extreme_colors():
     model = spread(300)
     wild = replace(model, sh_rest=model.sh_rest * 60, sh_base=model.sh_base * 20)
-    found = unpacked(pack(wild))
-    wild = matched(wild, found)
+    pixels = unpacked(pack(wild))
+    wild = matched(wild, pixels)
     most = np.abs(wild.sh_rest).max()
-    error = np.abs(found.sh[:, 1:].reshape(300, -1) - wild.sh_rest)
+    error = np.abs(pixels.sh[:, 1:].reshape(300, -1) - wild.sh_rest)
     assert (error < 0.02 * np.abs(wild.sh_rest) + 0.01).all(), most
-    assert np.abs(found.sh[:, 0] - wild.sh_base).max() < 0.02 * np.abs(wild.sh_base).max()
+    assert np.abs(pixels.sh[:, 0] - wild.sh_base).max() < 0.02 * np.abs(wild.sh_base).max()
 
 
 def test_render_settings_and_world_filter():

@@ -28,9 +28,9 @@ def flat(view):
 
 @pytest.fixture
 def page(tmp_path) -> Page:
-    found, model = scene(tmp_path), cloud(60)
-    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
-    return Page("demo", {"model": pack(model)}, stand, "white", view_entries(found, flat, "test"))
+    result, model = scene(tmp_path), cloud(60)
+    stand = Viewpoint.from_points(model.means, result.views, result.views[0])
+    return Page("demo", {"model": pack(model)}, stand, "white", view_entries(result, flat, "test"))
 
 
 def test_same_input_gives_the_same_page(page, tmp_path):
@@ -151,10 +151,10 @@ def test_photographs_stay_within_a_budget(sizes, budget, kept):
 
 @pytest.mark.parametrize(("which", "held"), [("none", []), ("test", [0, 3]), ("all", [0, 1, 2, 3])])
 def test_photographs_of_the_selected_views(tmp_path, which, held):
-    found = view_entries(scene(tmp_path), flat, which)
-    assert [i for i, view in enumerate(found) if view["photograph"]] == held
-    assert all(view["thumbnail"].startswith("data:image/jpeg;base64,") for view in found)
-    assert [view["split"] for view in found] == ["test", "train", "train", "test"]
+    result = view_entries(scene(tmp_path), flat, which)
+    assert [i for i, view in enumerate(result) if view["photograph"]] == held
+    assert all(view["thumbnail"].startswith("data:image/jpeg;base64,") for view in result)
+    assert [view["split"] for view in result] == ["test", "train", "train", "test"]
     assert all(not view["photograph"] for view in view_entries(scene(tmp_path), flat, which, budget=1e-6))
 
 
@@ -164,9 +164,9 @@ def test_thumbnails_keep_their_aspect(shape, after):
 
 
 def test_initial_camera_of_a_page(tmp_path):
-    model, found = cloud(200), views()
-    stand = Viewpoint.from_points(model.means, found, found[2])
-    assert stand.start is found[2]
+    model, result = cloud(200), views()
+    stand = Viewpoint.from_points(model.means, result, result[2])
+    assert stand.start is result[2]
     assert stand.focal == 85.0
     assert stand.up @ [0, -1, 0] > 0.8
     alone = Viewpoint.from_points(model.means, (), None)

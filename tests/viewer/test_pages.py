@@ -61,9 +61,9 @@ def luminance(color: str) -> float:
 @pytest.mark.parametrize("mode", ["light", "dark"])
 def test_text_has_enough_contrast(mode):
     light, dark = re.findall(r":root \{(.*?)\}", (FOLDER / "base.css").read_text(), re.DOTALL)
-    found = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
-    assert found[0].keys() == found[1].keys(), "a color of one mode alone"
-    colors = found[mode == "dark"]
+    actual = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
+    assert actual[0].keys() == actual[1].keys(), "a color of one mode alone"
+    colors = actual[mode == "dark"]
     on_paper = [(text, "paper") for text in ("ink", "soft", "link", "good", "warn", "bad")]
     for text, paper in [
         *on_paper,
@@ -89,8 +89,8 @@ def test_colors_follow_dark_mode():
 
 
 def test_only_one_module_marks_text_as_safe():
-    found = [path.name for path in SOURCES for line in path.read_text().splitlines() if "Markup(" in line]
-    assert found == ["page.py"]
+    actual = [path.name for path in SOURCES for line in path.read_text().splitlines() if "Markup(" in line]
+    assert actual == ["page.py"]
     for path in FOLDER.iterdir():
         assert not re.search(r"\|\s*safe|autoescape|Markup", path.read_text()), f"{path.name} puts in text unescaped"
 

@@ -28,20 +28,20 @@ def pictures(count=9, size=(64, 48)):
     width, height = size
     ground = np.zeros((height, width, 3), np.uint8)
     ground[..., 0], ground[..., 2] = np.linspace(40, 200, width), np.linspace(60, 180, height)[:, None]
-    found = []
+    results = []
     for i in range(count):
         image = ground.copy()
         image[10:26, 4 + 3 * i : 20 + 3 * i] = (240, 200, 30)
-        found.append(image)
-    return found
+        results.append(image)
+    return results
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_video_contains_its_frames(suffix, tmp_path):
     assert clsplat.write_video(tmp_path / f"a{suffix}", pictures(), fps=12) == 9
-    found, fps = decoded(tmp_path / f"a{suffix}")
-    assert (len(found), fps) == (9, 12)
-    for old, new in zip(pictures(), found, strict=True):
+    actual, fps = decoded(tmp_path / f"a{suffix}")
+    assert (len(actual), fps) == (9, 12)
+    for old, new in zip(pictures(), actual, strict=True):
         assert clsplat.metrics.psnr(new, old) > 26, "colors are in their order and their range"
     assert [path.name for path in tmp_path.iterdir()] == [f"a{suffix}"]
 

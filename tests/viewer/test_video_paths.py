@@ -50,14 +50,14 @@ def test_focus_and_up_axis_follow_the_cameras(rng):
 
 @pytest.mark.parametrize("name", ["ellipse", "orbit"])
 def test_orbit_circles_a_camera_ring_once_at_its_distance(name, rng):
-    found = PATHS[name](rig_of(ring(np.linspace(0, 2 * np.pi, 24, endpoint=False)), rng), 36, SIZE)
-    place = positions(found)
+    result = PATHS[name](rig_of(ring(np.linspace(0, 2 * np.pi, 24, endpoint=False)), rng), 36, SIZE)
+    place = positions(result)
     np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), 3, rtol=0.05)
     np.testing.assert_allclose(place[:, 2], 1, atol=0.05)
-    steps = np.diff(np.unwrap(azimuths(found)))
+    steps = np.diff(np.unwrap(azimuths(result)))
     assert (np.sign(steps) == np.sign(steps[0])).all()
     assert abs(steps.sum()) == pytest.approx(2 * np.pi * 35 / 36, rel=0.02)
-    for view in found:
+    for view in result:
         assert (view.camera.width, view.camera.height) == SIZE
         assert view.world_to_camera[1, :3] @ UP < -0.9, "up is up in the image"
         x, y, z = view.world_to_camera @ (0, 0, 0, 1)
@@ -76,10 +76,10 @@ def test_ellipse_matches_the_extent_of_the_cameras(rng):
 
 def test_ellipse_of_one_sided_cameras_swings_on_their_side(rng):
     views = ring(np.linspace(-0.8, 0.8, 15))
-    found = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
-    assert np.abs(azimuths(found)).max() < 0.9
-    assert np.ptp(azimuths(found)) > 0.8
-    moves = np.linalg.norm(np.diff(positions([*found, found[0]]), axis=0), axis=1)
+    result = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
+    assert np.abs(azimuths(result)).max() < 0.9
+    assert np.ptp(azimuths(result)) > 0.8
+    moves = np.linalg.norm(np.diff(positions([*result, result[0]]), axis=0), axis=1)
     assert moves.max() < 0.5, "the last frame leads to the first"
 
 
@@ -108,10 +108,10 @@ def facing(rng, count=20):
 def test_spiral_sways_no_farther_than_the_cameras(rng):
     views = facing(rng)
     rig = Rig.from_views(views, rng.normal(size=(500, 3)) * 0.3 + (0, 5, 0))
-    found = PATHS["spiral"](rig, 50, SIZE)
-    assert (np.abs(positions(found)).max(axis=0) <= np.abs(positions(views)).max(axis=0) + 0.05).all()
-    assert np.ptp(positions(found)[:, 0]) > 0.3
-    assert all(view.world_to_camera[2, 1] > 0.95 for view in found)
+    result = PATHS["spiral"](rig, 50, SIZE)
+    assert (np.abs(positions(result)).max(axis=0) <= np.abs(positions(views)).max(axis=0) + 0.05).all()
+    assert np.ptp(positions(result)[:, 0]) > 0.3
+    assert all(view.world_to_camera[2, 1] > 0.95 for view in result)
     assert 4 < rig.depths[0] < rig.depths[1] < 6
 
 
@@ -149,12 +149,12 @@ def test_walk_connects_neighbors_regardless_of_names(rng):
 
 def test_walk_passes_near_the_views_and_looks_as_they_do(rng):
     views = ring(np.linspace(0, 2.5, 20))
-    found = PATHS["through"](rig_of(views, rng), 100, SIZE)
-    place = positions(found)
+    result = PATHS["through"](rig_of(views, rng), 100, SIZE)
+    place = positions(result)
     gaps = np.linalg.norm(positions(views)[:, None] - place[None], axis=2).min(axis=1)
     assert gaps.max() < 0.15
     assert np.linalg.norm(np.diff(place, axis=0), axis=1).max() < 0.3, "no leaps"
-    for view in found:
+    for view in result:
         closest = nearest_view(view, views, 1.0)
         assert view.world_to_camera[2, :3] @ closest.world_to_camera[2, :3] > 0.97
         assert view.world_to_camera[1, :3] @ closest.world_to_camera[1, :3] > 0.97
@@ -168,9 +168,9 @@ def test_walk_passes_near_the_views_and_looks_as_they_do(rng):
     ],
 )
 def test_few_views_are_sufficient(name, count, rng):
-    found = PATHS[name](rig_of(ring(np.linspace(0, 1, count)), rng), 5, SIZE)
-    assert len(found) == (min(count, 5) if name == "views" else 5)
-    assert np.isfinite(positions(found)).all()
+    result = PATHS[name](rig_of(ring(np.linspace(0, 1, count)), rng), 5, SIZE)
+    assert len(result) == (min(count, 5) if name == "views" else 5)
+    assert np.isfinite(positions(result)).all()
 
 
 def test_views_keep_pose_and_field_of_view():
@@ -224,15 +224,15 @@ def test_unknown_path_and_a_path_without_a_scene_are_refused():
 
 def test_path_of_a_scene_in_python(rng):
     scene = make_scene(Path("none"), ring(np.linspace(0, 6, 12)), set(), None)
-    found = clsplat.camera_path(scene, "orbit", 5, "64x32")
-    assert [view.name for view in found] == [f"frame_{i:05d}" for i in range(1, 6)]
+    views = clsplat.camera_path(scene, "orbit", 5, "64x32")
+    assert [view.name for view in views] == [f"frame_{i:05d}" for i in range(1, 6)]
     assert clsplat.camera_path(scene)[0].camera.width == 200
 
 
 def test_ellipse_of_photographs_stays_in_front_of_the_scene():
     scene = clsplat.read_scene(data_set("fox"))
-    found = clsplat.camera_path(scene, frames=30)
+    views = clsplat.camera_path(scene, frames=30)
     middle = scene.points.positions.mean(axis=0)
     mean = np.mean([view.world_to_camera[2, :3] for view in scene.views], axis=0)
-    assert all(view.world_to_camera[2, :3] @ mean > 0 for view in found), "not from behind the wall"
-    assert all((view.world_to_camera @ [*middle, 1])[2] > 0 for view in found)
+    assert all(view.world_to_camera[2, :3] @ mean > 0 for view in views), "not from behind the wall"
+    assert all((view.world_to_camera @ [*middle, 1])[2] > 0 for view in views)

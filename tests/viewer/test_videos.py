@@ -25,14 +25,14 @@ def pictures(folder):
 
 def test_video_has_the_renders_of_its_path(few_steps, tiny_scene, tmp_path):
     options = {"path": "orbit", "frames": 6, "size": (64, 48), "fps": 5}
-    told = clsplat.render_path(few_steps, video=tmp_path / "a.webm", **options)
-    assert (told["frames"], told["seconds"], told["size"]) == (6, 1.2, [64, 48])
+    result = clsplat.render_path(few_steps, video=tmp_path / "a.webm", **options)
+    assert (result["frames"], result["seconds"], result["size"]) == (6, 1.2, [64, 48])
     assert clsplat.render_path(few_steps, video=None, out=tmp_path / "out", **options)["frames"] == 6
-    found, fps = decoded(tmp_path / "a.webm")
+    actual, fps = decoded(tmp_path / "a.webm")
     single = pictures(tmp_path / "out")
     assert fps == 5
     assert list(single) == [f"frame_{i:05d}.png" for i in range(1, 7)]
-    for frame, picture in zip(found, single.values(), strict=True):
+    for frame, picture in zip(actual, single.values(), strict=True):
         assert clsplat.metrics.psnr(frame, picture) > 25
     model = clsplat.load(few_steps)
     views = clsplat.camera_path(clsplat.read_scene(tiny_scene), "orbit", 6, "64x48")
@@ -50,8 +50,8 @@ def test_video_has_the_renders_of_its_path(few_steps, tiny_scene, tmp_path):
 def test_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     model = shutil.copy(few_steps / "point_cloud.ply", tmp_path)
-    told = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
-    assert (told["frames"], told["size"]) == (5, [32, 32])
+    result = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
+    assert (result["frames"], result["size"]) == (5, [32, 32])
     with pytest.raises(ConfigError, match="does not name its scene"):
         clsplat.render_path(model, video=tmp_path / "a.webm")
 
@@ -61,10 +61,10 @@ def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_pa
     shutil.copytree(few_steps, tmp_path / "run")
     pipeline = tmp_path / "run" / "pipeline.yaml"
     pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
-    told = clsplat.render_path(
+    result = clsplat.render_path(
         tmp_path / "run", video=None, out=tmp_path / "a", path=str(tmp_path / "p.json"), size="32x32"
     )
-    assert told["frames"] == 2
+    assert result["frames"] == 2
     assert f"the folder of its photos, {tmp_path / 'gone'}, is missing" in caplog.text
     with pytest.raises(DataError, match="is missing; give the folder of the scene"):
         clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
@@ -78,9 +78,9 @@ def test_frames_can_be_written_as_images(few_steps, tiny_scene, tmp_path):
     (out / "frame_00007.png").write_bytes(b"a drawing")
     renders = [path.relative_to(tiny_scene).as_posix() for path in sorted((tiny_scene / "test").glob("*.png"))]
     clsplat.render_path(few_steps, **options, frames=2)
-    found = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.*") if path.is_file())
+    actual = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.*") if path.is_file())
     frames = ["frame_00001.npy", "frame_00001.png", "frame_00002.png", "frame_00007.png"]
-    assert found == [".renders.json", *frames, *renders]
+    assert actual == [".renders.json", *frames, *renders]
     with pytest.raises(ConfigError, match=r"frame_00007\.png: exists, and is not from an earlier render"):
         clsplat.render_path(few_steps, **options, frames=7)
     (out / "frame_00003.png").write_bytes(b"a drawing")
@@ -117,8 +117,8 @@ def test_sog_folder_with_a_path_file_needs_no_scene(few_steps, tiny_scene, tmp_p
     with zipfile.ZipFile(tmp_path / "m.sog") as archive:
         archive.extractall(tmp_path / "m")
     options = {"path": str(tmp_path / "p.json"), "size": "32x32"}
-    told = clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm", **options)
-    assert told["frames"] == 2
+    result = clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm", **options)
+    assert result["frames"] == 2
     clsplat.render_path(tmp_path / "m" / "meta.json", video=tmp_path / "b.webm", **options)
     assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
     with pytest.raises(ConfigError, match="does not name its scene"):
@@ -126,12 +126,12 @@ def test_sog_folder_with_a_path_file_needs_no_scene(few_steps, tiny_scene, tmp_p
 
 
 def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
-    shown = command(
+    output = command(
         *("render", few_steps, "--path", "views", "--frames", "3", "--video", tmp_path / "a.webm"),
         *("--side", "photograph", "--depth", "--alpha", "--size", "40x40", "--fps", "2"),
     ).stdout
-    assert "3 frames of 80 x 40 px" in shown
-    assert "a.webm, a_depth.webm, a_alpha.webm" in shown
+    assert "3 frames of 80 x 40 px" in output
+    assert "a.webm, a_depth.webm, a_alpha.webm" in output
     clsplat.render_path(
         few_steps, None, tmp_path / "b.webm", path="views", frames=3, fps=2, size="40x40", side="photograph", depth=True
     )
@@ -142,10 +142,10 @@ def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
 
 def test_photo_of_the_nearest_camera_is_shown_next_to_it(few_steps, tiny_scene, tmp_path):
     clsplat.render_path(few_steps, video=tmp_path / "a.webm", path="views", frames=10, side="photograph")
-    found, _ = decoded(tmp_path / "a.webm")
+    actual, _ = decoded(tmp_path / "a.webm")
     scene = clsplat.read_scene(tiny_scene)
-    assert len(found) == len(scene.views)
-    for frame, view in zip(found, scene.views, strict=True):
+    assert len(actual) == len(scene.views)
+    for frame, view in zip(actual, scene.views, strict=True):
         assert frame.shape == (40, 80, 3)
         assert clsplat.metrics.psnr(frame[:, 40:], view.photograph(1.0)) > 24
 
@@ -196,9 +196,9 @@ def test_image_is_centered_in_its_box():
 )
 def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path):
     given = [tmp_path / word if word.startswith("x.") else word for word in options]
-    shown = command("render", few_steps, "--out", tmp_path / "out", *given, expect=2).stderr
-    assert message in shown
-    assert shown.count("\n") == 1
+    output = command("render", few_steps, "--out", tmp_path / "out", *given, expect=2).stderr
+    assert message in output
+    assert output.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -16,13 +16,13 @@ from clsplat.workflows.partition import Membership, assign_cells, cells, quantil
 def test_gaussians_are_partitioned_into_equal_cells(rng, count):
     means = (rng.standard_normal((4000, 3)) * [20, 5, 1]).astype(np.float32)
     weights = rng.random(4000) * np.exp(means[:, 0] / 20)
-    found = cells(means, weights, count)
-    held = np.stack([cell.box.contains(means) for cell in found])
+    result = cells(means, weights, count)
+    held = np.stack([cell.box.contains(means) for cell in result])
     assert (held.sum(axis=0) == 1).all()
-    np.testing.assert_array_equal(assign_cells(means, found), held.argmax(axis=0))
-    np.testing.assert_allclose([weights[one].sum() for one in held], weights.sum() / count, rtol=0.03)
+    np.testing.assert_array_equal(assign_cells(means, result), held.argmax(axis=0))
+    np.testing.assert_allclose([weights[item].sum() for item in held], weights.sum() / count, rtol=0.03)
     far = np.array([[-1e9, 0, 0], [1e9, 1e9, 1e9], [0, -1e9, 1e9]])
-    assert (np.stack([cell.box.contains(far) for cell in found]).sum(axis=0) == 1).all()
+    assert (np.stack([cell.box.contains(far) for cell in result]).sum(axis=0) == 1).all()
 
 
 def test_only_long_sides_are_cut(rng):

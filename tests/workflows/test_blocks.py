@@ -38,13 +38,13 @@ def trained(tiny_scene: Path, few_steps: Path, tmp_path_factory: pytest.TempPath
     return out, train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
 
 
-def boxes(found: dict) -> list:
-    return [Box(**block["cell"]) for block in found["blocks"]]
+def boxes(actual: dict) -> list:
+    return [Box(**block["cell"]) for block in actual["blocks"]]
 
 
-def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
+def by_owner(model: clsplat.Model, actual: dict) -> clsplat.Model:
     """A model with its Gaussians in the order of the blocks that own them."""
-    held = np.stack([box.contains(model.means) for box in boxes(found)])
+    held = np.stack([box.contains(model.means) for box in boxes(actual)])
     assert (held.sum(axis=0) == 1).all()
     return model[np.argsort(held.argmax(axis=0), kind="stable")]
 
@@ -57,41 +57,41 @@ def test_merged_model_equals_an_undivided_run_with_all_cameras(tiny_scene, few_s
     parts = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "parts", *MIP, blocks=COUNT, min_coverage=0)
     assert [len(block["views"]) for block in parts["blocks"]] == [8] * COUNT
     assert [block["start"] for block in parts["blocks"]] == [whole["gaussians"]] * COUNT
-    one, other = (clsplat.load(Path(found["run"]) / "point_cloud_raw.ply") for found in (whole, parts))
-    for table, values in by_owner(one, parts).tables().items():
+    first, other = (clsplat.load(Path(found["run"]) / "point_cloud_raw.ply") for found in (whole, parts))
+    for table, values in by_owner(first, parts).tables().items():
         np.testing.assert_array_equal(other.tables()[table], values)
     assert other.tables().keys() >= {"filter_variance"}
     assert (by_owner(coarse, parts).means != other.means[: len(coarse)]).any()  # they were trained
 
 
 def test_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
-    out, found = trained
+    out, actual = trained
     starts = [clsplat.load(out / f"block_{i:02d}.ply") for i in range(COUNT)]
-    own = [start[box.contains(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
-    assert [len(model) for model in own] == [block["gaussians"] for block in found["blocks"]]
-    whole = by_owner(clsplat.load(few_steps), found)
+    own = [start[box.contains(start.means)] for start, box in zip(starts, boxes(actual), strict=True)]
+    assert [len(model) for model in own] == [block["gaussians"] for block in actual["blocks"]]
+    whole = by_owner(clsplat.load(few_steps), actual)
     for table, values in whole.tables().items():
         np.testing.assert_array_equal(np.concatenate([model.tables()[table] for model in own]), values)
 
 
 def test_every_camera_is_used_and_views_are_fewer_than_all(trained, tiny_scene):
-    _, found = trained
-    names = [[view["name"] for view in block["views"]] for block in found["blocks"]]
+    _, actual = trained
+    names = [[view["name"] for view in block["views"]] for block in actual["blocks"]]
     train_views = [view.name for view in read_scene(tiny_scene).split("train")]
     assert set().union(*names) == set(train_views)
     assert min(map(len, names)) < len(train_views)
 
 
 def test_block_trains_with_the_full_extent_and_grows_in_its_cell(trained, tiny_scene):
-    out, found = trained
-    for block in found["blocks"]:
+    out, actual = trained
+    for block in actual["blocks"]:
         settings = load(str(out / block["name"] / "pipeline.yaml")).settings
         assert settings.scene.train.names == [view["name"] for view in block["views"]]
         assert settings.scene.extent == read_scene(tiny_scene).extent
         (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
         assert densify.inside.model_dump() == block["growth"]
         model = clsplat.load(out / block["name"])
-        assert boxes(found)[int(block["name"][-2:])].contains(model.means).all()
+        assert boxes(actual)[int(block["name"][-2:])].contains(model.means).all()
 
 
 @pytest.mark.parametrize("most", [16_000, "[[0, 15000], [8, 16000]]"])
@@ -99,19 +99,19 @@ def test_gaussian_limit_is_split_by_visible_pairs(most, tiny_scene, few_steps, t
     """All blocks grow to their parts; many of the Gaussians outside are pruned meanwhile, and leave no room."""
     rules = "[{type: clone, gradient_above: 1.0e-7, size_below: 0.05}, {type: prune_faint, opacity_below: 0.11}]"
     grows = f"densify.rules={rules}", f"densify.max_gaussians={most}", "densify.every=4", "densify.start=3"
-    found = train(tiny_scene, few_steps, tmp_path / "out", *grows, blocks=COUNT)
-    assert 12_000 < found["metrics"]["gaussians"] <= 16_000
-    for block in found["blocks"]:
+    result = train(tiny_scene, few_steps, tmp_path / "out", *grows, blocks=COUNT)
+    assert 12_000 < result["metrics"]["gaussians"] <= 16_000
+    for block in result["blocks"]:
         settings = load(str(tmp_path / "out" / block["name"] / "pipeline.yaml")).settings
         (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
         assert max(schedule_values(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
 
 
 def test_merged_run_is_measured_with_all_views(trained):
-    out, found = trained
-    assert Path(found["run"]) == out / "merged"
-    assert found["metrics"] == json.loads((out / "merged" / "metrics.json").read_text())
-    assert (found["metrics"]["test"]["1"]["views"], found["metrics"]["train"]["1"]["views"]) == (2, 8)
+    out, actual = trained
+    assert Path(actual["run"]) == out / "merged"
+    assert actual["metrics"] == json.loads((out / "merged" / "metrics.json").read_text())
+    assert (actual["metrics"]["test"]["1"]["views"], actual["metrics"]["train"]["1"]["views"]) == (2, 8)
     merged = clsplat.load(out / "merged.ply").means
     parts = [clsplat.load(out / f"block_{i:02d}").means for i in range(COUNT)]
     np.testing.assert_array_equal(merged, np.concatenate(parts))
@@ -218,12 +218,12 @@ def test_status_lists_every_block(trained, tmp_path):
     shutil.copytree(trained[0], out)
     shutil.rmtree(out / "merged")
     (out / "block_02" / "status.json").write_text("{")
-    shown = CliRunner().invoke(app, ["status", str(out)])
-    assert shown.exit_code == 0, shown.output
-    first, *parts = shown.stdout.splitlines()
+    result = CliRunner().invoke(app, ["status", str(out)])
+    assert result.exit_code == 0, result.output
+    first, *parts = result.stdout.splitlines()
     assert first.endswith("out: unfinished, 2 of 4 runs are done")
-    told = [Path(part.strip().split(" at ")[0].split(";")[0]).name for part in parts]
-    assert told == ["block_00: done", "block_01: done", "block_02: unknown", "merged: waiting"]
+    messages = [Path(part.strip().split(" at ")[0].split(";")[0]).name for part in parts]
+    assert messages == ["block_00: done", "block_01: done", "block_02: unknown", "merged: waiting"]
     (out / "blocks.json").write_text("[]")
     with pytest.raises(DataError, match=r"blocks.json: the number of blocks is missing; restore"):
         clsplat.status(out)
@@ -237,17 +237,17 @@ def test_check_finds_damaged_blocks(trained, tmp_path, damaged):
         shutil.rmtree(out / damaged)
     elif damaged:
         (out / damaged).write_bytes((out / damaged).read_bytes()[:-9])
-    found = clsplat.check(out)
-    assert [one["file"] for one in found["objects"] if not one["whole"]] == ([damaged] if damaged else [])
-    assert len(found["objects"]) > 30
+    result = clsplat.check(out)
+    assert [item["file"] for item in result["objects"] if not item["whole"]] == ([damaged] if damaged else [])
+    assert len(result["objects"]) > 30
     shown = CliRunner().invoke(app, ["check", str(out)])
     assert f"clsplat blocks … --out {out}` again" in str(shown.exception) if damaged else shown.exit_code == 0
 
 
 def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps, tmp_path):
     shared = {"blocks": 2, "min_coverage": NEVER, "steps": "shared"}
-    found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
-    for block in found["blocks"]:
+    result = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
+    for block in result["blocks"]:
         folder, share = tmp_path / "out" / block["name"], len(block["views"]) / 8
         assert json.loads((folder / "metrics.json").read_text())["steps"] == 16 * share
         rates = load(str(folder / "pipeline.yaml")).settings.training.rates
@@ -257,12 +257,12 @@ def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps
 
 def test_coarse_model_is_trained_if_none_is_given(tiny_scene, tmp_path):
     coarse = ("optimize.steps=6", "optimize.views.resolution=1")
-    found = clsplat.train_in_blocks(
+    result = clsplat.train_in_blocks(
         tiny_scene, tmp_path / "out", blocks=2, coarse_overrides=coarse, overrides=SHORT, only_plan=True
     )
-    assert found["run"] is None
+    assert result["run"] is None
     assert json.loads((tmp_path / "out" / "coarse" / "metrics.json").read_text())["steps"] == 6
-    assert found["gaussians"] == len(clsplat.load(tmp_path / "out" / "coarse"))
+    assert result["gaussians"] == len(clsplat.load(tmp_path / "out" / "coarse"))
 
 
 @pytest.mark.parametrize(
@@ -321,22 +321,22 @@ def test_plan_by_points_needs_points(tiny_scene, tmp_path):
 
 def test_inspect_shows_a_plan_by_the_points_before_training(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shown = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
-    assert shown.exit_code == 0, shown.output
-    found = json.loads(shown.stdout)
-    assert [block["name"] for block in found["blocks"]] == ["block_00", "block_01"]
-    assert found["gaussians"] == len(read_scene(tiny_scene).points)
-    assert all(0 < low <= high for low, high in (block["seconds"] for block in found["blocks"]))
+    result = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert [block["name"] for block in data["blocks"]] == ["block_00", "block_01"]
+    assert data["gaussians"] == len(read_scene(tiny_scene).points)
+    assert all(0 < low <= high for low, high in (block["seconds"] for block in data["blocks"]))
     assert not list(tmp_path.iterdir())
 
 
 def test_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     arguments = ["blocks", "--scene", str(tiny_scene), "--coarse", str(few_steps), "--out", str(tmp_path / "out")]
-    shown = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
-    assert shown.exit_code == 0, shown.output
-    names = [line.split()[0] for line in shown.stdout.splitlines() if "%" in line]
+    result = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
+    assert result.exit_code == 0, result.output
+    names = [line.split()[0] for line in result.stdout.splitlines() if "%" in line]
     assert names == ["block_00", "block_01", "whole"]
-    assert "estimated time" in shown.stdout
-    assert all(re.search(r"\d min", line) for line in shown.stdout.splitlines() if "%" in line)
+    assert "estimated time" in result.stdout
+    assert all(re.search(r"\d min", line) for line in result.stdout.splitlines() if "%" in line)
     refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
     assert "has a scene in blocks that differs in blocks" in str(refused.exception)

@@ -58,8 +58,8 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_targets(text, most, change):
-    found = CompressionTarget.parse(text)
-    assert (found.max_bytes, found.psnr_change) == (most, change)
+    result = CompressionTarget.parse(text)
+    assert (result.max_bytes, result.psnr_change) == (most, change)
 
 
 @pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
@@ -107,27 +107,27 @@ def test_invalid_fractions_are_refused(keeps):
 
 
 def test_every_file_is_measured_after_reading_it_back(searched, few_steps, tiny_scene):
-    found = json.loads((searched / "compress.json").read_text())
+    data = json.loads((searched / "compress.json").read_text())
     whole = len(read(few_steps / "point_cloud.ply"))
-    assert found["source"]["gaussians"] == whole
-    assert {(one["keep"], one["gaussians"]) for one in found["points"]} == {(1.0, whole), (0.5, round(whole / 2))}
-    for one in found["points"][::3]:
-        file = searched / one["file"]
-        assert file.stat().st_size == one["bytes"]
-        assert read(file).sh_degree == one["degree"]
-        assert evaluate(file, tiny_scene)["test"]["1"]["psnr"] == pytest.approx(one["psnr"], abs=1e-9)
+    assert data["source"]["gaussians"] == whole
+    assert {(item["keep"], item["gaussians"]) for item in data["points"]} == {(1.0, whole), (0.5, round(whole / 2))}
+    for item in data["points"][::3]:
+        file = searched / item["file"]
+        assert file.stat().st_size == item["bytes"]
+        assert read(file).sh_degree == item["degree"]
+        assert evaluate(file, tiny_scene)["test"]["1"]["psnr"] == pytest.approx(item["psnr"], abs=1e-9)
 
 
 def test_chosen_file_is_the_best(searched):
-    found = json.loads((searched / "compress.json").read_text())
-    assert found["chosen"]["psnr"] == max(one["psnr"] for one in found["points"])
-    assert (searched / "compressed.sog").read_bytes() == (searched / found["chosen"]["file"]).read_bytes()
+    data = json.loads((searched / "compress.json").read_text())
+    assert data["chosen"]["psnr"] == max(item["psnr"] for item in data["points"])
+    assert (searched / "compressed.sog").read_bytes() == (searched / data["chosen"]["file"]).read_bytes()
 
 
 def test_page_shows_every_file_and_the_curve(searched):
     text = (searched / "compress.html").read_text()
-    found = json.loads((searched / "compress.json").read_text())
-    assert all(one["file"] in text for one in found["points"])
+    data = json.loads((searched / "compress.json").read_text())
+    assert all(item["file"] in text for item in data["points"])
     assert text.count("<polyline") == len(KEEP)
     assert text.count('class="chosen"') == 1
     Page(text)
@@ -154,10 +154,10 @@ def test_names_of_files_are_escaped():
 def test_repeated_search_trains_nothing_and_gives_the_same_bytes(searched, few_steps):
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in searched.rglob("*.ply")}
     files = {path.name: path.read_bytes() for path in (searched / "trials").iterdir()}
-    found = clsplat.compress_model(few_steps, target="-40dB", out=searched, keep=KEEP, steps=STEPS)
+    result = clsplat.compress_model(few_steps, target="-40dB", out=searched, keep=KEEP, steps=STEPS)
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
     assert {path.name: path.read_bytes() for path in (searched / "trials").iterdir()} == files
-    assert found["chosen"]["bytes"] == min(one["bytes"] for one in found["points"])
+    assert result["chosen"]["bytes"] == min(item["bytes"] for item in result["points"])
 
 
 def test_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatch):
@@ -275,20 +275,20 @@ def test_spz_losses_are_reported_once_per_search(few_steps, tiny_scene, tmp_path
 
 def test_command_prints_a_table(searched, few_steps):
     arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
-    found = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
-    assert found.exit_code == 0, found.output
-    assert table(json.loads((searched / "compress.json").read_text())) in found.output
-    assert "compressed.sog: " in found.output
+    result = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
+    assert result.exit_code == 0, result.output
+    assert table(json.loads((searched / "compress.json").read_text())) in result.output
+    assert "compressed.sog: " in result.output
 
 
 def test_zero_loss_has_no_sign(monkeypatch):
     same = {"psnr": 30.0, "bytes": 10}
-    found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
-    monkeypatch.setattr("clsplat.api.commands.compress_model", lambda *_, **__: found)
+    actual = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
+    monkeypatch.setattr("clsplat.api.commands.compress_model", lambda *_, **__: actual)
     monkeypatch.setattr("clsplat.workflows.compress.table", lambda _: "")
-    told = CliRunner().invoke(app, ["compress", "a.ply"]).output
-    assert "0.00 dB" in told
-    assert "-0.00" not in told
+    output = CliRunner().invoke(app, ["compress", "a.ply"]).output
+    assert "0.00 dB" in output
+    assert "-0.00" not in output
 
 
 def test_candidate_is_trained_with_the_models_render_settings(few_steps, tmp_path):

@@ -50,45 +50,45 @@ def moments(tables: dict[str, np.ndarray], row: int) -> tuple[float, np.ndarray,
 def test_merged_pair_has_the_moments_of_its_mixture(rng):
     tables = float64_tables(model(rng, 40))
     first, second = np.arange(0, 40, 2), np.arange(1, 40, 2)
-    found = merge(tables, first, second, surface)
+    result = merge(tables, first, second, surface)
     for pair, (i, j) in enumerate(zip(first, second, strict=True)):
         (a, mean_a, cov_a), (b, mean_b, cov_b) = moments(tables, i), moments(tables, j)
         mean = (a * mean_a + b * mean_b) / (a + b)
         apart_a, apart_b = mean_a - mean, mean_b - mean
         covariance = (a * (cov_a + np.outer(apart_a, apart_a)) + b * (cov_b + np.outer(apart_b, apart_b))) / (a + b)
-        mass, mean_found, covariance_found = moments(found, pair)
+        mass, mean_found, covariance_found = moments(result, pair)
         np.testing.assert_allclose(mean_found, mean, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(covariance_found, covariance, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(mass, a + b, rtol=1e-9)
         for name in ("sh_base", "sh_rest"):
             color = (a * tables[name][i] + b * tables[name][j]) / (a + b)
-            np.testing.assert_allclose(found[name][pair], color, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(result[name][pair], color, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [surface, volume])
 def test_mixture_is_symmetric_in_its_pair(rng, size):
     tables = float64_tables(model(rng, 20))
-    one, two = np.arange(10), np.arange(10, 20)
-    there, back = merge(tables, one, two, size), merge(tables, two, one, size)
+    first, two = np.arange(10), np.arange(10, 20)
+    there, back = merge(tables, first, two, size), merge(tables, two, first, size)
     for found in (there, back):
         found["covariance"] = covariance_matrices(found.pop("quats"), found["log_scales"])
     for name in there:
         np.testing.assert_allclose(there[name], back[name], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(pair_cost(tables, one, two), pair_cost(tables, two, one), rtol=1e-9)
+    np.testing.assert_allclose(pair_cost(tables, first, two), pair_cost(tables, two, first), rtol=1e-9)
 
 
 @pytest.mark.parametrize("count", [2, 3, 64, 257])
 def test_mass_and_mean_are_preserved(rng, count):
     source = model(rng, count)
-    found = decimate(source)
-    assert len(found) == (count + 1) // 2
-    before, after = float64_tables(source), float64_tables(found)
+    result = decimate(source)
+    assert len(result) == (count + 1) // 2
+    before, after = float64_tables(source), float64_tables(result)
     mass = [masses(tables, surface) for tables in (before, after)]
     np.testing.assert_allclose(mass[1].sum(), mass[0].sum(), rtol=1e-5)
     mean = [(one[:, None] * tables["means"]).sum(axis=0) for one, tables in zip(mass, (before, after), strict=True)]
     np.testing.assert_allclose(mean[1], mean[0], rtol=1e-4, atol=1e-4 * mass[0].sum())
     for name in PARAMETERS:
-        assert getattr(found, name).dtype == np.float32
+        assert getattr(result, name).dtype == np.float32
 
 
 def test_target_fraction_is_reached_in_several_rounds(rng):
@@ -98,37 +98,37 @@ def test_target_fraction_is_reached_in_several_rounds(rng):
 def test_zero_and_one_gaussian_do_not_change(rng):
     for count in (0, 1):
         source = model(rng, count)
-        found = decimate(source)
+        result = decimate(source)
         for name, table in source.tables().items():
-            np.testing.assert_array_equal(getattr(found, name), table)
+            np.testing.assert_array_equal(getattr(result, name), table)
 
 
 def test_same_model_gives_same_bytes_in_any_row_order(rng):
     source = model(rng, 300)
-    found, again = decimate(source), decimate(source[:])
-    for name, table in found.tables().items():
+    result, again = decimate(source), decimate(source[:])
+    for name, table in result.tables().items():
         assert table.tobytes() == getattr(again, name).tobytes()
     mixed = decimate(source[rng.permutation(300)])
     for name in ("means", "sh_base"):
-        tables = (np.sort(getattr(one, name), axis=0) for one in (found, mixed))
+        tables = (np.sort(getattr(item, name), axis=0) for item in (result, mixed))
         np.testing.assert_allclose(*tables, rtol=1e-4, atol=1e-5)
 
 
 def test_coincident_duplicates_merge(rng):
     """More of them than the number of neighbors."""
-    one = model(rng, 1)
-    found = decimate(one[np.zeros(51, int)])
-    assert len(found) == 26
-    np.testing.assert_allclose(found.means, np.repeat(one.means, 26, axis=0), rtol=1e-6)
-    np.testing.assert_allclose(np.sort(found.log_scales), np.repeat(np.sort(one.log_scales), 26, axis=0), rtol=1e-5)
-    alone = np.isclose(found.logit_opacity, one.logit_opacity, rtol=1e-5)
+    first = model(rng, 1)
+    result = decimate(first[np.zeros(51, int)])
+    assert len(result) == 26
+    np.testing.assert_allclose(result.means, np.repeat(first.means, 26, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(np.sort(result.log_scales), np.repeat(np.sort(first.log_scales), 26, axis=0), rtol=1e-5)
+    alone = np.isclose(result.logit_opacity, first.logit_opacity, rtol=1e-5)
     assert alone.sum() == 1, "25 pairs, and the odd one"
 
 
 def test_coincident_gaussians_need_no_extra_work(rng):
     """A round pairs them all: a tree of places alone, or of rows, takes quadratic time here."""
-    one = model(rng, 1, degree=0)
-    rows = [len(pairs) for pairs in match_pairs(float64_tables(one[np.zeros(30_000, int)]))]
+    first = model(rng, 1, degree=0)
+    rows = [len(pairs) for pairs in match_pairs(float64_tables(first[np.zeros(30_000, int)]))]
     assert rows == [15_000, 15_000]
 
 
@@ -181,18 +181,18 @@ def test_extreme_values_and_zero_quaternions_merge_finitely(rng):
     source.quats[3:9] = 0
     source.logit_opacity[8:16] = (np.arange(8)[:, None] - 4) * 30
     source.means[20] = 1e30
-    found = decimate(source, 0.25)
-    assert len(found) == 6
-    assert all(np.isfinite(table).all() for table in found.tables().values())
+    result = decimate(source, 0.25)
+    assert len(result) == 6
+    assert all(np.isfinite(table).all() for table in result.tables().values())
 
 
 def test_mip_model_keeps_its_settings_and_bakes_a_world_filter(rng):
     source = model(rng, 10, mode="mip")
     filtered = Model(**source.tables(), filter_variance=np.full((10, 1), 0.1), rendering=source.rendering)
-    found = decimate(filtered)
-    assert found.filter_variance is None
-    assert found.rendering == source.rendering
-    np.testing.assert_array_equal(found.means, decimate(filtered.baked()).means)
+    result = decimate(filtered)
+    assert result.filter_variance is None
+    assert result.rendering == source.rendering
+    np.testing.assert_array_equal(result.means, decimate(filtered.baked()).means)
 
 
 def test_unmergeable_model_is_refused(rng):

@@ -37,19 +37,19 @@ def tree(folder: Path) -> dict[Path, bytes]:
 
 
 def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
-    folder, found = trained
+    folder, actual = trained
     whole = len(read(few_steps / "point_cloud.ply"))
-    counts = [level["gaussians"] for level in found["levels"]]
+    counts = [level["gaussians"] for level in actual["levels"]]
     assert counts == [whole, (whole + 1) // 2, ((whole + 1) // 2 + 1) // 2]
     assert json.loads((folder / "lod-meta.json").read_text())["counts"] == counts
     training = folder.with_name("site.training")
     for number in (1, 2):
         for file, key in ((f"level_{number}.ply", "merged_psnr"), (f"level_{number}/point_cloud.ply", "psnr")):
             measured = evaluate(training / file, tiny_scene)["test"]["1"]["psnr"]
-            assert found["levels"][number][key] == pytest.approx(measured, abs=1e-9)
+            assert actual["levels"][number][key] == pytest.approx(measured, abs=1e-9)
         assert json.loads((training / f"level_{number}" / "metrics.json").read_text())["steps"] == STEPS
         assert "\nname: lod\n" in (training / f"level_{number}" / "pipeline.yaml").read_text()
-    first = found["levels"][0]
+    first = actual["levels"][0]
     assert first["psnr"] == first["merged_psnr"] == evaluate(few_steps)["test"]["1"]["psnr"]
 
 
@@ -67,10 +67,10 @@ def test_each_level_is_merged_from_the_previous_trained_one(trained):
 
 
 def test_sizes_match_the_files(trained):
-    folder, found = trained
-    assert found["bytes"] == model_bytes(folder) == sum(map(len, tree(folder).values()))
+    folder, actual = trained
+    assert actual["bytes"] == model_bytes(folder) == sum(map(len, tree(folder).values()))
     meta = (folder / "lod-meta.json").stat().st_size
-    assert sum(level["bytes"] for level in found["levels"]) == found["bytes"] - meta
+    assert sum(level["bytes"] for level in actual["levels"]) == actual["bytes"] - meta
 
 
 def test_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
@@ -83,9 +83,9 @@ def test_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
 
 
 def test_written_level_0_is_a_model(trained, few_steps, tiny_scene):
-    folder, found = trained
+    folder, actual = trained
     psnr = evaluate(folder, tiny_scene)["test"]["1"]["psnr"]
-    assert psnr == pytest.approx(found["levels"][0]["psnr"], abs=1)
+    assert psnr == pytest.approx(actual["levels"][0]["psnr"], abs=1)
 
 
 def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch):
@@ -95,12 +95,12 @@ def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch)
     monkeypatch.setattr("clsplat.runs.model_file.open_verified", opens)
     file = tmp_path / "model.ply"
     file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
-    found = clsplat.write_levels(file, tmp_path / "site", levels=2, keep=0.3)
+    result = clsplat.write_levels(file, tmp_path / "site", levels=2, keep=0.3)
     whole = len(read(file))
-    assert [level["gaussians"] for level in found["levels"]] == [whole, int(0.3 * whole + 0.5)]
-    assert found["split"] is None
+    assert [level["gaussians"] for level in result["levels"]] == [whole, int(0.3 * whole + 0.5)]
+    assert result["split"] is None
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.ply", "site"]
-    assert table(found).splitlines()[0].split() == ["level", "Gaussians", "MB"]
+    assert table(result).splitlines()[0].split() == ["level", "Gaussians", "MB"]
 
 
 @pytest.fixture
@@ -112,9 +112,9 @@ def model_file(few_steps: Path, tmp_path: Path) -> Path:
 
 
 def test_merging_without_training_is_reported(model_file, tmp_path):
-    found = CliRunner().invoke(app, ["lod", str(model_file), str(tmp_path / "site"), "--steps", "0"])
-    assert found.exit_code == 0, found.output
-    assert "model.ply: no photos: levels are merged without training" in found.output
+    result = CliRunner().invoke(app, ["lod", str(model_file), str(tmp_path / "site"), "--steps", "0"])
+    assert result.exit_code == 0, result.output
+    assert "model.ply: no photos: levels are merged without training" in result.output
 
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
@@ -139,8 +139,8 @@ def moved(few_steps: Path, tiny_scene: Path, tmp_path: Path) -> Path:
 def test_zero_steps_need_no_photographs(there, moved, tmp_path, caplog):
     if there:
         (tmp_path / "gone").mkdir()
-    found = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
-    assert (len(found["levels"]), found["split"]) == (2, None)
+    result = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
+    assert (len(result["levels"]), result["split"]) == (2, None)
     assert "levels are merged without training and not measured" in caplog.text
 
 
@@ -222,8 +222,8 @@ def test_training_does_not_resume_with_other_photographs(few_steps, tiny_scene, 
 
 def test_folder_of_levels_is_a_model(trained, tiny_scene, tmp_path):
     """With a scene, like any model file."""
-    found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
-    assert found["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
+    result = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
+    assert result["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
 
 
 def test_photographs_have_the_requested_size(few_steps, tmp_path):
@@ -232,8 +232,8 @@ def test_photographs_have_the_requested_size(few_steps, tmp_path):
 
 
 def test_zero_steps_only_measure_the_levels(few_steps, tmp_path):
-    found = clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=0)
-    assert found["levels"][1]["psnr"] == found["levels"][1]["merged_psnr"]
+    result = clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=0)
+    assert result["levels"][1]["psnr"] == result["levels"][1]["merged_psnr"]
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
 
 
@@ -266,9 +266,9 @@ def test_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
 
 def test_command_prints_a_table_and_suggests_one_file_for_few(few_steps, tmp_path):
     arguments = ["lod", str(few_steps), str(tmp_path / "site"), "--levels", "2", "--steps", str(STEPS)]
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == 0, found.output
-    text = " ".join(found.output.split())
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    text = " ".join(result.output.split())
     assert "below a million a single SOG is better" in text
     assert "level Gaussians MB PSNR, dB before training" in text
     assert "site/lod-meta.json: " in text.replace(" /", "/")
