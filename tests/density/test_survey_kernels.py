@@ -71,7 +71,9 @@ def test_squares_match_finite_differences(rng):
 
     case, step = safe_case(rng, 12, 20, 16, MARGIN, opaque), 1e-7
     splats, background, result = case.project(), BACKGROUND.astype(np.float64), squares(case)
-    falloffs = {blend_step.splat: blend_step.falloff for blend_step in ref.blend_steps(splats, 20, 16, ref.Thresholds())}
+    falloffs = {
+        blend_step.splat: blend_step.falloff for blend_step in ref.blend_steps(splats, 20, 16, ref.Thresholds())
+    }
     for i, falloff in falloffs.items():
         sides = []
         for sign in (1, -1):

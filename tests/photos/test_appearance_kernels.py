@@ -68,7 +68,9 @@ def test_step_gradient_is_that_of_its_losses(device, rng, monkeypatch, colors, s
     table, step = case.trainer.modules[0].table, 2e-3
     numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
     case.trainer.modules[0].scalars = case.scalars
-    monkeypatch.setattr(ViewTable, "update", lambda self, scalars, view, gradient, rate: results.append((view, gradient)))
+    monkeypatch.setattr(
+        ViewTable, "update", lambda self, scalars, view, gradient, rate: results.append((view, gradient))
+    )
     case.trainer.step(case.photograph, 1)
     ((view, gradient),) = results
     assert view == "b"

@@ -288,7 +288,9 @@ matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
     assert 5 <= kept < 14 * 13 // 2, "it was killed in the middle"
     match_features(source, tmp_path)
     actual = rows(database)
-    assert len(actual.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
+    assert len(actual.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), (
+        "the last one may be half there"
+    )
     assert actual == rows(mapped.parent / "matches" / "database.db")
 
 

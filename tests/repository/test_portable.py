@@ -189,7 +189,9 @@ def test_implicit_text_encoding_is_detected():
 
 def test_text_files_name_their_encoding():
     actual = [(path, call.lineno) for path in FILES for call in calls(path) if has_implicit_encoding(call)]
-    assert not actual, "\n".join(f"{path}:{line}: takes the encoding of the system; name utf-8" for path, line in actual)
+    assert not actual, "\n".join(
+        f"{path}:{line}: takes the encoding of the system; name utf-8" for path, line in actual
+    )
 
 
 def test_modules_of_some_systems_are_imported_where_used():

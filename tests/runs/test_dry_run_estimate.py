@@ -147,7 +147,8 @@ def test_skipped_files_are_reported_once(photos, caplog):
 def test_dry_run_lists_the_undecided_settings(photos):
     pipeline = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
     lines = [
-        line.strip() for line in describe(pipeline, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
+        line.strip()
+        for line in describe(pipeline, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
     ]
     (actual,) = [line for line in lines if line.startswith("adapt ")]
     assert "the photos decide init.transparent, init.count, " in actual
@@ -161,7 +162,9 @@ def test_existing_cameras_need_no_time(tiny_scene, tmp_path):
     assert [line.split()[0] for line in parts] == ["expected:", "optimize"]
     assert not list(tmp_path.iterdir())
     pipeline = load("smoke", [f"scene.path='{tiny_scene}'"])
-    assert "expected" not in describe(pipeline, RunState.read(tmp_path / "run"), None, "new"), "cells of a matrix are many"
+    assert "expected" not in describe(pipeline, RunState.read(tmp_path / "run"), None, "new"), (
+        "cells of a matrix are many"
+    )
 
 
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])

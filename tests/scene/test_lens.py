@@ -51,7 +51,9 @@ def test_photographs_of_one_camera_share_one_map(monkeypatch):
     monkeypatch.setattr(Lens, "distort", lambda self, u, v: (computed.append(u.size), distort(self, u, v))[1])
     photograph = np.zeros((STRONG.height, STRONG.width, 3), np.uint8)
     for _ in range(3):
-        first = intern_lens(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
+        first = intern_lens(
+            replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True)
+        )  # a lens of this test alone
         first.undistort_image(photograph)
         assert first.shown.any()
     assert drawn[0] is drawn[1] is drawn[2]

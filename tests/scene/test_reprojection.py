@@ -120,7 +120,11 @@ def test_inspect_recommends_a_setting(tmp_path, rng, length, level):
 
 def test_inspect_and_the_photos_recipe_agree():
     for error, learned in ((POSES_ERROR - 0.01, None), (POSES_ERROR, {"start": 500})):
-        (actual,) = [decision for decision in apply_adaptation(load("photos"), Measures(9, error)).decisions if decision.key in POSES]
+        (actual,) = [
+            decision
+            for decision in apply_adaptation(load("photos"), Measures(9, error)).decisions
+            if decision.key in POSES
+        ]
         assert actual.value == learned
     assert POSES == "optimize.modules.camera_optimizer={start: 500}"
 

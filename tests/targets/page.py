@@ -104,7 +104,11 @@ def _vendor_table(simt: Table, rows: list[Row], targets: list[str], vendor: str)
     lines = [_line(head), _line("---" for _ in head)]
     for kernel, variant in rows:
         actual = [simt[Place(target, "simt", kernel, variant)] for target in targets]
-        facts = [_range(of.group for of in actual), _range(of.local for of in actual), _range(of.scratch for of in actual)]
+        facts = [
+            _range(of.group for of in actual),
+            _range(of.local for of in actual),
+            _range(of.scratch for of in actual),
+        ]
         lines.append(_line([f"`{kernel}`" + f" {variant}".rstrip(), *facts, *(_cell(of, vendor) for of in actual)]))
     others = {place: of for place, of in simt.items() if (place.kernel, "") not in rows and not place.variant}
     count = len({place.kernel for place in others})

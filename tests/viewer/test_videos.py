@@ -50,7 +50,9 @@ def test_video_has_the_renders_of_its_path(few_steps, tiny_scene, tmp_path):
 def test_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     model = shutil.copy(few_steps / "point_cloud.ply", tmp_path)
-    result = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
+    result = clsplat.render_path(
+        model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32"
+    )
     assert (result["frames"], result["size"]) == (5, [32, 32])
     with pytest.raises(ConfigError, match="does not name its scene"):
         clsplat.render_path(model, video=tmp_path / "a.webm")
