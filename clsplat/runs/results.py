@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clsplat.core.errors import ConfigError, DataError, shorten
+from clsplat.core.errors import ConfigError, DataError, quote, shorten
 from clsplat.core.files import METRICS, PIPELINE
 from clsplat.core.reading import read_file
 from clsplat.pipeline import plugins
@@ -124,9 +124,12 @@ class RunFolder:
 
     @property
     def renders(self) -> Path:
-        """The folder of the images that the run's last `render` stage wrote."""
+        """The folder of the images that the run's last `render` stage wrote.  Raises DataError if it is elsewhere."""
         stages = [stage["render"] for stage in self.settings["stages"] if isinstance(stage, dict) and "render" in stage]
-        return self.path / (stages[-1] or {}).get("folder", "renders") if stages else self.path / "renders"
+        folder = str((stages[-1] or {}).get("folder", "renders")) if stages else "renders"
+        if Path(folder).is_absolute() or ".." in Path(folder).parts:
+            raise DataError(f"{self.path / PIPELINE}: render.folder is outside the run folder: {quote(folder)}")
+        return self.path / folder
 
 
 def read_settings(path: Path) -> dict[str, Any]:

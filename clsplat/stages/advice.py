@@ -12,7 +12,7 @@ from clsplat.metrics.views import Gains, ViewMetrics, measure
 from clsplat.scene.view import View, sample_views
 from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
 from clsplat.stages.export import sky_gaussians
-from clsplat.training.modules.base import color_model, learned_scene
+from clsplat.training.modules.base import color_model, learned_scene, module_class
 from clsplat.training.modules.sky_choice import sky_reason
 from clsplat.training.run import Run
 
@@ -44,7 +44,7 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     again, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
     stages = run.pipeline["stages"]
-    can_mask = run.learned_field is None and not {"transients", "distractors"} & run.modules.keys()
+    can_mask = run.learned_field is None and not any(module_class(name).masks_objects for name in run.modules)
     has_exposures = color_model(run) is not None or run.learned_field is not None
     limits = [edit["limit"] for edit in run.records.read("densify") if "limit" in edit]
     key = find_limit(stages)

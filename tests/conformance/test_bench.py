@@ -130,7 +130,7 @@ def test_table_in_text_is_plain_and_never_cut(monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     monkeypatch.setenv("FORCE_COLOR", "1")
     long = "a long name [bold]of[/bold] a scene" * 20
-    assert text_table([("scene", "MiB"), (long, "7"), ("b", "")], left=1).splitlines() == [
+    assert text_table([("scene", "MiB"), (long, "7"), ("b", "")], left_columns=1).splitlines() == [
         "scene".ljust(len(long)) + "  MiB",
         long + "    7",
         "b",

@@ -258,6 +258,13 @@ def test_single_run_is_compared_with_the_photograph(make_run):
     assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in result)
 
 
+@pytest.mark.parametrize("folder", ["../elsewhere", "/elsewhere"])
+def test_renders_outside_the_run_folder_are_refused(make_run, folder):
+    run = RunFolder.read(make_run("alone"))
+    with pytest.raises(DataError, match=r"render\.folder is outside the run folder"):
+        _ = replace(run, settings={"stages": [{"render": {"folder": folder}}]}).renders
+
+
 def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
     folder = make_run("bent", error=0)
     run = RunFolder.read(folder)

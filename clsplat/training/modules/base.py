@@ -149,6 +149,7 @@ class TrainingModule(Settings):
     a number and not a list of other modules, so that plug-ins have a position too."""
     side_files: ClassVar[Mapping[str, str]] = {}
     """Files in the run folder, each with its title; their names start with `view_`."""
+    masks_objects: ClassVar[bool] = False  # whether it masks objects that move between photographs
     device_planes: ClassVar[int] = 0  # float planes on the device, each of the largest view's size
     implicit_type: ClassVar[str] = ""  # the type of a module that is never listed, but implied by the model or a loss
     keyed_by_type: ClassVar[bool] = True

@@ -46,6 +46,7 @@ class Distractors(TrainingModule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     order: ClassVar[int] = 20  # before the modules for colors: these Gaussians have the colors of the scene
+    masks_objects: ClassVar[bool] = True
     device_planes: ClassVar[int] = 12  # to render and compare them, at most
 
     type: Literal["distractors"] = "distractors"

@@ -36,6 +36,7 @@ class Transients(TrainingModule):
         {"start", "quantile", "outlier_ratio", "tail_ratio", "box_size", "decay"}
     )
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    masks_objects: ClassVar[bool] = True
     device_planes: ClassVar[int] = 2  # residuals and mask
     order: ClassVar[int] = 90  # after all changes of both images
 
