@@ -75,10 +75,10 @@ def advise_on_training_views(
     if names := find_outliers({view.view: view.psnr for view in metrics}):
         text = f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos"
         if steps is None:
-            yield f"{text}: remove those that are blurred or have wrong poses, then `{again}`"
+            yield f"{text}: remove blurred photos and photos with wrong poses, then `{again}`"
         else:
             transients = shell_quote(f"optimize.modules.transients={{start: {round(TRANSIENTS_START * steps)}}}")
-            yield f"{text}: remove those that are blurred; if objects move, `{again} --set {transients}`"
+            yield f"{text}: remove blurred photos; if objects move, `{again} --set {transients}`"
     gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
     gained = float(np.mean(gains)) if gains else 0.0
     if not has_exposures and gained >= MIN_EXPOSURE_GAIN:
