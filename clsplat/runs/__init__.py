@@ -1,1 +1,1 @@
-"""One run in its folder: start, resume, verify, status, render, live preview."""
+"""Start, resume, verify, report, render, and preview a single run in its folder."""

@@ -41,47 +41,51 @@ def describe(
     read: ReadScene = read_run_scene,
     with_time: bool = False,
 ) -> str:
-    """Return what a run in a folder would do, a line for each stage; nothing is written.
+    """Describe what a run would do in a folder, one line per stage, without writing anything.
 
-    read: reads the scene; with_time: whether to add an estimate of the time of a new run.
-    Raises the errors that the run would raise before its first stage; those of its photos only if they are prepared.
+    read: function that reads the scene.  with_time: whether to add a time estimate for a new run.
+    Raises the errors that the run would raise before its first stage.  Errors in photos that still have to be prepared
+    are not found.
     """
     out = state.out
-    chosen = choose_start(pipeline, state, start)
-    if chosen is None:
+    actual_start = choose_start(pipeline, state, start)
+    if actual_start is None:
         return f"{out}: up to date"
-    start = chosen
+    start = actual_start
     check_output_paths(pipeline, state)
     check_run_folder(state, start)
     check_unused(out)
-    planned = pipeline.preparation(out)
-    lines = [f"  {step.step.stage:<14} {step.why or 'done'}" for step in planned]
+    planned_steps = pipeline.preparation(out)
+    lines = [f"  {step.step.stage:<14} {step.why or 'done'}" for step in planned_steps]
     run, verdict = None, "would run"
-    if any(step.why for step in planned):
-        opened, _ = check_start(pipeline, out, device, start)
+    if any(step.why for step in planned_steps):
+        opened_device, _ = check_start(pipeline, out, device, start)
     else:
         run = open_run(pipeline, out, device, start, read=read)
-        opened = run.device
+        opened_device = run.device
         pipeline = resolve_choices(pipeline, run, log_reasons=False)  # the description includes them
         if start == "resume":
-            resumed = restore(pipeline, run)
-            verdict = f"would continue from step {run.step}" if resumed else "nothing to resume; would run"
+            restored_checkpoint = restore(pipeline, run)
+            verdict = f"would continue from step {run.step}" if restored_checkpoint else "nothing to resume; would run"
         check_run(pipeline, run)
-    names = photo_names(pipeline, planned, out) if run is None else []
-    measures, refusal = _expect_measures(pipeline, names)
-    lines += [*refusal, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
-    if undecided := pipeline.undecided:
-        lines.append(f"  adapt          the photos decide {', '.join(undecided)}")
-    described = [stage for stage in pipeline.stages if _has_work(stage, run)]
-    lines += [f"  {stage.stage:<14} {_describe_stage(stage, run)}".rstrip() for stage in described]
+    names = photo_names(pipeline, planned_steps, out) if run is None else []
+    measures, refusal_lines = _expect_measures(pipeline, names)
+    lines += [*refusal_lines, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
+    if undecided_keys := pipeline.undecided:
+        lines.append(f"  adapt          the photos decide {', '.join(undecided_keys)}")
+    active_stages = [stage for stage in pipeline.stages if _has_work(stage, run)]
+    lines += [f"  {stage.stage:<14} {_describe_stage(stage, run)}".rstrip() for stage in active_stages]
     lines += _describe_offloading(pipeline, run) if run else []
     if with_time and start != "resume":
-        lines += estimate_time(pipeline, planned, names, measures, opened, run)
+        lines += estimate_time(pipeline, planned_steps, names, measures, opened_device, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
 def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
-    """Return the expected measures of the photos to prepare, or a line with the reason why the run will be refused."""
+    """Return the expected measures of the photos to prepare, and a list of lines.
+
+    If the run would be refused even if all photos get a camera, the measures are None, and the line says why.
+    """
     try:
         return expected_measures(pipeline, names), []
     except DataError as error:
@@ -89,26 +93,26 @@ def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures
 
 
 def check_unused(out: Path) -> None:
-    """Raise OutputError if `out` is in use; log if a run would have to wait to find out."""
+    """Raise OutputError if a run is using `out`.  Log if a new run would first have to wait for a heartbeat."""
     if not lock.check_free(out):
         LOG.info("%s: was in use on another machine; the run would wait up to a minute for its heartbeat", out)
 
 
 def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
-    """Return a line with the memory plan if spherical harmonics will be in host memory."""
-    first = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
-    if first is None:
+    """Return the memory plan in a list of one line; empty unless the spherical harmonics are offloaded to the host."""
+    init_stage = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
+    if init_stage is None:
         return []
-    motion, count = run.model_settings.time, first.expected_count(run.scene)
+    motion, gaussian_count = run.model_settings.time, init_stage.expected_count(run.scene)
     tables = table_widths(run.model_settings.sh_degree, motion.width if motion else 0)
-    if run.harmonics == "auto" and count <= run.memory_plan(tables, "device").limit:
+    if run.harmonics == "auto" and gaussian_count <= run.memory_plan(tables, "device").limit:
         return []
-    planned = run.memory_plan(tables, offload_target(run.harmonics, run.device.info))
-    return [f"  {planned.text(count)}"] if planned.host else []
+    host_plan = run.memory_plan(tables, offload_target(run.harmonics, run.device.info))
+    return [f"  {host_plan.text(gaussian_count)}"] if host_plan.host else []
 
 
 def _has_work(stage: Stage, run: Run | None) -> bool:
-    """Return whether a stage does anything; evaluation and rendering need views in their split."""
+    """Return whether a stage has any work.  Evaluation and rendering have none if their split has no views."""
     return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
 
 
@@ -123,7 +127,7 @@ def _describe_stage(stage: Stage, run: Run | None) -> str:
 
 
 def _describe_cadence(stage: Scheduled) -> str:
-    """Return when a scheduled stage runs."""
+    """Describe when a scheduled stage runs, such as "densify every 100 (start 500, stop 15000)"."""
     limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
     text = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
     return f"{stage.stage} every {stage.every}" + (f" ({text})" if text else "")

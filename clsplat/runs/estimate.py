@@ -1,8 +1,8 @@
 """Estimate the time of a run as a rough range, without running anything on the device.
 
 The time of a step is proportional to pixels and Gaussians, or to the samples and weights of a field, divided by the
-compute units of the device.  Unknowns widen the range: how many Gaussians grow, and at which step validation ends the
-training.
+compute units of the device.  The range is wider if the final number of Gaussians, or the step at which validation ends
+the training, is unknown.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,20 +23,20 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
 
-PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian of a training step, on one AVX-512 core
-WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per weight of a field and per level of its grid, for each sample
-LAUNCHES = 1.0e-3  # s per step, whatever its size
+PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian in a training step, on one AVX-512 core
+WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per network weight and per grid level of a field, for each sample
+LAUNCHES = 1.0e-3  # s per step for kernel launches, independent of its size
 SLOWER = 6.0  # factor for slower processors and larger Gaussians than in the benchmark
-MIN_GAUSSIANS = 5000  # initial number for a small capture, while the points are unknown
+MIN_GAUSSIANS = 5000  # initial number for a small capture whose points are unknown
 MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; typical captures end at 0.1 to 1
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimated time of a part of a run, s, from minimum to maximum, with an explanation."""
+    """The estimated time of one part of a run, with an explanation."""
 
     name: str
-    seconds: tuple[float, float]
+    seconds: tuple[float, float]  # minimum and maximum
     reason: str
 
     @property
@@ -47,23 +47,23 @@ class Estimate:
 
 def estimate_time(
     pipeline: Pipeline,
-    planned: Sequence[PlannedStep],
+    planned_steps: Sequence[PlannedStep],
     names: Sequence[str],
     measures: Measures | None,
     device: Device,
     run: Run | None,
 ) -> list[str]:
-    """Return a line with the time of the run, and one for each part; empty if nothing can be estimated.
+    """Return a line with the estimated time of the run, and one line per part; empty if nothing can be estimated.
 
-    names, measures: of the photos to prepare; run: only if the scene is prepared already.
+    names, measures: of the photos to prepare.  run: None if the scene is not prepared yet.
     """
-    parts = list(_preparation_estimates(planned, len(names))) if names else []
-    if (capture := _capture(pipeline, planned, names, run)) is not None:
+    parts = list(_preparation_estimates(planned_steps, len(names))) if names else []
+    if (training_size := _training_size(pipeline, planned_steps, names, run)) is not None:
         settings = (apply_adaptation(pipeline, measures) if measures and run is None else pipeline).settings
-        trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-        parts += [_training_estimate(training, *capture, device.info.units) for training in trainings]
-    fields = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
-    parts += [_field_estimate(training, device.info.units) for training in fields]
+        training_stages = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+        parts += [_training_estimate(training, *training_size, device.info.units) for training in training_stages]
+    field_stages = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
+    parts += [_field_estimate(training, device.info.units) for training in field_stages]
     if not parts:
         return []
     low, high = (sum(part.seconds[end] for part in parts) for end in (0, 1))
@@ -71,33 +71,33 @@ def estimate_time(
     return [total, *(part.text for part in parts)]
 
 
-def _preparation_estimates(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Estimate]:
-    """Estimate the preparation steps that are due."""
-    for planned_step in planned:
+def _preparation_estimates(planned_steps: Sequence[PlannedStep], photo_count: int) -> Iterator[Estimate]:
+    """Yield an estimate for each preparation step that is due."""
+    for planned_step in planned_steps:
         if planned_step.why and (seconds := planned_step.step.seconds) is not None:
-            count, name = planned_step.step.pieces(photographs)
-            yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {name}")
+            count, unit = planned_step.step.pieces(photo_count)
+            yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {unit}")
 
 
-def _capture(
-    pipeline: Pipeline, planned: Sequence[PlannedStep], names: Sequence[str], run: Run | None
+def _training_size(
+    pipeline: Pipeline, planned_steps: Sequence[PlannedStep], names: Sequence[str], run: Run | None
 ) -> tuple[tuple[int, int], int] | None:
-    """Return the image size in training, px, and the initial number of Gaussians; None if unknown."""
+    """Return the size of the training images, px, and the initial number of Gaussians; None if the size is unknown."""
     if run is not None:
         views = run.scene.merge_validation().split("train")
         sizes = sorted(((view.camera.width, view.camera.height) for view in views), key=lambda size: size[0] * size[1])
         counts = [stage.expected_count(run.scene) for stage in pipeline.settings.stages if isinstance(stage, Init)]
         return sizes[len(sizes) // 2], counts[0] if counts else MIN_GAUSSIANS
     scene = pipeline.settings.scene
-    if (size := _size(scene.folder, names)) is None:
+    if (size := _first_photo_size(scene.folder, names)) is None:
         return None
-    longest = getattr(planned[-1].step, "long_side", None) or max(size)
-    scale = min(1.0, longest / max(size)) / scene.downscale
+    long_side = getattr(planned_steps[-1].step, "long_side", None) or max(size)
+    scale = min(1.0, long_side / max(size)) / scene.downscale
     return (max(1, round(scale * size[0])), max(1, round(scale * size[1]))), MIN_GAUSSIANS
 
 
-def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
-    """Return the size of the first photo that can be read, px; None if none of the first three can."""
+def _first_photo_size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
+    """Return the size, px, of the first readable photo; None if the first three are unreadable."""
     for name in names[:3]:
         with suppress(DataError):
             return image_size(folder / name)
@@ -105,7 +105,10 @@ def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
 
 
 def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, units: int) -> Estimate:
-    """Estimate a training, for the smallest and the largest number of steps and Gaussians."""
+    """Estimate the time of a training stage, from its minimum and maximum numbers of steps and Gaussians.
+
+    size: width and height of the images, px.  initial: the initial number of Gaussians.  units: of the device.
+    """
     pixels = size[0] * size[1]
     maximum = max(initial, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
     low, high = step_seconds(units, size, initial)[0], step_seconds(units, size, maximum)[1]
@@ -116,7 +119,7 @@ def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, 
 
 
 def _field_estimate(training: TrainField, units: int) -> Estimate:
-    """Estimate a training of a field, whose steps all take the same time."""
+    """Estimate the time of a stage that trains a field; all of its steps take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
     sample_seconds = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
@@ -126,19 +129,19 @@ def _field_estimate(training: TrainField, units: int) -> Estimate:
 
 
 def max_gaussians(training: Optimize, pixels: int) -> float | None:
-    """Return the maximum number of Gaussians by the settings of a training; None if there is no limit.
+    """Return the maximum number of Gaussians that the settings of a training allow; None if there is no limit.
 
-    pixels: of an image.
+    pixels: number of pixels of an image.
     """
-    growing = [stage for stage in training.during if isinstance(stage, Densify)]
-    limits = [max(schedule_values(stage.max_gaussians)) for stage in growing if stage.max_gaussians is not None]
-    return min([*limits, *(stage.per_pixel * pixels for stage in growing if stage.per_pixel)], default=None)
+    growth_stages = [stage for stage in training.during if isinstance(stage, Densify)]
+    limits = [max(schedule_values(stage.max_gaussians)) for stage in growth_stages if stage.max_gaussians is not None]
+    return min([*limits, *(stage.per_pixel * pixels for stage in growth_stages if stage.per_pixel)], default=None)
 
 
 def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, float]:
     """Return the minimum and maximum time of a training step, s.
 
-    units: compute units of the device; size: of an image, px; count: of Gaussians.
+    units: number of compute units of the device.  size: width and height of an image, px.  count: number of Gaussians.
     """
     seconds = LAUNCHES + (PIXEL * size[0] * size[1] + GAUSSIAN * count) / units
     return seconds, SLOWER * seconds

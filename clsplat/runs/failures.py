@@ -1,4 +1,4 @@
-"""Record failures: of a run, in its status.json, and of parts, such as cells, while the other parts continue."""
+"""Record the failure of a run in its status.json, and collect the failures of parts, such as the cells of a matrix."""
 
 import logging
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ LOG = logging.getLogger("clsplat")
 
 
 class Failures(dict[str, ClsplatError]):
-    """The errors of the parts that failed, by name."""
+    """A dictionary from the name of each failed part to its error."""
 
     def __init__(self, parts: str) -> None:
         """parts: a plural noun for messages, such as "cells"."""
@@ -21,7 +21,7 @@ class Failures(dict[str, ClsplatError]):
 
     @contextmanager
     def recording(self, name: str) -> Iterator[None]:
-        """Record an error of the block as a failure of the part, instead of raising it.  Raises Interrupted."""
+        """Record an error of the block as the failure of a part, instead of raising it.  Raises Interrupted."""
         try:
             yield
         except Interrupted:
@@ -30,27 +30,27 @@ class Failures(dict[str, ClsplatError]):
             self.note(name, as_clsplat_error(error))
 
     def note(self, name: str, error: ClsplatError) -> None:
-        """Record and log that a part failed."""
+        """Record the error of a part, and log it."""
         self[name] = error
         LOG.warning("%s failed: %s", name, one_line(error))
 
     def texts(self) -> dict[str, str]:
-        """Return the error of each part in one line."""
+        """Return the error of each part as one line, by name."""
         return {name: one_line(error) for name, error in self.items()}
 
     def summary(self, count: int, verb: str = "failed") -> ClsplatError:
-        """Return a single error with the exit code of the first failure.  count: number of all parts."""
-        name, first = next(iter(self.items()))
-        error = ClsplatError(f"{len(self)} of {count} {self._parts} {verb}; the first, {name}: {first}")
-        error.exit_code = first.exit_code
+        """Return a single error with the exit code of the first failure.  count: total number of parts."""
+        name, first_error = next(iter(self.items()))
+        error = ClsplatError(f"{len(self)} of {count} {self._parts} {verb}; the first, {name}: {first_error}")
+        error.exit_code = first_error.exit_code
         return error
 
 
 @contextmanager
 def recording_failures(status: StatusFile, reraise: bool = False) -> Iterator[None]:
-    """Turn any failure of the block into a ClsplatError, and write it to status.json.
+    """Write any failure of the block to status.json, and raise it as a ClsplatError.
 
-    reraise: re-raise the original exception instead.
+    reraise: whether to raise the original exception instead.
     """
     try:
         yield
@@ -66,7 +66,7 @@ def recording_failures(status: StatusFile, reraise: bool = False) -> Iterator[No
 
 
 def _interrupted_error(status: StatusFile) -> Interrupted:
-    """Return the error of a run that a signal ended at once, with advice on how to continue."""
+    """Return the error of a run that a signal stopped at once, with advice on how to continue."""
     now, resume = status.now, f"`clsplat resume {shell_quote(status.out)}`"
     if not (status.has_run and now.step):  # the folder is unchanged
         return Interrupted("stopped at once; run the same command again to continue")

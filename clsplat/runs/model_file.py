@@ -53,35 +53,38 @@ AnyModel = Model | FieldModel
 
 
 def read(file: Path) -> AnyModel:
-    """Read a model file or a field file.  Raises DataError if it is missing, damaged or another file."""
+    """Read a model file or a field file.  Raises DataError if it is missing, damaged, or of another format."""
     return load_field(file) if is_field(file) else load(file)
 
 
-def make_painter(loaded: AnyModel, device: Device, background: Background) -> Painter:
-    """Return a painter of a model on a device.  background: for Gaussians; a field has its own."""
-    if isinstance(loaded, FieldModel):
-        return loaded.upload(device)
-    return SplatPainter(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
+def make_painter(host_model: AnyModel, device: Device, background: Background) -> Painter:
+    """Return a painter for a model on a device.  background: behind Gaussians; a field file contains its background."""
+    if isinstance(host_model, FieldModel):
+        return host_model.upload(device)
+    return SplatPainter(Rasterizer(device), host_model.upload(device), Photographs(device, background).background)
 
 
-def points_of(loaded: AnyModel, scene: Scene | None) -> NDArray[np.float32]:
-    """Return points of the content, [M, 3]: the means of Gaussians, or the points of the scene, if any, for a field."""
-    if isinstance(loaded, Model):
-        return loaded.scene_means
+def points_of(host_model: AnyModel, scene: Scene | None) -> NDArray[np.float32]:
+    """Return points of the visible content, (M, 3): the means of Gaussians, or for a field the points of the scene.
+
+    M is 0 for a field without scene points.
+    """
+    if isinstance(host_model, Model):
+        return host_model.scene_means
     points = scene.points if scene else None
     return np.zeros((0, 3), np.float32) if points is None else points.positions
 
 
-def is_moving(loaded: AnyModel) -> bool:
-    """Return whether a model has motion."""
-    return isinstance(loaded, Model) and loaded.motion is not None
+def is_moving(host_model: AnyModel) -> bool:
+    """Return whether a model is a set of Gaussians with motion."""
+    return isinstance(host_model, Model) and host_model.motion is not None
 
 
-def size_of(loaded: AnyModel) -> dict[str, int | None]:
-    """Return the number of Gaussians or of network parameters, with the keys of metrics.json."""
-    if isinstance(loaded, Model):
-        return {"gaussians": len(loaded)}
-    return {"gaussians": None, "parameters": loaded.shape.parameter_count}
+def size_of(host_model: AnyModel) -> dict[str, int | None]:
+    """Return the number of Gaussians or of network parameters, under the keys that metrics.json uses."""
+    if isinstance(host_model, Model):
+        return {"gaussians": len(host_model)}
+    return {"gaussians": None, "parameters": host_model.shape.parameter_count}
 
 
 # The model and the photos of a command, given as a file, a dataset folder, or a run folder.
@@ -89,20 +92,20 @@ def size_of(loaded: AnyModel) -> dict[str, int | None]:
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model file, and the photos with its cameras."""
+    """A model file, and the dataset that it is rendered or compared with."""
 
     file: Path
-    folder: Path  # of the photos
-    settings: SceneSettings  # for reading the photos
-    scene_name: str  # on pages
-    alpha: Alpha | None = None  # None: as the model file says
+    folder: Path  # dataset folder, with the photos and cameras
+    settings: SceneSettings  # settings for reading the dataset
+    scene_name: str  # shown on pages
+    alpha: Alpha | None = None  # None: use the value in the model file
 
     @classmethod
     def from_model(cls, model: Path, scene: Path | None) -> "ModelSource":
-        """Find the photos of a run folder, or of a file that a run exported; other files need `scene`.
+        """Find the dataset of a run folder, or of a file that a run exported.  Other model files need `scene`.
 
-        `scene`, a dataset folder or run folder, replaces the photos of the model's run.  Raises DataError if a file is
-        missing, and ConfigError if the scene is unknown.
+        scene: a dataset folder or run folder whose photos replace those of the model's run.  Raises DataError if a
+        file is missing, and ConfigError if the scene is unknown.
         """
         run = find_run(model)
         folder = scene if scene is not None and has_pipeline(scene) else run
@@ -124,20 +127,20 @@ class ModelSource:
         return cls(file, folder, settings, name, settings.alpha)
 
     def scene(self, model: Model | FieldModel) -> Scene:
-        """Read the scene as the training of the model did, at full image size."""
+        """Read the scene with the masks and alpha mode of the model's training, at full image size."""
         masked = self.settings.apply_masks(read_scene(self.folder, self.settings.split))
         return masked.with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:
-    """Raise DataError for a folder without Gaussians, and for a field."""
+    """Raise DataError if a path is a folder without a model of Gaussians, or a field."""
     refuse_field(path)
     if path.is_dir() and not (file := model_path(path)).is_file():
         raise _missing_model_error(path, file.name)
 
 
 def _missing_model_error(folder: Path, name: str = MODEL) -> DataError:
-    """Return the error for a folder without a model, with a remedy for its kind."""
+    """Return the error for a folder without a model; its remedy depends on whether the folder is a run or photos."""
     if _has_field(folder):
         return DataError(f"{folder}: its field file is missing; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
@@ -163,7 +166,7 @@ def field_error(path: Path) -> DataError:
 
 
 def trained_file(run: Path) -> Path:
-    """Return the file that a run trained: Gaussians, or a field."""
+    """Return the model file that a run trained: Gaussians, or a field."""
     file = run_model(run)
     return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
@@ -177,7 +180,10 @@ def _has_field(run: Path) -> bool:
 
 
 def find_run(model: Path) -> Path | None:
-    """Return the run folder of a model: the path itself, or the run that exported the file; None if there is none."""
+    """Return the run folder of a model; None if it is not from a run.
+
+    model: the run folder itself, or a file that the run exported.
+    """
     if model.is_dir():
         return model if has_pipeline(model) else None
     file = model.resolve()
@@ -191,14 +197,15 @@ def find_run(model: Path) -> Path | None:
 
 
 def photo_folder(scene: Path) -> Path:
-    """Return the dataset folder of a scene: the folder itself, or for a run folder that of its photos.
+    """Return the dataset folder of a scene.
 
-    Raises ConfigError if the pipeline of a run names no folder or cannot be read, DataError if the folder is missing.
+    scene: the dataset folder itself, or a run folder, whose pipeline names the dataset folder.  Raises ConfigError if
+    that pipeline cannot be read or names no folder, and DataError if the named folder is missing.
     """
     if not has_pipeline(scene):
         return scene
-    prepared = read_note(scene)
-    folder = Path(prepared["folder"]) if prepared else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
+    note = read_note(scene)
+    folder = Path(note["folder"]) if note else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
         raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; give the folder of the scene")
     return folder
@@ -215,7 +222,7 @@ def with_scene_path(overrides: Sequence[str], scene: Path | None) -> list[str]:
 
 
 def path_setting(folder: Path) -> str:
-    """Format the absolute path of a folder as a value for `--set`.  Raises ConfigError if YAML cannot represent it."""
+    """Format the absolute path of a folder as a value for `--set`.  Raises ConfigError if it is not valid Unicode."""
     path = str(folder.resolve())
     try:
         path.encode()
@@ -226,10 +233,10 @@ def path_setting(folder: Path) -> str:
 
 # Renders in a folder, one file per view and layer.
 
-FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # of a video; frames of the path `views` have the names of views
+FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # video frames; those of the path `views` are named like views
 LOG = logging.getLogger("clsplat")
 KINDS = ("png", "npy")  # file formats
-RECORD = ".renders.json"  # next to renders: their names, and whether each is a frame of a video
+RECORD = ".renders.json"  # in the folder of renders: the name of each render, and whether it is a frame of a video
 
 
 def write_pictures(
@@ -241,10 +248,10 @@ def write_pictures(
     photographs: Sequence[Path],
     is_video: bool = False,
 ) -> list[Path]:
-    """Write images (`kind` png) or float32 arrays (npy) of the layers of each view; return their files.
+    """Write the layers of each view as images (`kind` png) or float32 arrays (npy); return the paths of the files.
 
-    File names end in the name of the layer, except for color.  photographs: files whose folders must not be written to;
-    is_video: the views are frames of a video, and leftover frames of an earlier one are removed at the end.
+    File names end in the name of the layer, except for color.  photographs: photo files, whose folders must not be
+    written to.  is_video: whether the views are frames of a video; if so, frames of earlier videos are removed.
     """
     color_paths = image_paths(out, [view.name for view in views], f".{kind}")
     files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
@@ -253,8 +260,8 @@ def write_pictures(
         raise ConfigError(f"{out}: two images would have the same name; rename the view that ends in _depth or _alpha")
     _check_folder(out, paths, photographs)
     names = [path.relative_to(out).as_posix() for path in paths]
-    rendered = {**_read_record(out), **dict.fromkeys(names, is_video)}
-    _write_record(out, rendered)
+    record = {**_read_record(out), **dict.fromkeys(names, is_video)}
+    _write_record(out, record)
     depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
     for view, layer_files in counted(zip(views, files, strict=True), "views rendered", len(views)):
         buffers = canvas.render_layers(view, "depth" in layers)
@@ -265,13 +272,13 @@ def write_pictures(
                 _write_array(path, layer_values(buffers, layer))
     if is_video:
         _remove_frames(
-            out, {name for name, is_frame in rendered.items() if is_frame and name.endswith(f".{kind}")} - {*names}
+            out, {name for name, is_frame in record.items() if is_frame and name.endswith(f".{kind}")} - {*names}
         )
     return paths
 
 
 def _remove_frames(out: Path, frames: set[str]) -> None:
-    """Remove frames of an earlier video from a folder and its record."""
+    """Remove frames of an earlier video from a folder and from its record."""
     with raising_output_error(out):
         for name in frames:
             (out / name).unlink(missing_ok=True)
@@ -292,7 +299,7 @@ def _write_array(path: Path, array: NDArray[np.float32]) -> None:
 
 
 def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path]) -> None:
-    """Raise ConfigError if renders would mix with photos, or replace files that are not renders."""
+    """Raise ConfigError if renders would be written among photos, or would replace files that are not renders."""
     folder = out.resolve()
     for images in {path.resolve().parent for path in photographs}:
         if folder == images or folder in images.parents or images in folder.parents:
@@ -306,13 +313,13 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
 
 
 def _read_record(out: Path) -> dict[str, bool]:
-    """Return the renders of earlier calls in a folder, and whether each is a frame of a video."""
+    """Return the names of earlier renders in a folder, each with whether it is a frame of a video."""
     try:
         record = read_json(out / RECORD)
     except DataError:
         return {}
-    table = record if isinstance(record, dict) else {}
-    return {name: is_frame is True and FRAME.fullmatch(name) is not None for name, is_frame in table.items()}
+    entries = record if isinstance(record, dict) else {}
+    return {name: is_frame is True and FRAME.fullmatch(name) is not None for name, is_frame in entries.items()}
 
 
 def _write_record(out: Path, rendered: Mapping[str, bool]) -> None:
@@ -325,47 +332,47 @@ SPLITS = ("train", "test", "all")
 class ModelFile:
     """A model on a device, with its scene.
 
-    Rendering settings come from the header of the file; files of other programs get those of 3DGS, or of Mip-Splatting
-    if the header says so.  Photos of a run folder are read as the run read them.
+    The header of the model file contains the rendering settings.  Files of other programs use the settings of 3DGS, or
+    of Mip-Splatting if the header says so.  The photos of a run folder are read with the settings of the run.
     """
 
     def __init__(
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
-        """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
+        """downscale: divisor of the image size; default: the one used by the run, or 1 for a file."""
         self.source = ModelSource.from_model(model, scene)
-        loaded = read(self.source.file)
+        host_model = read(self.source.file)
         self.device = open_verified(device)
-        original = self.source.scene(loaded)
-        self.loaded = loaded.in_scene(original)
+        original = self.source.scene(host_model)
+        self.host_model = host_model.in_scene(original)
         self.photographs = apply_side_files(self.source.file, original) if scene is None else original
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
-        self.background = self.loaded.rendering.background or self.scene.background
+        self.background = self.host_model.rendering.background or self.scene.background
         self.colors = read_color_model(self.source.file)
 
     @property
     def gaussians(self) -> Model:
-        """The model.  Raises DataError for a field."""
-        if isinstance(self.loaded, FieldModel):
+        """The Gaussians of the model.  Raises DataError for a field."""
+        if isinstance(self.host_model, FieldModel):
             raise field_error(self.source.file)
-        return self.loaded
+        return self.host_model
 
     @cached_property
     def painter(self) -> Painter:
-        """The painter of the model on the device."""
-        return make_painter(self.loaded, self.device, self.background)
+        """The painter that renders the model on the device."""
+        return make_painter(self.host_model, self.device, self.background)
 
     def render(
         self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
     ) -> int:
-        """Write layers of the views of a split as images (`kind` png) or float32 arrays (npy); return the file count.
+        """Render the views of a split, and write their layers as images (`kind` png) or float32 arrays (npy).
 
-        time: in [0, 1], for all views; None: each view's time.
+        time: timestamp in [0, 1] for all views; None: use the timestamp of each view.  Returns the number of files.
         """
         views: Sequence[View] = self.scene.split(split)
         if times := parse_times(time):
-            require_motion(is_moving(self.loaded))
+            require_motion(is_moving(self.host_model))
             views = [replace(view, time=times[0]) for view in views]
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
@@ -375,7 +382,7 @@ class ModelFile:
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
     ) -> dict[str, Any]:
-        """Return metrics by split and downscale factor, with the keys of metrics.json."""
+        """Return metrics by split and downscale factor, under the keys that metrics.json uses."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for downscale in downscales or [self.downscale]:
             scene = self.photographs.downscaled(downscale)
@@ -390,19 +397,19 @@ class ModelFile:
                         trained=scene.split("train"),
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
-        return {**metrics, **size_of(self.loaded), "device": self.device.text}
+        return {**metrics, **size_of(self.host_model), "device": self.device.text}
 
 
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
-    """Write cameras in the format of another program; return the files.
+    """Write cameras in the format of another program; return the paths of the files.
 
-    scene: a dataset folder, a `Scene`, or a run folder, whose cameras are the optimized ones.  Raises ClsplatError.
+    scene: a dataset folder, a `Scene`, or a run folder, whose optimized cameras are written.  Raises ClsplatError.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; expected a folder to write into")
     if isinstance(scene, Path) and has_pipeline(scene):
         source = ModelSource.from_model(scene, None)
-        resolved = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
+        used_scene = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
     else:
-        resolved = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
-    return camera_files.write_cameras(resolved, out, format_, images)
+        used_scene = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
+    return camera_files.write_cameras(used_scene, out, format_, images)

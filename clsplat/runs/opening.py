@@ -1,4 +1,4 @@
-"""Open a run: check the device, prepare the photos, read the scene, and resolve settings that the photos decide."""
+"""Open a run: check the device, prepare the photos, read the scene, and resolve settings that depend on the photos."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -46,8 +46,8 @@ MIN_VIEWS = 3  # training photos; with fewer, a warning is logged
 class RunScene:
     """A scene with the settings of a run."""
 
-    original: Scene  # as read
-    scene: Scene  # as trained on: at one size or several
+    original: Scene  # with photos at full size
+    scene: Scene  # with photos at the training size, or at several sizes
     background: Background
     identity: Identity
 
@@ -55,7 +55,7 @@ class RunScene:
     def from_scene(cls, settings: SceneSettings, scene: Scene) -> "RunScene":
         """Apply the settings to a scene, and decode its photos.
 
-        Raises DataError, with their names, if photos or masks cannot be used.
+        Raises DataError, which names the files, if photos or masks cannot be used.
         """
         original, background = settings.apply(scene)
         downscaled = original.downscaled(*settings.downscales)
@@ -105,27 +105,28 @@ def open_run(
     status: StatusFile | None = None,
     read: ReadScene = read_run_scene,
 ) -> Run:
-    """Open the device, prepare and read the scene, and decode its photos; `status` shows the progress.
+    """Open the device, prepare and read the scene, and decode its photos; return the run before its first stage.
 
-    start: "restart" allows photos that differ from those of the run in `out`.  Raises the errors of these steps.
+    start: with "restart", the photos may differ from those of the run in `out`.  status: receives the progress.
+    Raises the errors of these steps.
     """
-    opened, planned = check_start(pipeline, out, device, start)
+    opened_device, planned_steps = check_start(pipeline, out, device, start)
     if status:
-        status.enter("preparing", device=opened.text)
+        status.enter("preparing", device=opened_device.text)
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with listening(count_listener(status)):
-        folder = prepare(planned, folder, root, status.stage)
+        folder = prepare(planned_steps, folder, root, status.stage)
         with status.stage(READ_SCENE):
-            run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
-    run.prepared, run.preparation = make_note(planned) if planned else None, step_facts(planned)
+            run = make_run(pipeline, read(pipeline.settings.scene, folder), opened_device, out, status)
+    run.prepared, run.preparation = make_note(planned_steps) if planned_steps else None, step_facts(planned_steps)
     return run
 
 
 def count_listener(status: StatusFile) -> Listener:
-    """Return a listener that writes progress of the preparation to `status`; the time left, only in the last stage.
+    """Return a listener that writes the progress of the preparation to `status`.
 
-    Earlier, the time of the next steps is unknown: for example, that of mapping while pairs are being matched.
+    The remaining time is written only in the last stage, because earlier the time of the following steps is unknown.
     """
 
     def note_count(unit: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -137,50 +138,48 @@ def count_listener(status: StatusFile) -> Listener:
 def check_start(
     pipeline: Pipeline, out: Path, device: str | Device | None, start: Start
 ) -> tuple[Device, list[PlannedStep]]:
-    """Check all that is possible before photos are prepared; return the device and the steps of `prepare`.
+    """Check everything that can be checked before the photos are prepared; return the device and the `prepare` steps.
 
-    Nothing is written.  Raises the errors of a run.
+    Nothing is written.  Raises the errors that the run would raise.
     """
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    opened = open_verified(device, settings.rasterizer.schedule, settings.rasterizer.sort)
-    planned = check_preparation(pipeline, out)
-    if planned and start != "restart" and read_note(out) not in (None, make_note(planned)):
+    opened_device = open_verified(device, settings.rasterizer.schedule, settings.rasterizer.sort)
+    planned_steps = check_preparation(pipeline, out)
+    if planned_steps and start != "restart" and read_note(out) not in (None, make_note(planned_steps)):
         raise ConfigError(f"{out}: was started with other photos or other settings of `prepare`; use another folder")
-    return opened, planned
+    return opened_device, planned_steps
 
 
-def photo_names(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> list[str]:
-    """Return the names of the photos to prepare; empty without `prepare`, or if there are none.
+def photo_names(pipeline: Pipeline, steps: Sequence[PlannedStep], out: Path) -> list[str]:
+    """Return the names of the photos to prepare; empty if there are none, or if the pipeline does not prepare photos.
 
     Skipped files are logged.
     """
     try:
-        return (
-            list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if planned else []
-        )
+        return list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if steps else []
     except DataError:
         return []
 
 
 def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
-    """Return the steps that prepare the photos of a run in `out`; nothing is written.
+    """Check the steps that prepare the photos of a run in `out`, and return them; nothing is written.
 
-    Raises ConfigError or DataError for errors that are known before the first step.
+    Raises ConfigError or DataError if the preparation is certain to fail.
     """
-    planned = pipeline.preparation(out)
-    if planned and planned[0].why:
-        planned[0].step.check(pipeline.settings.scene.folder.resolve(), prepared_folder(out).parent)
-    if any(step.why for step in planned):
-        _check_split(pipeline, planned, out)
-    return planned
+    planned_steps = pipeline.preparation(out)
+    if planned_steps and planned_steps[0].why:
+        planned_steps[0].step.check(pipeline.settings.scene.folder.resolve(), prepared_folder(out).parent)
+    if any(step.why for step in planned_steps):
+        _check_split(pipeline, planned_steps, out)
+    return planned_steps
 
 
-def _check_split(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> None:
-    """Raise DataError if the photos to prepare do not fit the split, even if all get a camera."""
+def _check_split(pipeline: Pipeline, planned_steps: Sequence[PlannedStep], out: Path) -> None:
+    """Raise DataError if the split would reject the photos to prepare, even if all of them get a camera."""
     with log_level(logging.ERROR):
-        names = photo_names(pipeline, planned, out)
+        names = photo_names(pipeline, planned_steps, out)
     if not names:
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
@@ -189,15 +188,16 @@ def _check_split(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) 
 
 
 def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
-    """Return the measures known before preparation: the number of training and validation photos, if all get a camera.
+    """Return the measures that are known before the preparation; None without names.
 
-    Returns None without names.  Raises DataError if the photos do not fit the split.
+    Only the number of training and validation photos is known, and only if all of them get a camera.  Raises DataError
+    if the split rejects the photos.
     """
     return Measures(len(_scene_of_names(pipeline, names).merge_validation().train)) if names else None
 
 
 def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
-    """Return a scene of named photos with placeholder cameras and the split of the pipeline.  Raises DataError."""
+    """Return a scene of the named photos with placeholder cameras, split as in the pipeline.  Raises DataError."""
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
@@ -206,19 +206,19 @@ def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
 
 
 def undistorted_folder(out: Path) -> Path:
-    """Return the folder of undistorted photos: in the run folder, or the target of a link next to it.
+    """Return the folder of undistorted photos: a subfolder of the run folder, or of the target of a link next to it.
 
-    A store creates the link so that its cells share the photos.  Each host has a separate folder, because the names of
-    temporary files are unique only within a host.
+    A store creates the link so that its cells share the photos.  Each host uses a separate subfolder of its target,
+    because the names of temporary files are unique only within a host.
     """
-    shared = out.absolute().parent / UNDISTORTED
-    store = Path(*shared.parts[:-4]) / UNDISTORTED  # a link to another folder is not from the store
-    is_store_link = shared.is_symlink() and shared.is_dir() and shared.resolve().parent == store.resolve()
-    return shared / Owner.current().host_slug if is_store_link else out / UNDISTORTED
+    link = out.absolute().parent / UNDISTORTED
+    store_folder = Path(*link.parts[:-4]) / UNDISTORTED  # a link to another folder is not from the store
+    is_store_link = link.is_symlink() and link.is_dir() and link.resolve().parent == store_folder.resolve()
+    return link / Owner.current().host_slug if is_store_link else out / UNDISTORTED
 
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
-    """Return the run of a pipeline on a scene, in the state before its first stage."""
+    """Create the run of a pipeline on a scene, in the state before its first stage."""
     pipeline = with_lengths(pipeline, scene.scene)
     settings = pipeline.settings
     budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
@@ -241,13 +241,13 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
     )
 
 
-# Settings that the photos decide, resolved before the first step and written to the run's pipeline.yaml.
+# Settings that depend on the photos, resolved before the first step and written to the run's pipeline.yaml.
 
 
 def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> Pipeline:
-    """Resolve `adapt` and `auto` keys from the photos; return the pipeline, and set it in the run.
+    """Resolve `adapt` and `auto` settings from the photos; return the pipeline, and update the run with it.
 
-    Choices of an earlier run are kept.  log_reasons: whether to log the reasons of `adapt`.
+    The choices of a resumed run do not change.  log_reasons: whether to log the reasons for the choices of `adapt`.
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
@@ -263,20 +263,20 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
 
 
 def with_lengths(pipeline: Pipeline, scene: Scene) -> Pipeline:
-    """Return the pipeline with the near plane and the units of fields that `auto` chooses by the scene."""
+    """Return the pipeline with its `auto` lengths, the near plane and the units of fields, resolved from the scene."""
 
     def with_unit(training: TrainField) -> TrainField:
         return training.model_copy(update={"field": training.field.with_unit(scene)})
 
     settings = map_trainings(pipeline.settings, TrainField, with_unit)
     if settings.model.near == "auto":
-        changed = settings.model.model_copy(update=dict.fromkeys(("near", "near_auto"), near_plane(scene)))
-        settings = settings.model_copy(update={"model": changed})
+        model_settings = settings.model.model_copy(update=dict.fromkeys(("near", "near_auto"), near_plane(scene)))
+        settings = settings.model_copy(update={"model": model_settings})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)
 
 
 def _warn_of_near(near: float | str, nearest: float | None) -> None:
-    """Warn if the nearest points are in front of the near plane; both in scene units."""
+    """Warn if the nearest points are in front of the near plane.  Both distances are in scene units."""
     if isinstance(near, float) and nearest is not None and nearest < near:
         LOG.warning(
             "nothing nearer than model.near=%g scene units is drawn, but the nearest points of the training photos are "
@@ -288,11 +288,11 @@ def _warn_of_near(near: float | str, nearest: float | None) -> None:
 def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
     """Return the pipeline with the `auto` settings of its training modules resolved."""
 
-    def with_choices(training: Optimize) -> Optimize:
+    def with_resolved_modules(training: Optimize) -> Optimize:
         modules = [module.resolve_auto(run) for module in training.modules]
         return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
-    settings = map_trainings(pipeline.settings, Optimize, with_choices)
+    settings = map_trainings(pipeline.settings, Optimize, with_resolved_modules)
     modules = [module for stage in settings.stages if isinstance(stage, Optimize) for module in stage.modules]
     settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules)})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

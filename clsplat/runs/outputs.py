@@ -30,13 +30,13 @@ from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write metrics.json: the results of a run, and the output path of the last stage of each name."""
+    """Write metrics.json: the results of a run, and for each stage name the first output of its last stage."""
     training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
     seconds = {
         **run.status.seconds,
         training: run.train_seconds,
     }  # of this process; training time includes earlier processes
-    files = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
+    output_paths = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
         "test": run.metrics.get("test", {}),
         "train": run.metrics.get("train", {}),
@@ -56,7 +56,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "scene": str(run.scene.path.resolve()),
         **({"origin": run.scene.origin.tolist()} if run.scene.origin.any() else {}),
-        "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
+        "files": {name: path.relative_to(run.out).as_posix() for name, path in output_paths.items()},
         **({"preparation": run.preparation} if run.preparation else {}),
         **({"changes": run.changes} if run.changes else {}),
     }
@@ -64,37 +64,37 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
 
 
 def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
-    """Return the SHA-256, by path in the folder, of files of the finished run that no later stage rewrites.
+    """Return the SHA-256, by path in the folder, of files of the finished run that no remaining stage rewrites.
 
-    Until the run ends again, a change of these files counts as damage.  Records, and files of a training that
-    continues, are included only if they are damaged.
+    Until the run ends again, a change of these files counts as damage.  The records, and the files of a training stage
+    that continues, are included only if they are damaged.
     """
     sums = read_sums(run.out)  # read again: with --minutes this process may have changed them
     if sums is None:
         sums = run.model_hashes if run.status.was_done else {}
     stages = pipeline.stages[run.stage_index :]
     training_files = [path for stage in stages if isinstance(stage, Training) for path in stage.outputs(run.out)]
-    rewritten = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
-    rewritten += [run.out / name for name in (PIPELINE, METRICS)]
-    previous = {name: value for name, value in sums.items() if not is_below(run.out / name, rewritten)}
-    damaged, growing = damaged_files(run.out, previous), [run.out / RECORDS, *training_files]
-    return {n: value for n, value in previous.items() if n in damaged or not is_below(run.out / n, growing)}
+    rewritten_files = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
+    rewritten_files += [run.out / name for name in (PIPELINE, METRICS)]
+    previous = {name: value for name, value in sums.items() if not is_below(run.out / name, rewritten_files)}
+    damaged_names, growing_files = damaged_files(run.out, previous), [run.out / RECORDS, *training_files]
+    return {n: value for n, value in previous.items() if n in damaged_names or not is_below(run.out / n, growing_files)}
 
 
 def write_checksums(pipeline: Pipeline, run: Run, previous: Mapping[str, str]) -> None:
     """Write the SHA-256 of each file of the finished run, by path in the run folder.
 
-    previous: checksums of files that this run did not write.
+    previous: checksums of files that the resumed run did not rewrite.
     """
     files = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
     for output in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         files += sorted(output.rglob("*")) if output.is_dir() else [output]
-    new = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in previous]
-    save_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new}, **previous})
+    new_files = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in previous]
+    save_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new_files}, **previous})
 
 
 def save_checksums(run: Run, sums: Mapping[str, str]) -> None:
-    """Write the list of checksums, or remove it if there are none."""
+    """Write the list of checksums, or remove its file if the list is empty."""
     if sums:
         write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
     else:
@@ -108,18 +108,16 @@ def _name(path: Path, run: Run) -> str:
 def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
     """Raise ConfigError if a run would write outside of its folder, or replace files that are not from a run.
 
-    Raises OutputError if the path of the folder is impossible.
+    Raises OutputError if the path of the folder is invalid.
     """
     out = state.out
     path_exists(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
         raise ConfigError(f"{out}: is the root of a file system; use another folder for the run")
-    forbidden = (
-        [folder, folder.parent] if pipeline.settings.prepare else [folder]
-    )  # `prepare` hashes the photos' folder
+    reserved = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # `prepare` hashes the photos' folder
     is_inside = scene.path is not None and (
-        scene.folder.resolve() in forbidden or (state.phase < Phase.BEGUN and _is_among_photos(folder, scene.folder))
+        scene.folder.resolve() in reserved or (state.phase < Phase.BEGUN and _is_among_photos(folder, scene.folder))
     )
     if is_inside:
         raise ConfigError(f"{out}: is, or is inside, the folder of the photos; use another folder for the run")
@@ -127,13 +125,16 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
 
 
 def _is_among_photos(out: Path, scene: Path) -> bool:
-    """Return whether a folder below that of a scene, or a folder between the two, contains photos."""
-    between = [path for path in (out, *out.parents) if scene.resolve() in path.parents and path.is_dir()]
-    return any(is_image(file) for path in between for file in path.iterdir())
+    """Return whether `out`, or a folder between it and the scene folder that contains it, has photos."""
+    folders_between = [path for path in (out, *out.parents) if scene.resolve() in path.parents and path.is_dir()]
+    return any(is_image(file) for path in folders_between for file in path.iterdir())
 
 
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
-    """Raise ConfigError if a file that a run or a matrix would write is outside of its folder, or not from a run."""
+    """Raise ConfigError if a file to write is outside of the run folder, or exists and is not from a run.
+
+    names: of files in the folder of the run or matrix.  outputs: further files or folders to write.
+    """
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
     require_inside(out, files)
     early_files = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
@@ -144,22 +145,22 @@ def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path]
 
 
 def require_inside(out: Path, files: Sequence[Path]) -> None:
-    """Raise ConfigError if a file is a link to a target outside of a folder."""
+    """Raise ConfigError if one of the files is a link to a target outside of `out`."""
     folder = out.resolve()
-    if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
-        raise ConfigError(f"{outside[0]}: links to a target outside of the run folder; remove it, or use another name")
+    if links := [path for path in files if not path.resolve().is_relative_to(folder)]:
+        raise ConfigError(f"{links[0]}: links to a target outside of the run folder; remove it, or use another name")
 
 
 def _is_lock(file: Path) -> bool:
-    """Return whether a file is a run.lock, even one that its process did not finish writing."""
+    """Return whether a file is a run.lock, even if its process did not finish writing it."""
     start = b'{"process": '
     return file.is_file() and start.startswith(read_file(file)[: len(start)])
 
 
 def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -> None:
-    """Check that the files of a run exist, except those that were `damaged` before it.
+    """Raise OutputError if an output of the run is missing, or if a model has changed since the run wrote it.
 
-    Raises OutputError if a file is missing, or a model has changed since it was written.
+    damaged: names of files that were damaged before the run; they are not checked.
     """
     outputs = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
     models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, outputs)}
@@ -170,6 +171,6 @@ def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -
 
 
 def declared_outputs(pipeline: Pipeline) -> list[str]:
-    """Return the output files that the stages of a pipeline name, as paths in the run folder."""
+    """Return the output files that the settings of the stages name, as paths in the run folder."""
     fields = [(stage, *entry) for stage in pipeline.stages for entry in stage.named_outputs().items()]
     return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

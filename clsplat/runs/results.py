@@ -1,4 +1,4 @@
-"""Read a finished run from its folder: settings, metrics, records, renders."""
+"""Read a finished run from its folder: its settings, metrics, records, and renders."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +23,7 @@ Points = list[tuple[float, float]]
 
 
 class Averages(BaseModel):
-    """Metrics of a split at one image size; perceptual metrics are extra fields."""
+    """Mean metrics over the views of a split at one image size; perceptual metrics are extra fields."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
@@ -31,7 +31,7 @@ class Averages(BaseModel):
     ssim: float
     lpips: float | None = None
     views: int
-    psnr_color_views: int | None = None  # None: all views
+    psnr_color_views: int | None = None  # number of views with a `psnr_color`; None: all views
 
     @property
     def color_views(self) -> int:
@@ -39,7 +39,7 @@ class Averages(BaseModel):
         return self.views if self.psnr_color_views is None else self.psnr_color_views
 
     def figure(self, metric: str) -> float | None:
-        """Return a metric by name; None if it was not measured."""
+        """Return a metric by its name; None if it was not measured."""
         value = getattr(self, metric, None)
         return float(value) if isinstance(value, int | float) else None
 
@@ -48,23 +48,23 @@ AveragesByDownscale = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Aver
 
 
 class RunMetrics(BaseModel):
-    """The content of metrics.json; values of stages and of the preparation are extra fields."""
+    """The content of metrics.json; values from stages and from the preparation are extra fields."""
 
     model_config = ConfigDict(extra="allow")
 
     test: AveragesByDownscale
     train: AveragesByDownscale
     gaussians: int | None  # None for a field
-    sky_gaussians: int = 0  # in addition, in exported files
-    parameters: int | None = None  # of a field
+    sky_gaussians: int = 0  # additional Gaussians of the sky in exported files
+    parameters: int | None = None  # number of network parameters of a field
     steps: int
     train_seconds: float
-    cpu_seconds: float | None = None  # of the training, summed over threads
-    device_memory: int | None = None  # peak, bytes
+    cpu_seconds: float | None = None  # CPU time of the training, summed over threads
+    device_memory: int | None = None  # peak allocation, bytes
     seed: int
     device: str
     pipeline: str
-    files: dict[str, str] = {}  # by stage name: the output of its last stage, in the run folder
+    files: dict[str, str] = {}  # first output of the last stage of each name, as a path in the run folder
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RunFolder:
     """The folder of a finished run: settings, metrics, and records."""
 
     path: Path
-    settings: dict[str, Any]  # the resolved pipeline, in the shape of a file
+    settings: dict[str, Any]  # the resolved pipeline, structured as in pipeline.yaml
     scene: SceneSettings
     metrics: RunMetrics
 
@@ -92,16 +92,16 @@ class RunFolder:
 
     @property
     def missing_plugins(self) -> list[str]:
-        """A message for each plug-in of the run that is not loaded, or has changed since."""
-        recorded = self.settings.get("plugins")
-        faults = plugins.differences(recorded) if isinstance(recorded, dict) else []
+        """A message for each plug-in of the run that is not loaded, or has changed since the run."""
+        recorded_plugins = self.settings.get("plugins")
+        faults = plugins.differences(recorded_plugins) if isinstance(recorded_plugins, dict) else []
         return [f"{self.path}: {fault}" for fault in faults]
 
     @property
     def photographs(self) -> Path:
-        """The folder of the photos that the run trained on.  Raises ConfigError if no scene is named."""
-        prepared = read_note(self.path)
-        return Path(prepared["folder"]) if prepared else self.scene.folder
+        """The folder of the photos that the run trained on.  Raises ConfigError if the pipeline names no scene."""
+        note = read_note(self.path)
+        return Path(note["folder"]) if note else self.scene.folder
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
@@ -109,22 +109,25 @@ class RunFolder:
         return Records(self.path).read()
 
     def points(self, kind: str, figure: str, **conditions: Any) -> Points:
-        """Return (step, figure) of all records of a kind, such as `train`, that match the conditions."""
-        lines = (line for line in self.records if line["kind"] == kind)
-        chosen = (line for line in lines if all(line.get(key) == value for key, value in conditions.items()))
-        return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
+        """Return the points (step, figure) of all records of a kind, such as `train`, that match the conditions.
+
+        conditions: values that a record must have, such as split="test".
+        """
+        records = (record for record in self.records if record["kind"] == kind)
+        matches = (record for record in records if all(record.get(key) == value for key, value in conditions.items()))
+        return [(record["step"], record[figure]) for record in matches if isinstance(record.get(figure), int | float)]
 
     def over_cpu_seconds(self, points: Points) -> Points:
-        """Convert points (step, figure) to points (CPU seconds of training, figure); empty without CPU times."""
+        """Convert points (step, figure) to (CPU seconds of training, figure); empty if no CPU times were recorded."""
         times = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
         if len(times) == 1:
             return []
-        steps, seconds = zip(*times, strict=True)
-        return [(float(np.interp(step, steps, seconds)), figure) for step, figure in points]
+        steps, cpu_seconds = zip(*times, strict=True)
+        return [(float(np.interp(step, steps, cpu_seconds)), figure) for step, figure in points]
 
     @property
     def renders(self) -> Path:
-        """The folder of the images that the run's last `render` stage wrote.  Raises DataError if it is elsewhere."""
+        """The folder of images of the last `render` stage.  Raises DataError if it is outside the run folder."""
         stages = [stage["render"] for stage in self.settings["stages"] if isinstance(stage, dict) and "render" in stage]
         folder = str((stages[-1] or {}).get("folder", "renders")) if stages else "renders"
         if Path(folder).is_absolute() or ".." in Path(folder).parts:
@@ -133,7 +136,7 @@ class RunFolder:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the pipeline.yaml of a run folder as plain data.  Raises ConfigError if it is not a pipeline."""
+    """Return the content of a run's pipeline.yaml, not validated.  Raises ConfigError if it is not a pipeline."""
     data = read_yaml(path / PIPELINE).data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
         raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")
@@ -149,13 +152,13 @@ def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
 
 
 def read_metrics(path: Path) -> RunMetrics:
-    """Read a metrics.json.  Raises DataError, with the file and the key, if it is damaged."""
+    """Read a metrics.json file.  Raises DataError, which names the file and the key, if it is damaged."""
     try:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = shorten(".".join(str(part) for part in first["loc"]))
-        message = shorten(first["msg"].removeprefix("Invalid JSON: "), 200)
+        first_error = error.errors()[0]
+        key = shorten(".".join(str(part) for part in first_error["loc"]))
+        message = shorten(first_error["msg"].removeprefix("Invalid JSON: "), 200)
         raise DataError(
             f"{path}: {key + ': ' if key else ''}{message}; the file is damaged: run the pipeline again"
         ) from error

@@ -39,10 +39,11 @@ Start = Literal["new", "resume", "restart"]
 
 @contextmanager
 def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]:
-    """Create and lock the run folder, remove leftovers of killed runs, and yield its status with `values`.
+    """Create and lock the run folder, remove leftover files of killed runs, and yield the status file of the run.
 
-    A run that ends before its first step, without a checkpoint, leaves no files behind, and a finished run that is
-    rejected before it continues stays finished.
+    values: initial fields of the status.
+    A run that ends before its first step, without a checkpoint, leaves no files behind.  A finished run stays finished
+    if its continuation is rejected.
     Raises ConfigError if the folder has another run, and OutputError if it is in use or not writable.
     """
     check_run_folder(state, start)
@@ -68,10 +69,10 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
                         write_text(out / STATUS, old_status)
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # keep the log, which has the traceback
                 if PIPELINE not in state.names and not status.now.step and not is_defect:
-                    written = EARLY_RUN_FILES if status.now.cells else RUN_FILES - {CHECKPOINTS}
+                    removable_names = EARLY_RUN_FILES if status.now.cells else RUN_FILES - {CHECKPOINTS}
                     with suppress(OutputError):
                         status.require_lock()
-                        _remove_unused(out, written, keep={LOCK} if new_folders else EARLY_RUN_FILES)
+                        _remove_unused(out, removable_names, kept_names={LOCK} if new_folders else EARLY_RUN_FILES)
                 raise
     except BaseException:
         with suppress(OSError):  # a folder that is not empty stays
@@ -80,16 +81,17 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
         raise
 
 
-def _remove_unused(out: Path, written: Collection[str], keep: Collection[str]) -> None:
-    """Remove the files of a run that ended before its first step, except for the names to keep.
+def _remove_unused(out: Path, run_file_names: Collection[str], kept_names: Collection[str]) -> None:
+    """Remove the files of a run that ended before its first step, except for `kept_names`.
 
-    Nothing is removed if the folder has other files, such as a checkpoint or a file of the user.
+    run_file_names: names that the run may have written.  Nothing is removed if the folder has other files, such as a
+    checkpoint or a file of the user.
     """
     with suppress(OSError):
         files = list(out.iterdir())
-        if all(file.name in written for file in files):
+        if all(file.name in run_file_names for file in files):
             for file in files:
-                if file.name not in keep:
+                if file.name not in kept_names:
                     shutil.rmtree(file) if file.is_dir() else file.unlink()
 
 
@@ -105,7 +107,7 @@ def clear(status: StatusFile) -> None:
 
 
 def _has_own_pipeline(state: RunState) -> bool:
-    """Return whether the pipeline.yaml of a folder, if any, was written by a run or a matrix."""
+    """Return whether a run or a matrix wrote the pipeline.yaml of a folder; True if there is none."""
     out = state.out
     if PIPELINE not in state.names or STATUS in state.names or state.checkpoints:
         return True
@@ -119,9 +121,11 @@ def _has_own_pipeline(state: RunState) -> bool:
 
 
 def check_run_folder(state: RunState, start: Start) -> None:
-    """Raise ConfigError if the folder has another run, for a new run, or a pipeline.yaml that no run wrote.
+    """Raise ConfigError if a run cannot start in a folder.
 
-    Raises OutputError if a run to resume has lost its state.
+    Possible reasons: a new run would replace another run, no run wrote the folder's pipeline.yaml, or the finished run
+    to resume has no checkpoint.  Raises OutputError if both the status and the checkpoints of a run to resume are
+    missing.
     """
     out = state.out
     if start not in get_args(Start):
@@ -143,11 +147,11 @@ def check_run_folder(state: RunState, start: Start) -> None:
         )
 
 
-# The default folder of a run, and whether a folder has the results that a run would produce.
+# The default folder of a run, and checks whether a folder already has the results of a run.
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunState:
-    """Return the default run folder, or the next numbered one that has no other run."""
+    """Return the state of the default run folder, or of the next numbered folder that no other run uses."""
     number, state = 1, RunState.read(folder)
 
     def is_taken() -> bool:
@@ -166,14 +170,14 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunSta
 
 
 def choose_start(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:
-    """Return how a run starts in a folder; None if it is finished.  A finished run with missing files resumes."""
+    """Return how a run starts in a folder; None if it is complete.  A finished run with missing files is resumed."""
     if start == "new" and is_up_to_date(pipeline, state):
         start = "resume"
     return None if start == "resume" and state.is_complete(pipeline) else start
 
 
 def is_up_to_date(pipeline: Pipeline, state: RunState) -> bool:
-    """Return whether a run of this pipeline on the same photos is finished; always False without `prepare`."""
+    """Return whether a run of this pipeline on the same photos is finished; always False without `prepare` steps."""
     if not pipeline.settings.prepare or state.phase is not Phase.DONE or state.difference(pipeline):
         return False
     return read_note(state.out) == make_note(pipeline.preparation(state.out))

@@ -28,19 +28,19 @@ from clsplat.training.checkpoint import save_on_failure
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 
-# The refit: training again on all photos, for the number of steps that validation found best.
+# The refit: a second training on all photos, for the number of steps that validation found best.
 
 LOG = logging.getLogger("clsplat")
 WITHOUT_VALIDATION = {"keep": "last", "patience": None, "refit": False}
 
 
 def is_refit_due(run: Run) -> bool:
-    """Return whether validation has chosen the number of steps, and the refit has not started."""
+    """Return whether validation has chosen the number of steps, but the refit has not started yet."""
     return run.best is not None and run.best.refit == "due"
 
 
 def start_refit_if_due(run: Run) -> None:
-    """Restart the pipeline if a refit is due."""
+    """Reset the run to its first stage if a refit is due."""
     if run.best is None or run.best.refit != "due":
         return
     LOG.info(
@@ -53,9 +53,9 @@ def start_refit_if_due(run: Run) -> None:
 
 
 def with_refit_steps(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline as it is trained: in a refit, for the number of steps that validation chose.
+    """Return the pipeline to train: in a refit, with the number of steps that validation chose, else unchanged.
 
-    A refit gives the same bits as a run of this pipeline without validation views.
+    A refit has the same bits as a run of the returned pipeline without validation views.
     """
     if not run.is_refit or run.best is None:
         return pipeline
@@ -71,12 +71,12 @@ def with_refit_steps(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _with_growth_end(stage: Densify, best: Best) -> Densify:
-    """Return a stage that ends growth at the step where patience ended it in the first training."""
-    ends = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
-    return stage.model_copy(update={"patience": None, "grow_until": min(ends, default=None)})
+    """Return a stage whose growth ends at the step at which it ended in the first training."""
+    end_steps = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
+    return stage.model_copy(update={"patience": None, "grow_until": min(end_steps, default=None)})
 
 
-# inputs.json: the inputs of a run, and their comparison when the run resumes.
+# inputs.json: the identity of a run's inputs, which is compared when the run resumes.
 
 
 def write_inputs(run: Run) -> None:
@@ -86,9 +86,9 @@ def write_inputs(run: Run) -> None:
 
 
 def require_same_inputs(scene: Path, identity: Identity | None, out: Path, digest: str = "") -> None:
-    """Raise ConfigError, with the changes, if a run was started with other photos, cameras, or points.
+    """Raise ConfigError, which lists the changes, if a run was started with other photos, cameras, or points.
 
-    digest: digest of the earlier inputs, if a checkpoint has it.
+    digest: digest of the earlier inputs from a checkpoint; "": use the one in inputs.json.
     """
     previous = _read_identity(out / INPUTS)
     digest = digest or (previous.digest if previous else "")
@@ -115,9 +115,9 @@ def _read_identity(path: Path) -> Identity | None:
 
 @contextmanager
 def finishing_on_interrupt(run: Run) -> Iterator[None]:
-    """At the first signal, finish the step, or the view of a longer stage, and save the state.
+    """At the first signal, finish the current step, or the current view of a longer stage, and save the state.
 
-    The second signal stops at once, as does the first if there is no model to save.
+    The second signal stops at once.  So does the first if there is no model to save.
     """
 
     def finish() -> None:
@@ -132,9 +132,9 @@ def finishing_on_interrupt(run: Run) -> Iterator[None]:
 
 
 def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress], None]) -> None:
-    """Run the stages, from the newest checkpoint if the run resumes, and write the files of the run folder.
+    """Run the stages, from the newest checkpoint if the run is resumed, and write the files of the run folder.
 
-    The caller records failures.
+    show: receives the progress reports.  The caller has to record failures.
     """
     run.on_progress = show
     previous = begin(pipeline, run, start)
@@ -157,7 +157,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
 def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     """Restore the newest checkpoint, or clear the folder, and write the first files of the run.
 
-    Return the checksums of files of the finished run that no later stage rewrites.
+    Returns the checksums of files of the finished run that no remaining stage rewrites.
     """
     restored = restore(pipeline, run) if start == "resume" else None
     check_run(pipeline, run)
@@ -178,54 +178,54 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
 
 
 def check_run(pipeline: Pipeline, run: Run) -> None:
-    """Check the run for all remaining stages, and raise their errors; nothing is written."""
+    """Check that all remaining stages can run.  Raises their errors; nothing is written."""
     for stage in pipeline.stages[run.stage_index :]:
         stage.check_run(run)
 
 
 def write_pipeline(pipeline: Pipeline, run: Run) -> None:
-    """Write pipeline.yaml, with all settings, and the reason if some differ from the pipeline file."""
+    """Write pipeline.yaml with all settings, and a comment with the reason if some differ from the pipeline file."""
     reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
     write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
 
 
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
-    """Restore the newest intact checkpoint; return it, or None if none was saved.  Nothing is written.
+    """Restore the newest intact checkpoint, and return its path; None if no checkpoint was saved.  Nothing is written.
 
-    Raises ConfigError if it has other settings, photos, cameras, or points, or has trained longer already, and
+    Raises ConfigError if the checkpoint has other settings, photos, cameras, or points, or is beyond the last step, and
     OutputError if all checkpoints are damaged.
     """
-    restored, remarks = checkpoint.restore(run)
-    if restored:
+    path, warnings = checkpoint.restore(run)
+    if path:
         require_same_inputs(run.scene.path, run.identity, run.out, run.resumed_inputs)
         stage = pipeline.stages[run.stage_index] if run.stage_index < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
-                f"{restored}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it; use "
+                f"{path}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it; use "
                 f"{run.stage_step} or more, or start over: `clsplat run` with --restart or another --out"
             )
-    for remark in remarks:
-        LOG.warning("%s", remark)
-    return restored
+    for warning in warnings:
+        LOG.warning("%s", warning)
+    return path
 
 
 def run_stages(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages from the current one, and all of them again for a refit.
+    """Run the stages from the current one to the last, and all of them again if a refit is due.
 
-    The current stage advances only after a training or an edit, and before the next one: the stages between use the
-    same model, and a resumed run repeats all of them.
+    The index of the current stage advances only at stages that change the model, by training or editing it.  The
+    stages between two of them use the same model, so a resumed run repeats all of them.
     """
     start_refit_if_due(run)
-    for cursor, stage in enumerate(with_refit_steps(pipeline, run).stages):
-        if cursor < run.stage_index:
+    for index, stage in enumerate(with_refit_steps(pipeline, run).stages):
+        if index < run.stage_index:
             continue
         changes_model = stage.edits or isinstance(stage, Training)
-        if changes_model and cursor > run.stage_index:
-            run.next_stage(cursor)
+        if changes_model and index > run.stage_index:
+            run.next_stage(index)
         with suppress(Stopped):
             stage.act(run)
             if changes_model:
-                run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
+                run.next_stage(index + 1)  # a resumed run must not repeat an edit
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(

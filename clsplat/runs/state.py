@@ -1,4 +1,4 @@
-"""Read a run folder once: the phase of the run, and which of its files are missing or changed."""
+"""Read a run folder once, to find the phase of the run and the files that are missing or changed."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -23,26 +23,26 @@ class Phase(IntEnum):
     """The phase of the run in a folder."""
 
     EMPTY = 0
-    """There is no run."""
+    """The folder has no run."""
     PREPARING = 1
-    """There is only a status.json; no stage has started."""
+    """The folder has only a status.json, because no stage has started."""
     BEGUN = 2
-    """It is running, or has stopped before its end."""
+    """The run has started, and may have stopped before its end."""
     STATELESS = 3
-    """It has started, but both its status and its checkpoints are missing."""
+    """The run has started, but both its status and its checkpoints are missing."""
     DONE = 4
-    """It has finished; `RunState.bad_files` lists files that are missing or changed."""
+    """The run has finished; `RunState.bad_files` lists the files that are missing or changed."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """The content of the folder of a run or a matrix at the time of reading."""
+    """A snapshot of the folder of a run or a matrix."""
 
     out: Path
-    names: frozenset[str]  # of the files and folders in it
+    names: frozenset[str]  # names of the files and folders in `out`
     status: Mapping[str, Any]  # content of status.json; empty if missing or damaged
     checkpoints: tuple[Path, ...]  # oldest first
-    sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None if the list is missing or damaged
+    sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None if checksums.json is missing or damaged
 
     @classmethod
     def read(cls, out: Path) -> "RunState":
@@ -65,31 +65,34 @@ class RunState:
 
     @property
     def state_name(self) -> str:
-        """The state in status.json, or "killed" if the process is gone."""
+        """The state in status.json, or "killed" if the process no longer exists."""
         owner = Owner.from_record(self.status) if self.status.get("state") not in END_STATES else None
         return "killed" if owner and owner.has_ended else str(self.status.get("state", "unknown"))
 
     @cached_property
     def pipeline(self) -> Pipeline:
-        """The pipeline of the run.  Raises ConfigError if its file is missing or damaged."""
+        """The resolved pipeline of the run.  Raises ConfigError if pipeline.yaml is missing or damaged."""
         return load(str(self.out / PIPELINE))
 
     @cached_property
     def bad_files(self) -> list[str]:
-        """The files that are missing or changed; for a finished run also a missing list of checksums."""
+        """The files that are missing or changed, including the list of checksums itself for a finished run."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
         return damaged_files(self.out, self.sums)
 
     def difference(self, pipeline: Pipeline) -> str:
-        """Describe how another pipeline differs, or why that of the run cannot be read; "" if they are the same."""
+        """Return how another pipeline differs from that of the run; "" if they are the same.
+
+        If the pipeline of the run cannot be read, the result is the reason.
+        """
         try:
             return str(_difference(self.pipeline, pipeline) or "")
         except ConfigError as error:
             return one_line(error)
 
     def require_same(self, pipeline: Pipeline) -> None:
-        """Raise ConfigError if a finished run had other settings."""
+        """Raise ConfigError if the folder has a finished run with other settings."""
         is_known = self.phase is Phase.DONE and PIPELINE in self.names
         if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.bad_files:
             raise ConfigError(
@@ -102,23 +105,23 @@ class RunState:
 
     @property
     def steps_key(self) -> str:
-        """The key of the number of training steps; optimize.steps if the pipeline cannot be read."""
+        """The settings key of the number of training steps; optimize.steps if the pipeline cannot be read."""
         with suppress(ConfigError):  # which the resumed run raises again
             return f"{self.pipeline.settings.training.stage}.steps"
         return "optimize.steps"
 
     def note_on_longer_training(self) -> str:
-        """Return how training longer differs from a run that was planned as long; '' if it is the same."""
+        """Describe how a continued training would differ from one planned with all its steps; "" if it would not."""
         training = self.pipeline.settings.training
-        last = training.steps
-        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(last)]
-        if not names or self.status.get("step", 0) < last:
+        steps = training.steps
+        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(steps)]
+        if not names or self.status.get("step", 0) < steps:
             return ""
-        return f"'{names[0]}' was due at step {last}, the last one, so the result differs from a run planned as long"
+        return f"'{names[0]}' was due at step {steps}, the last one, so the result differs from a run planned as long"
 
     @property
     def restart(self) -> str:
-        """The command that starts the run over."""
+        """The command that starts the run over, for messages."""
         pipeline = "…"
         with suppress(ConfigError):  # the pipeline is missing or damaged
             pipeline = shell_quote(self.pipeline.path)
@@ -132,18 +135,18 @@ def has_pipeline(folder: Path) -> bool:
 
 def _difference(old_pipeline: Pipeline, new_pipeline: Pipeline) -> Difference | None:
     """Return the first setting that differs, except for automatic choices of the run.  Raises ConfigError."""
-    decided = with_decisions(new_pipeline, old_pipeline.decisions)
-    old, new = (without_auto(pipeline.resolved()) for pipeline in (old_pipeline, decided))
-    return first_difference({**old, "adapt": None}, {**new, "adapt": None})
+    decided_pipeline = with_decisions(new_pipeline, old_pipeline.decisions)
+    old_settings, new_settings = (without_auto(pipeline.resolved()) for pipeline in (old_pipeline, decided_pipeline))
+    return first_difference({**old_settings, "adapt": None}, {**new_settings, "adapt": None})
 
 
 def is_below(file: Path, paths: Iterable[Path]) -> bool:
-    """Return whether a file is one of the paths, or in a folder among them."""
+    """Return whether a file is one of the paths, or is inside one of them."""
     return any(map(file.is_relative_to, paths))
 
 
 def read_sums(out: Path) -> dict[str, str] | None:
-    """Return the list of checksums; None if it is missing or damaged."""
+    """Return the SHA-256 of each file in checksums.json, by path; None if the list is missing or damaged."""
     try:
         sums = read_json(out / CHECKSUMS)
     except DataError:
@@ -152,7 +155,7 @@ def read_sums(out: Path) -> dict[str, str] | None:
 
 
 def damaged_files(out: Path, sums: Mapping[str, str]) -> list[str]:
-    """Return the files in a list of checksums that are missing or changed."""
+    """Return the names of the files in a list of checksums that are missing or changed."""
     return [name for name, value in sums.items() if try_sha256(out / name) != value]
 
 

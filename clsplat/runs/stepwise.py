@@ -12,60 +12,60 @@ from clsplat.training.run import Run
 
 def run_until_training(pipeline: Pipeline, run: Run) -> None:
     """Run the stages before the first training, starting at the run's stage."""
-    for cursor, stage in enumerate(pipeline.stages):
+    for index, stage in enumerate(pipeline.stages):
         if isinstance(stage, Optimize):
             return
-        if cursor >= run.stage_index:
-            run.stage_index = cursor
+        if index >= run.stage_index:
+            run.stage_index = index
             stage.act(run)
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
-    """Run all stages from the first training to the last, and the edits that follow it; yield the losses of each step.
+    """Run the stages from the first training to the last one and the edits after it; yield the losses of each step.
 
-    A refit runs the stages from the start.
+    A refit starts with the first stage again.
     """
-    original, starts_refit = pipeline, is_refit_due(run)
+    full_pipeline, starts_refit = pipeline, is_refit_due(run)
     start_refit_if_due(run)
-    pipeline = with_refit_steps(original, run)
+    pipeline = with_refit_steps(full_pipeline, run)
     if starts_refit:
         run_until_training(pipeline, run)
-    first, last = _training_stages(pipeline)
-    for cursor in range(max(first, run.stage_index), last + 1):
-        if cursor > run.stage_index:
-            run.next_stage(cursor)
-        stage = pipeline.stages[cursor]
+    first_index, last_index = _training_stages(pipeline)
+    for index in range(max(first_index, run.stage_index), last_index + 1):
+        if index > run.stage_index:
+            run.next_stage(index)
+        stage = pipeline.stages[index]
         if isinstance(stage, Optimize):
             run.status.note(stage=stage.stage, progress=None)
             for view in stage.iterate(run):
-                if cursor == last and stage.has_ended(run) and not is_refit_due(run):
+                if index == last_index and stage.has_ended(run) and not is_refit_due(run):
                     _run_final_edits(pipeline, run)
                     yield view
                     return
                 yield view
             if is_refit_due(run):
-                yield from train(original, run)
+                yield from train(full_pipeline, run)
                 return
         else:
             stage.act(run)
 
 
 def _run_final_edits(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages that edit the model after the training, as part of its last step."""
+    """Run the stages that edit the model directly after the training, as part of its last step."""
     for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.stage_index + 1 :]):
         run.next_stage(run.stage_index + 1)
         stage.act(run)
 
 
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
-    """Return whether the training has no steps left."""
-    _, last = _training_stages(pipeline)
-    stage = with_refit_steps(pipeline, run).stages[last]
-    is_at_end = isinstance(stage, Optimize) and run.stage_index == last and stage.has_ended(run)
-    return (run.stage_index > last or is_at_end) and not is_refit_due(run)
+    """Return whether all training steps have run, including those of a refit."""
+    _, last_index = _training_stages(pipeline)
+    stage = with_refit_steps(pipeline, run).stages[last_index]
+    is_at_end = isinstance(stage, Optimize) and run.stage_index == last_index and stage.has_ended(run)
+    return (run.stage_index > last_index or is_at_end) and not is_refit_due(run)
 
 
 def _training_stages(pipeline: Pipeline) -> tuple[int, int]:
-    """Return the indices of the first and the last training."""
+    """Return the indices of the first and the last training stage."""
     indices = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
     return indices[0], indices[-1]

@@ -1,8 +1,9 @@
 """Choose the number of steps that fit into a time budget (`--minutes`).
 
-A short rehearsal measures the time of a step, and of everything else.  If it was very short, a longer one follows,
-because steps become slower while Gaussians grow.  At fixed fractions of the training, the number of steps is corrected
-from measured times.  It is written to the run's pipeline, so that the run can be repeated bit by bit.
+A short rehearsal measures the time of a training step, and of everything else.  If the rehearsal takes only a small
+fraction of the budget, a longer one follows, because steps become slower as the number of Gaussians grows.  At fixed
+fractions of the training, the number of steps is corrected from measured times.  The run's pipeline contains the number
+of steps, so that the run can be reproduced bit by bit.
 """
 
 import logging
@@ -30,11 +31,11 @@ from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
 CORRECTIONS = 0.3, 0.6, 0.85  # fractions of the training
-STEPS = 200  # of the first rehearsal; a training may declare that fewer are enough
+STEPS = 200  # of the first rehearsal; a training stage may declare a smaller number
 LONGER = 3  # factor of the number of steps of the next rehearsal
 MIN_FRACTION = 0.03  # of the budget; a shorter rehearsal is followed by a longer one
-REPORTS = 20  # minimum per training; each gives the median time of its steps
-MAX_FRACTION = 0.2  # of the budget, after which a rehearsal stops training
+REPORTS = 20  # minimum number per training; each contains the median time of the steps since the previous one
+MAX_FRACTION = 0.2  # of the budget; after this time, a rehearsal stops training
 MAX_TREND = 0.5  # largest exponent of the growth of a step's time with the number of steps
 
 Show = Callable[[Progress], None]
@@ -46,59 +47,63 @@ class Rehearsal:
     """The measured times of a pipeline run with few steps, in seconds."""
 
     steps: int
-    step_times: Sequence[float]  # of one step, in equal parts of the training
+    step_times: Sequence[float]  # mean time of one step in each of several equal parts of the training
     during: float  # before the training, and between its steps
     after: float  # after the training
     trend: float = 0.0  # exponent of the growth of a step's time with the number of steps
 
     def steps_in(self, seconds: float) -> int:
-        """Return the number of steps that fit into a time, s."""
+        """Return the number of training steps that fit into a total time, s."""
         times = max(0.0, seconds - self.during - self.after) / (self.steps * fmean(self.step_times))
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
     def later(self, fraction: float) -> tuple[float, float]:
-        """Return the mean and the last step time after a fraction of the training, relative to the time at it."""
+        """Return the mean and the final step time after a fraction of the training, relative to the time there."""
         index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
         now = self.step_times[index]
         return fmean(self.step_times[index:]) / now, self.step_times[-1] / now
 
 
 class _RehearsalOver(Exception):
-    """Raised to end the training of a rehearsal."""
+    """Raised to end the training of a rehearsal early."""
 
 
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
     """Execute the pipeline with the number of steps that fits into `minutes`, including the rehearsal.
 
-    Raises ConfigError unless exactly one stage trains and its minimum of steps fits, and the errors of `execute`.
+    Raises ConfigError unless exactly one stage trains, and its minimum number of steps fits.  Also raises the errors of
+    `execute`.
     """
-    until = time.perf_counter() + 60 * minutes
+    deadline = time.perf_counter() + 60 * minutes
     _require_one_training(pipeline)
     check_run(pipeline, run)
-    rehearsal = rehearse_enough(pipeline, run, minutes, until)
-    steps, planned = pipeline.settings.training.steps, rehearsal.steps_in(until - time.perf_counter())
-    if planned < min_steps_of(pipeline):
+    rehearsal = rehearse_enough(pipeline, run, minutes, deadline)
+    steps, planned_steps = pipeline.settings.training.steps, rehearsal.steps_in(deadline - time.perf_counter())
+    if planned_steps < min_steps_of(pipeline):
         raise _too_short_error(minutes, pipeline)
-    reason = f"--minutes {minutes:g}: {planned:,} steps instead of {steps:,}, by a rehearsal"
+    reason = f"--minutes {minutes:g}: {planned_steps:,} steps instead of {steps:,}, by a rehearsal"
     LOG.info("%s", reason)
-    plan = replace(pipeline, settings=_add_reports(stretch(pipeline.settings, Fraction(planned, steps))), reason=reason)
+    settings = _add_reports(stretch(pipeline.settings, Fraction(planned_steps, steps)))
+    plan = replace(pipeline, settings=settings, reason=reason)
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
-        planned, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
-        mean, last = (ratio * step_time for ratio in rehearsal.later(fraction))
-        remaining = rehearsal.after + (1 - fraction) * rehearsal.during + mean * (planned - report.step)
-        change = math.floor((until - time.perf_counter() - remaining) / last)
-        minimum = min(planned, last_edit(plan.settings.training) + 2)  # stages that start after the last edit run once
-        steps = max(report.step + 2, minimum, planned + change)
+        old_steps, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
+        mean_step_time, last_step_time = (ratio * step_time for ratio in rehearsal.later(fraction))
+        remaining = rehearsal.after + (1 - fraction) * rehearsal.during + mean_step_time * (old_steps - report.step)
+        change = math.floor((deadline - time.perf_counter() - remaining) / last_step_time)
+        minimum = min(
+            old_steps, last_edit(plan.settings.training) + 2
+        )  # stages that start after the last edit run once
+        steps = max(report.step + 2, minimum, old_steps + change)
         reason = f"--minutes {minutes:g}: {steps:,} steps, corrected at step {report.step:,}"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
 
     for fraction in CORRECTIONS:
-        corrected = _execute_until(fraction, plan, new_run(run, plan), start, show, execute, correct)
-        if corrected is None:
+        corrected_plan = _execute_until(fraction, plan, new_run(run, plan), start, show, execute, correct)
+        if corrected_plan is None:
             return
-        plan, start = corrected, "resume"
+        plan, start = corrected_plan, "resume"
     execute(plan, new_run(run, plan), start, show)
 
 
@@ -113,55 +118,57 @@ def _execute_until(
 ) -> Pipeline | None:
     """Execute a pipeline up to a fraction of its training, save a checkpoint, and return the corrected pipeline.
 
-    Returns None if the training ended earlier.
+    Returns None if the training ended before that fraction.
     """
-    corrected: list[Pipeline] = []
+    corrected_plans: list[Pipeline] = []
 
     def show_and_correct(report: Progress) -> None:
         show(report)
         if fraction * report.steps <= report.step < report.steps and not run.interrupted:
-            corrected.append(correct(plan, report))
-            write_pipeline(corrected[0], run)  # before the checkpoint, so that a resumed run uses it
-            run.settings, run.pipeline = corrected[0].settings, corrected[0].resolved()
+            corrected_plans.append(correct(plan, report))
+            write_pipeline(corrected_plans[0], run)  # before the checkpoint, so that a resumed run uses it
+            run.settings, run.pipeline = corrected_plans[0].settings, corrected_plans[0].resolved()
             run.interrupted = True
 
     try:
         execute(plan, run, start, show_and_correct)
     except Interrupted:
-        if not corrected:
+        if not corrected_plans:
             raise
         stop_if_signaled()
-    return corrected[0] if corrected else None
+    return corrected_plans[0] if corrected_plans else None
 
 
-def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, until: float) -> Rehearsal:
-    """Rehearse until the rehearsal takes a minimum fraction of the time; return the last one, with its trend.
+def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, deadline: float) -> Rehearsal:
+    """Repeat the rehearsal with more steps until it takes a minimum fraction of the budget; return the last one.
 
-    until: deadline, s, on the clock.  Raises ConfigError as `rehearse` does.
+    The result includes the trend of step times.  deadline: on the clock of `time.perf_counter`, s.  Raises ConfigError
+    as `rehearse` does.
     """
-    steps, started, trend = min(STEPS, pipeline.settings.training.rehearsal_steps), time.perf_counter(), 0.0
-    rehearsal = rehearse(pipeline, run, steps, minutes, until)
-    while time.perf_counter() - started < MIN_FRACTION * 60 * minutes:
-        previous, steps, started = rehearsal, LONGER * steps, time.perf_counter()
-        rehearsal = rehearse(pipeline, run, steps, minutes, until)
+    steps, start_time, trend = min(STEPS, pipeline.settings.training.rehearsal_steps), time.perf_counter(), 0.0
+    rehearsal = rehearse(pipeline, run, steps, minutes, deadline)
+    while time.perf_counter() - start_time < MIN_FRACTION * 60 * minutes:
+        previous, steps, start_time = rehearsal, LONGER * steps, time.perf_counter()
+        rehearsal = rehearse(pipeline, run, steps, minutes, deadline)
         trend = math.log(fmean(rehearsal.step_times) / fmean(previous.step_times)) / math.log(LONGER)
     return replace(rehearsal, trend=min(max(trend, -MAX_TREND), MAX_TREND))
 
 
-def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: float) -> Rehearsal:
+def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, deadline: float) -> Rehearsal:
     """Run all stages of the pipeline with few steps, without changing the run.
 
-    until: deadline, s, on the clock.  Raises ConfigError as soon as it is clear that the minimum steps do not fit.
+    deadline: on the clock of `time.perf_counter`, s.  Raises ConfigError as soon as it is clear that the minimum number
+    of steps does not fit.
     """
     LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
-    short = stretch(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
-    short_pipeline, started = replace(pipeline, settings=_add_reports(short)), time.perf_counter()
+    short_settings = stretch(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
+    short_pipeline, start_time = replace(pipeline, settings=_add_reports(short_settings)), time.perf_counter()
     reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
 
     def check_time() -> None:
         # the first report may include the building of kernels
         step_time = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0
-        if time.perf_counter() + min_steps_of(pipeline) * step_time > until:
+        if time.perf_counter() + min_steps_of(pipeline) * step_time > deadline:
             raise _too_short_error(minutes, pipeline)
 
     def show(report: Progress) -> None:
@@ -180,21 +187,21 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
         except _RehearsalOver:
             trial.next_stage(trial.stage_index + 1)
             run_stages(short_pipeline, trial)
-    training_end, done_steps, _ = reports[-1]
+    training_end, completed_steps, _ = reports[-1]
     step_times = [seconds for _, _, seconds in reports]
-    during = (training_end - started - done_steps * fmean(step_times)) * steps / done_steps
-    step_times += [step_times[-1]] * (round(len(step_times) * steps / done_steps) - len(step_times))
+    during = (training_end - start_time - completed_steps * fmean(step_times)) * steps / completed_steps
+    step_times += [step_times[-1]] * (round(len(step_times) * steps / completed_steps) - len(step_times))
     return Rehearsal(steps, step_times, max(0.0, during), time.perf_counter() - training_end)
 
 
 def min_steps_of(pipeline: Pipeline) -> int:
-    """Return the minimum number of training steps: no fewer than a rehearsal, and edits stay at different steps."""
+    """Return the minimum number of training steps: that of a rehearsal, or more to keep edits at different steps."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsal_steps), min_steps(training))
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
-    """Return a run of the pipeline in the state before its first step, with the same device, scene, and photos."""
+    """Return a run of another pipeline, before its first step, with the device, scene, and photos of `run`."""
     reset: dict[str, Any] = {
         "best": None,
         "best_tables": {},
@@ -207,7 +214,7 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
 
 
 def _add_reports(settings: PipelineFile) -> PipelineFile:
-    """Return settings with a minimum of REPORTS reports per training."""
+    """Return settings in which each training makes at least REPORTS reports."""
 
     def with_reports(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
@@ -217,12 +224,12 @@ def _add_reports(settings: PipelineFile) -> PipelineFile:
 
 def _require_one_training(pipeline: Pipeline) -> None:
     """Raise ConfigError unless a single number of steps determines the time of the training."""
-    trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
-    if len(trainings) != 1:
+    stages = [stage for stage in pipeline.stages if isinstance(stage, Training)]
+    if len(stages) != 1:
         raise ConfigError(
-            f"{pipeline.path}: --minutes: expected one stage that trains, found {len(trainings)}; leave --minutes out"
+            f"{pipeline.path}: --minutes: expected one stage that trains, found {len(stages)}; leave --minutes out"
         )
-    if isinstance(trainings[0], ValidatedTraining) and trainings[0].refit:
+    if isinstance(stages[0], ValidatedTraining) and stages[0].refit:
         raise ConfigError(
             f"{pipeline.path}: --minutes: a refit trains twice, for an unknown time; add --set optimize.refit=false"
         )

@@ -1,4 +1,4 @@
-"""Verify the files of a run folder: required files exist, and every file is intact."""
+"""Verify the files of a run folder: whether the required files exist, and whether every file is intact."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -40,7 +40,7 @@ from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
 from clsplat.training.status import parse_status
 
-# Checks of each kind of file: they return a description, or raise DataError.
+# One check per kind of file.  Each returns a description of the file, and raises an error if the file is damaged.
 
 
 def require_sum(expected: str | None, path: Path) -> None:
@@ -54,8 +54,8 @@ def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
     if "matrix" in settings:
         load_experiment(str(path))
         return "of a matrix"
-    recorded = settings.get("plugins")
-    if isinstance(recorded, dict) and (faults := plugins.differences(recorded)):
+    recorded_plugins = settings.get("plugins")
+    if isinstance(recorded_plugins, dict) and (faults := plugins.differences(recorded_plugins)):
         return f"not checked further: {faults[0]}"
     load(str(path))
     return ""
@@ -85,15 +85,18 @@ def sums_file(expected: list[str], path: Path) -> str:
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
     faults = [f"'{shorten(name)}' is not a file of the run" for name in sums if not is_inside(name)]
-    if absent := [f"'{name}'" for name in expected if name not in sums]:
-        faults.append(f"lacks {', '.join(absent)}")
+    if missing_names := [f"'{name}'" for name in expected if name not in sums]:
+        faults.append(f"lacks {', '.join(missing_names)}")
     if faults:
         raise DataError("; ".join(faults))
     return f"of {len(sums)} files"
 
 
 def output(expected: str | None, path: Path) -> str:
-    """Check one output; return a description.  Raises errors of its reader, and DataError if its checksum differs."""
+    """Check an output file, and return its description.
+
+    Raises DataError if its checksum differs, and the errors of its reader.
+    """
     require_sum(expected, path)
     if path.name == METRICS:
         metrics = read_metrics(path)
@@ -112,29 +115,33 @@ NO_SUMS = "is missing, as always with a Trainer; without it, outputs cannot be v
 
 
 def verify(state: RunState) -> dict[str, Any]:
-    """Verify all files of a run or a matrix.
+    """Verify all files of a run or a matrix.  Raises DataError if the folder has no run.
 
-    Returns the `state` of the run, `whole`: whether all files are intact, and `objects`: for each `file`, whether it is
-    `whole`, and a `detail`; for damaged files also a `remedy`.  Files of later stages may be missing in an unfinished
-    run.  Raises DataError if the folder has no run.
+    Returns a dictionary with these keys:
+    run, state: the folder, and the state of the run
+    whole: whether all files are intact
+    objects: for each file its name (`file`), whether it is intact (`whole`), and a description or error (`detail`)
+    remedy: how to restore the files, if any is damaged
+    Files of later stages may be missing in an unfinished run.
     """
     out = state.out
     if state.phase is Phase.EMPTY:
         raise DataError(f"{out}: has neither pipeline.yaml nor status.json; expected the folder of a run")
     cells: dict[str, RunState] = {}
     objects = list(_check_files(state, cells))
-    damaged = [entry["file"] for entry in objects if not entry["whole"]]
-    verified = {"run": str(out), "state": state.state_name, "whole": not damaged, "objects": objects}
-    if damaged:
-        cell = cells.get(damaged[0].partition("/")[0])
+    bad_files = [entry["file"] for entry in objects if not entry["whole"]]
+    verified = {"run": str(out), "state": state.state_name, "whole": not bad_files, "objects": objects}
+    if bad_files:
+        cell = cells.get(bad_files[0].partition("/")[0])
         verified["remedy"] = _remedy(cell if cell and cell.phase else state, verified)
     return verified
 
 
 def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield the result for each file of a run, or of the cells of a matrix.
+    """Yield the result for each file of a run, or of all cells of a matrix.
 
-    cells: receives the folders of the cells, by name; expect_all: whether to expect the files of a finished run.
+    cells: receives the states of the cells' folders, by name.  expect_all: whether all files of a finished run have to
+    exist.
     """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
@@ -171,7 +178,7 @@ def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool =
 
 
 def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, Any]:
-    """Check one file; return its entry of the result of `verify`."""
+    """Check one file, and return its entry for `objects` in the result of `verify`."""
     path = out / name
     try:
         if not path.exists():
@@ -184,7 +191,7 @@ def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, 
 
 
 def _find_cells(out: Path, is_done: bool) -> dict[str, RunState]:
-    """Return the folders of a matrix's cells, by name: the existing ones, or all of a finished matrix."""
+    """Return the states of the cells' folders, by name: of existing folders, and of all cells if the matrix is done."""
     folders = [path for path in out.iterdir() if path.is_dir() and not path.is_symlink()]
     cells = {path.name: state for path in folders if (state := RunState.read(path)).phase}
     with suppress(ConfigError):  # reported for the file of the pipeline
@@ -212,13 +219,13 @@ def verdict(result: dict[str, Any]) -> str:
 
 
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
-    """Return how to restore the files of a run: from an intact checkpoint, or from the start."""
+    """Return advice on how to restore the files of a run: from an intact checkpoint, or by starting over."""
     if state.phase is Phase.DONE and "cells" not in state.status and not state.bad_files and PIPELINE in state.names:
         return "ignore them: all outputs are intact, and only longer training needs these files"
-    intact = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
-    can_continue = "cells" in state.status or any(path in intact for path in state.checkpoints)
+    intact_files = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
+    can_continue = "cells" in state.status or any(path in intact_files for path in state.checkpoints)
     can_continue |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
-    if state.out / PIPELINE not in intact:
+    if state.out / PIPELINE not in intact_files:
         option = "--resume" if can_continue else "--restart"
         return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {option}"
     if can_continue:
@@ -227,7 +234,7 @@ def _remedy(state: RunState, verified: dict[str, Any]) -> str:
 
 
 def lines(result: dict[str, Any]) -> str:
-    """Format the result of `verify`, a line for each file."""
+    """Format the result of `verify` as text, one line per file."""
     rows = (
         (f"{'ok     ' if entry['whole'] else 'DAMAGED'}  {entry['file']}", entry["detail"])
         for entry in result["objects"]
@@ -239,9 +246,10 @@ def lines(result: dict[str, Any]) -> str:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline, by file or name; return its path, name, stages or cells, and the keys that the photos decide.
+    """Check a pipeline, matrix, run folder, model, or field, given by its path or the name of a shipped pipeline.
 
-    For a run folder, return the result of `verify`; for a model file, that of `examine`; for a field, its parameters.
+    Returns the path and name of a pipeline or matrix, with its stages and the keys that depend on the photos, or its
+    cells; the result of `verify` for a run folder, and of `examine` for a model; the number of parameters of a field.
     Raises ConfigError, and DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):

@@ -54,14 +54,14 @@ PHOTOGRAPH = "photograph"  # value of --side; any other value is a model
 class VideoTarget:
     """The output of a video: a file, or images in a folder."""
 
-    video: Path | None
-    out: Path = Path("renders")
-    kind: str = "png"  # of the images, one of KINDS
+    video: Path | None  # the video file; None: write images
+    out: Path = Path("renders")  # folder of the images
+    kind: str = "png"  # file format of the images, one of KINDS
 
 
 @dataclass(frozen=True)
 class VideoExtras:
-    """What a video shows in addition to the color image."""
+    """Additional content of a video: an image next to each frame, and layers other than color."""
 
     side: str | None = None  # PHOTOGRAPH, or a model file or run folder
     layers: tuple[str, ...] = ("color",)
@@ -79,9 +79,10 @@ def make_video(
 ) -> dict[str, Any]:
     """Render a video of a model file or run folder along a path.
 
-    Returns `files`, `frames`, `fps`, `seconds` of video, `size` in px, and the time it `took`, s.  Raises ClsplatError.
+    Returns a dictionary with `files`, `frames` (their number), `fps`, `seconds` (duration of the video), `size` (width
+    and height, px), and `took` (rendering time, s).  Raises ClsplatError.
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     videos = layer_files(target.video, extras.layers) if target.video else {}
     if target.kind not in KINDS:
         raise ConfigError(f"--format: expected {' or '.join(KINDS)}, got '{target.kind}'")
@@ -89,14 +90,14 @@ def make_video(
         raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; leave --video out")
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
-    loaded = _read(model)
-    used_scene = _scene(model, scene, loaded, downscale, is_required=not request.is_file or extras.side == PHOTOGRAPH)
-    origin = used_scene.origin if used_scene else loaded.origin
-    loaded = loaded.in_scene(used_scene) if used_scene else loaded
-    plan = plan_video(request, used_scene, points_of(loaded, used_scene), moves=is_moving(loaded), origin=origin)
-    background = loaded.rendering.background or (used_scene.background if used_scene else "black")
+    content = _read(model)
+    used_scene = _scene(model, scene, content, downscale, is_required=not request.is_file or extras.side == PHOTOGRAPH)
+    origin = used_scene.origin if used_scene else content.origin
+    content = content.in_scene(used_scene) if used_scene else content
+    plan = plan_video(request, used_scene, points_of(content, used_scene), moves=is_moving(content), origin=origin)
+    background = content.rendering.background or (used_scene.background if used_scene else "black")
     opened_device = open_verified(device)
-    canvas = Canvas(make_painter(loaded, opened_device, background))
+    canvas = Canvas(make_painter(content, opened_device, background))
     if not videos:
         photo_files = [view.image_path for view in used_scene.views] if used_scene else []
         files = write_pictures(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
@@ -110,7 +111,7 @@ def make_video(
         "fps": plan.fps,
         "seconds": plan.seconds,
         "size": list(plan.size),
-        "took": time.perf_counter() - started,
+        "took": time.perf_counter() - start_time,
     }
 
 
@@ -121,9 +122,9 @@ def _read(model: Path) -> AnyModel:
 
 
 def _scene(
-    model: Path, scene: Path | None, loaded: AnyModel, downscale: float | None, is_required: bool
+    model: Path, scene: Path | None, host_model: AnyModel, downscale: float | None, is_required: bool
 ) -> Scene | None:
-    """Return the scene of a model at the image size of its run; None if it is unknown and not required."""
+    """Return the scene of a model at the image size of its run; None if the scene is unknown and not required."""
     if not is_required and scene is None and not has_pipeline(model):
         return None
     try:
@@ -133,13 +134,13 @@ def _scene(
             raise
         LOG.warning("%s; continuing without a scene, with the background of the model and the size of the path", error)
         return None
-    return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
+    return source.scene(host_model).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
 def _side(
     name: str | None, plan: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
-    """Return a function that makes the image next to a frame: the nearest photo, or a render of another model."""
+    """Return a function from a view to the image next to its frame: the nearest photo, or a render of another model."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
@@ -164,7 +165,7 @@ def _side(
 # A viewer page with one or two models.
 
 MAX_MODELS = 2  # side by side
-MANY_SPLATS = 2_000_000  # a page with more is slow
+MANY_SPLATS = 2_000_000  # pages with more splats are slow
 
 
 def view(
@@ -178,7 +179,8 @@ def view(
 ) -> Path:
     """Write a viewer page that shows one model, or two side by side; return its path.  Raises ClsplatError.
 
-    scene: the page includes its views and photos; default: the scene of the first run folder among the models.
+    scene: dataset or run folder whose views and photos the page includes; default: the scene of the first model that is
+    from a run.
     """
     if not 1 <= len(models) <= MAX_MODELS:
         raise ConfigError(f"view: expected one model or two, got {len(models)}")
@@ -198,14 +200,14 @@ def view(
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
     _warn_of_different_scenes(models, source)
-    loaded = dict(zip(names(models), map(load, counted(models, "models read", len(models))), strict=True))
-    _warn_of_size(loaded, splats)
-    first = next(iter(loaded.values()))
-    used_scene = source.scene(first).downscaled(source.settings.downscale) if source else None
-    background = first.rendering.background or (used_scene.background if used_scene else "black")
-    origin = used_scene.origin if used_scene else first.origin
-    loaded = {
-        name: model.in_scene(used_scene) if used_scene else model.with_origin(origin) for name, model in loaded.items()
+    by_name = dict(zip(names(models), map(load, counted(models, "models read", len(models))), strict=True))
+    _warn_of_size(by_name, splats)
+    first_model = next(iter(by_name.values()))
+    used_scene = source.scene(first_model).downscaled(source.settings.downscale) if source else None
+    background = first_model.rendering.background or (used_scene.background if used_scene else "black")
+    origin = used_scene.origin if used_scene else first_model.origin
+    by_name = {
+        name: model.in_scene(used_scene) if used_scene else model.with_origin(origin) for name, model in by_name.items()
     }
 
     def read_photo(view: View) -> NDArray[np.uint8]:
@@ -214,20 +216,20 @@ def view(
     views = view_entries(used_scene, read_photo, photographs, photograph_budget) if used_scene else []
     start = (used_scene.split("test") or used_scene.views)[0] if used_scene else None
     viewpoint = Viewpoint.from_points(
-        next(iter(loaded.values())).scene_means, used_scene.views if used_scene else (), start
+        next(iter(by_name.values())).scene_means, used_scene.views if used_scene else (), start
     )
-    title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
+    title = " and ".join(by_name) + (f" · {source.scene_name}" if source else "")
     if used_scene is None:
         LOG.info("without a scene, up is -y; add --scene if the model is upside down")
-    packed = counted(loaded.items(), "models packed", len(loaded))
-    contents = {name: pack(model, splats) for name, model in packed}
-    Page(title, contents, viewpoint, background, views, origin).write(out)
+    named_models = counted(by_name.items(), "models packed", len(by_name))
+    packed_models = {name: pack(model, splats) for name, model in named_models}
+    Page(title, packed_models, viewpoint, background, views, origin).write(out)
     return out
 
 
-def _warn_of_size(loaded: Mapping[str, Model], splats: int | None) -> None:
-    """Warn about models with too many splats for a page, before packing, which takes minutes."""
-    for name, model in loaded.items():
+def _warn_of_size(models_by_name: Mapping[str, Model], splats: int | None) -> None:
+    """Warn about models with too many splats for a page.  Call this before packing them, which takes minutes."""
+    for name, model in models_by_name.items():
         if min(len(model), splats or len(model)) > MANY_SPLATS:
             LOG.warning(
                 "%s: %s splats take long to pack, and browsers show only %s smoothly; --splats %d keeps the most "
@@ -237,21 +239,21 @@ def _warn_of_size(loaded: Mapping[str, Model], splats: int | None) -> None:
 
 
 def _warn_of_different_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
-    """Warn if models are of different scenes, because the page has the cameras of only one."""
+    """Warn if the models are of different scenes, because the page has the cameras of only one scene."""
     scenes = {}
     for name, run in zip(names(models), map(find_run, models), strict=True):
         with suppress(ConfigError):  # of a missing plug-in; the model can be shown without it
             if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
                 scenes[name] = Path(path).resolve()
     if source and len(set(scenes.values())) > 1:
-        names_and_scenes = [part for item in scenes.items() for part in item]
+        names_and_scenes = [text for item in scenes.items() for text in item]
         LOG.warning("%s shows %s, %s shows %s; the page has the cameras of %s", *names_and_scenes, source.scene_name)
 
 
 def names(models: Sequence[Path]) -> list[str]:
-    """Return a unique name for each model: that of its folder or file, with the parent folder if two are equal."""
-    short = [path.resolve().name if path.is_dir() else path.stem for path in models]
-    parents = [path.resolve().parent.name for path in models]
-    if len(set(short)) < len(short):
-        short = [f"{parent}/{name}" for parent, name in zip(parents, short, strict=True)]
-    return short if len(set(short)) == len(short) else [f"{name} ({i})" for i, name in enumerate(short, 1)]
+    """Return a unique name for each model: its folder or file name, with the parent folder if two are equal."""
+    names = [path.resolve().name if path.is_dir() else path.stem for path in models]
+    folders = [path.resolve().parent.name for path in models]
+    if len(set(names)) < len(names):
+        names = [f"{parent}/{name}" for parent, name in zip(folders, names, strict=True)]
+    return names if len(set(names)) == len(names) else [f"{name} ({i})" for i, name in enumerate(names, 1)]
