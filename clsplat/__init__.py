@@ -6,7 +6,7 @@
     trainer.run()
     result = clsplat.Renderer(trainer.model).render(scene.split("test")[0])
 
-Names are imported on first use; until then, no device is opened.
+Names are imported on first use.  `import clsplat` opens no device.
 """
 
 import importlib
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 
 
 class _CheckoutFinder:
-    """Finds clsplat.data_tools in a checkout, which has it next to the package."""
+    """An import finder for `clsplat.data_tools` in a checkout, where its folder is next to the package."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:

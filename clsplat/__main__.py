@@ -1,4 +1,4 @@
-"""Run the command `clsplat`, also as `python -m clsplat`."""
+"""Run the command line, as `clsplat` or as `python -m clsplat`."""
 
 import os
 
@@ -6,9 +6,9 @@ from clsplat.core.signals import exit_on_signals
 
 
 def main() -> None:
-    """Run the command line.  Signals end it in the same way while it is still being imported."""
+    """Run the command line.  Signals exit it with code 130, even while modules are still being imported."""
     exit_on_signals()
-    os.environ["PYTHONSAFEPATH"] = "1"  # -P for all child processes, also those of Dask and multiprocessing
+    os.environ["PYTHONSAFEPATH"] = "1"  # -P for all child processes, including those of Dask and multiprocessing
     from clsplat.cli import main as command_line
 
     command_line()

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ChildResult:
-    """How a child process ended, and what it wrote."""
+    """The exit code and the output of a child process."""
 
     code: int | None  # exit code; None: stopped after the time limit
     output: str  # standard output, then standard error
 
     @property
     def crash(self) -> str | None:
-        """How it crashed or hung, as a verb phrase such as "crashes with SIGSEGV"; None if it exited."""
+        """A verb phrase that describes a crash or hang, such as "crashes with SIGSEGV"; None if the process exited."""
         if self.code is None:
             return "hangs"
         return None if self.code in range(256) else f"crashes with {signal_name(self.code)}"
@@ -30,15 +30,15 @@ def run_module(
     command = [sys.executable, "-P", "-m", module, *arguments]  # -P: import nothing from the working folder
     environment = {**os.environ, **(variables or {})}
     try:
-        completed = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
+        process = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
     except subprocess.TimeoutExpired as error:
         return ChildResult(None, _text(error.stdout, error.stderr))
-    return ChildResult(completed.returncode, _text(completed.stdout, completed.stderr))
+    return ChildResult(process.returncode, _text(process.stdout, process.stderr))
 
 
 def signal_name(code: int) -> str:
-    """Return the name of the signal in the exit code of a child process."""
-    return {number.value: number.name for number in signal.Signals}.get(-code, f"signal {-code}")
+    """Return the name of the signal that ended a child process, from its negative exit code."""
+    return {member.value: member.name for member in signal.Signals}.get(-code, f"signal {-code}")
 
 
 def _text(*streams: bytes | None) -> str:

@@ -1,4 +1,4 @@
-"""Define all errors, each with its exit code.
+"""Define the error classes and their exit codes.
 
 A message is one line: where, what is wrong, and what to do.  The command line prints it without a traceback unless
 `--debug` is given.
@@ -16,7 +16,7 @@ from itertools import islice
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
 NAMES_SHOWN = 8  # names of a list in a message
-PLUGIN_MARK = "__clsplat_plugin__"  # the variable of a plug-in's module that contains its name
+PLUGIN_MARK = "__clsplat_plugin__"  # module variable that marks plug-in code
 
 
 class ClsplatError(Exception):
@@ -112,7 +112,7 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, ImportError) and "failed to map segment" in str(error):
         reason = "too little memory or address space (`ulimit -v`), or a file system mounted with `noexec`"
         return MemoryLimitError(f"{one_line(error)}: {reason}")
-    # an input: write_error has already converted the errors of outputs
+    # the name of an input: `write_error` has already converted errors about outputs
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return DataError(f"{error.filename}: cannot be read ({error.strerror}); expected the path of a file or folder")
     if isinstance(error, OSError) and error.strerror:
@@ -137,7 +137,7 @@ def one_line(error: BaseException | str) -> str:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Join the first names of a list and the number of further ones, for a message."""
+    """Join up to NAMES_SHOWN names of a list for a message, and append how many more there are."""
     more = f", and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more
 
@@ -148,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
-    """Format the size of a trained model: the Gaussians, without and of the `sky`, or the parameters of a field."""
+    """Format the size of a trained model: the numbers of scene and `sky` Gaussians, or of parameters of a field."""
     text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
     return f"{text} and {sky:,} of the sky" if sky else text
 
@@ -159,7 +159,7 @@ def shell_quote(path: object) -> str:
 
 
 def shorten(text: str, limit: int = QUOTE_LIMIT) -> str:
-    """Return the text; text longer than `limit` characters is cut in the middle."""
+    """Return the text, with the middle cut out if it is longer than `limit` characters."""
     size = limit - 3
     return text if len(text) <= limit else f"{text[: size - size // 2]} … {text[-(size // 2) :]}"
 
@@ -186,8 +186,8 @@ class _Quotes(reprlib.Repr):
         """Show the first keys in their order of insertion; `reprlib` would sort all of them."""
         if level <= 0:
             return f"{{{self.fillvalue}}}"
-        shown = [f"{self.repr1(key, level - 1)}: {self.repr1(x[key], level - 1)}" for key in islice(x, self.maxdict)]
-        return f"{{{', '.join([*shown, *([self.fillvalue] if len(x) > self.maxdict else [])])}}}"
+        items = [f"{self.repr1(key, level - 1)}: {self.repr1(x[key], level - 1)}" for key in islice(x, self.maxdict)]
+        return f"{{{', '.join([*items, *([self.fillvalue] if len(x) > self.maxdict else [])])}}}"
 
 
 _QUOTES = _Quotes()

@@ -1,4 +1,4 @@
-"""Write files atomically: a reader sees a complete file or none, even after a power cut."""
+"""Write files atomically: a reader sees a complete file or none, even after a power failure."""
 
 import errno
 import itertools
@@ -29,7 +29,7 @@ _temporary_names: set[str] = set()  # names of the temporary files that this pro
 def open_atomic(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file next to `path`; when the block ends without an error, sync it and rename it to `path`.
 
-    The folder is synced afterwards, so that the new name survives a power cut.
+    The folder is synced afterwards, so that the new name survives a power failure.
     Raises OutputError when the file cannot be written; an existing file then stays unchanged.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -42,7 +42,8 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
     """Yield a temporary path next to `path`, and rename it to `path` as `open_atomic` does.
 
-    For libraries that open files themselves and choose the format by the suffix.  The caller syncs the file.
+    Use it with libraries that open files themselves and choose the format by the suffix.  The caller must sync the
+    file.
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
@@ -66,7 +67,7 @@ def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yield a hidden folder next to `folder`, and rename it to `folder` when the block ends without an error.
 
-    Hidden folders left by killed processes are removed first.  The caller syncs the files.
+    Hidden folders left by killed processes are removed first.  The caller must sync the files.
     Raises ConfigError when `folder` is in use, and OutputError, possibly before the block, when it cannot be created.
     """
     require_free(folder)
@@ -99,7 +100,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 
 def require_free(folder: Path) -> None:
-    """Raise ConfigError if anything other than an empty folder exists at the path of a new one."""
+    """Raise ConfigError if the path of a new folder exists, unless it is an empty folder."""
     with raising_output_error(folder):
         is_free = not path_exists(folder) or (folder.is_dir() and not any(folder.iterdir()))
     # os.replace cannot replace links and mount points
@@ -124,7 +125,7 @@ def _temporary_path(path: Path, suffix: str = "") -> Path:
 
 
 def _replace(temporary: Path, path: Path) -> None:
-    """Rename; retry for a second when Windows refuses because another process is reading the old file."""
+    """Rename a file or folder; on Windows, retry for a second while another process is reading the old file."""
     for attempt in range(20):
         try:
             return os.replace(temporary, path)
@@ -135,7 +136,7 @@ def _replace(temporary: Path, path: Path) -> None:
 
 
 def append(path: Path, data: bytes) -> None:
-    """Append to a file and sync it; on failure restore its old size.  Raises OutputError."""
+    """Append to a file and sync it; if that fails, restore its old size.  Raises OutputError."""
     with raising_output_error(path):
         size = path.stat().st_size if path.exists() else None
         try:
@@ -152,10 +153,10 @@ def append(path: Path, data: bytes) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, so that their names survive a power cut.  Raises OSError."""
-    missing = list(itertools.takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
+    """Create a folder and its parents, and sync their names, so that they survive a power failure.  Raises OSError."""
+    new_folders = list(itertools.takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
     folder.mkdir(parents=True, exist_ok=True)
-    for path in missing:
+    for path in new_folders:
         sync_folder(path.parent)
 
 
@@ -187,7 +188,7 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def remove_partial_files(folder: Path, border: str) -> None:
-    """Remove temporary files of killed processes below a folder, skipping subfolders that contain a file `border`."""
+    """Remove temporary files of killed processes below a folder, except in subfolders with a file named `border`."""
     for base, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not os.path.exists(os.path.join(base, name, border))]
         for name in filter(_is_abandoned, files):
@@ -197,7 +198,7 @@ def remove_partial_files(folder: Path, border: str) -> None:
 
 
 def _remove_partial_folders(folder: Path) -> None:
-    """Remove temporary folders for `folder` that killed processes have left."""
+    """Remove the temporary folders for `folder` that killed processes left behind."""
     with suppress(OSError):
         for path in folder.parent.iterdir():
             if path.name.startswith(f".{folder.name}.") and _is_abandoned(path.name):
@@ -206,7 +207,7 @@ def _remove_partial_folders(folder: Path) -> None:
 
 
 def _is_abandoned(name: str) -> bool:
-    """Return whether a file or folder is temporary and no process of this machine is writing it any more."""
+    """Return whether a name is that of a temporary file or folder that no process on this machine is still writing."""
     if not (match := PARTIAL.fullmatch(name)) or name in _temporary_names:
         return False
     process = int(match[1])
@@ -214,7 +215,7 @@ def _is_abandoned(name: str) -> bool:
 
 
 def path_exists(path: Path) -> bool:
-    """Return whether a path exists, broken links included.  Raises OutputError if that cannot be determined."""
+    """Return whether a path exists, even as a broken link.  Raises OutputError if that cannot be determined."""
     with raising_output_error(path):
         return path.exists() or path.is_symlink()
 
@@ -230,7 +231,7 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-# File names: which are portable, and which are reserved in a run folder.
+# Portable file names, and names that are reserved in a run folder.
 
 # The files that a run or a matrix writes in its folder.
 PIPELINE = "pipeline.yaml"
@@ -247,8 +248,8 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
-STORE = "store"  # of the cells of a matrix
-MODULE_FILE_PREFIX = "view_"  # of the side files of training modules
+STORE = "store"  # results of the cells of a matrix
+MODULE_FILE_PREFIX = "view_"  # side files of training modules
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, PREPARE_SUMMARY, INPUTS, CHECKSUMS, LOCK),
@@ -261,18 +262,18 @@ MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON, STORE})
 END_STATES = ("done", "failed", "interrupted")  # states in status.json
 HEARTBEAT_TIMEOUT = 60  # seconds without a heartbeat in status.json after which a run may have ended
 MAX_NAME_BYTES = 200  # systems allow 255, and temporary names are longer
-_WINDOWS_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of devices
+_WINDOWS_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # devices
 
 
 def invalid_name_reason(name: str) -> str | None:
-    """Return why a file name is not portable, or None."""
+    """Return why a file name is not portable, or None if it is."""
     try:
         size = len(name.encode())
     except UnicodeEncodeError:
         return f"{name!r} is not valid Unicode"
     if size > MAX_NAME_BYTES:
         return f"a name of {size} bytes is too long; the limit is {MAX_NAME_BYTES}"
-    if any(letter < " " or letter in '<>:"|?*\x7f' for letter in name):
+    if any(char < " " or char in '<>:"|?*\x7f' for char in name):
         return f"{name!r} contains a character that not every system allows"
     if _WINDOWS_NAMES.fullmatch(name.rstrip(" .")) or re.search(r"~\d", name) or name != name.rstrip(" ."):
         return f"'{name}' has a special meaning on Windows"
@@ -280,13 +281,13 @@ def invalid_name_reason(name: str) -> str | None:
 
 
 def is_inside(text: str) -> bool:
-    """Return whether a relative path stays inside its folder.  Both `/` and `\\` separate."""
+    """Return whether a path is relative and stays inside its folder.  Both `/` and `\\` are separators."""
     path = PureWindowsPath(text)
     return bool(path.parts) and not path.anchor and ".." not in path.parts
 
 
 def invalid_output_reason(text: str) -> str | None:
-    """Return why a pipeline may not write to a path in the run folder, or None."""
+    """Return why a pipeline may not write to a path in the run folder, or None if it may."""
     parts = PureWindowsPath(text).parts
     if not is_inside(text):
         return "it is outside of the run folder"
@@ -320,7 +321,7 @@ def _is_run_file(run: Path, path: Path) -> bool:
     """Return whether a file in a run's folder belongs to the run; the checksums of a finished run list its files."""
     name = path.absolute().relative_to(run).as_posix()
     try:
-        listed = read_json(run / CHECKSUMS)
+        checksums = read_json(run / CHECKSUMS)
     except DataError:  # the run has not ended, or it is a matrix
         return True
-    return not isinstance(listed, dict) or name in listed or name in RESERVED
+    return not isinstance(checksums, dict) or name in checksums or name in RESERVED

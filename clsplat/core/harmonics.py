@@ -5,15 +5,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # samples: enough for the 7 functions of a band and, with their opposites, for all products
+DIRECTIONS = 64  # samples: enough to fit the 7 functions of a band and, with the opposite directions, all products
 BAND_0 = 0.28209479177387814
 ROWS = 4096  # Gaussians per block, to limit temporary memory
 Floats = NDArray[np.float64]
-DIGITS = 6  # decimals of means; later ones differ between processors
+DIGITS = 6  # decimals of means; further ones differ between processors
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the values of the bands 1 to 3 at unit directions, [M, 15]."""
+    """Return the basis functions of bands 1 to 3, [M, 15], evaluated at unit directions, [M, 3]."""
     x, y, z = directions.astype(np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     values = [
@@ -29,20 +29,20 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of Y(d), [K], over a distribution of directions d.
+    """Return the mean of the basis functions Y(d), [K], over a distribution of directions d.
 
-    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  The products of the functions of bands 1 to 3 span
-    every function; those of band 1 alone do not, and the result is then 0.
+    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of two functions of bands 1 to 3 span all of
+    these functions.  Products of band 1 alone do not, so the result is then 0.
     """
-    count, half = len(form), _directions()
-    values = basis(np.concatenate([half, -half]))[:, :count]
+    count, directions = len(form), _directions()
+    values = basis(np.concatenate([directions, -directions]))[:, :count]
     pairs = np.triu_indices(count)
     products = values[:, pairs[0]] * values[:, pairs[1]]
     from_products = np.linalg.lstsq(products, values, rcond=1e-9)[0]
     moments = form * (count / (4 * np.pi) / np.trace(form))  # |Y|² = K / 4 pi in every direction
     mean = moments[pairs] @ from_products
-    size = mean @ np.linalg.solve(moments, mean)  # at most 1 for a distribution; noise in `form` can exceed it
-    return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
+    norm2 = mean @ np.linalg.solve(moments, mean)  # at most 1 for a distribution; noise in `form` can exceed it
+    return np.asarray(np.round(mean / np.sqrt(max(norm2, 1.0)), DIGITS))
 
 
 def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,26 +52,26 @@ def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> N
     """
     count, coefficients = len(sh_rest), sh_rest.shape[1] // 3
     directions = _directions()
-    before, after = basis(directions @ rotation), basis(directions)  # the rows of d R are R^T d
+    rotated_values, values = basis(directions @ rotation), basis(directions)  # the rows of d R are R^T d
     table = sh_rest.astype(np.float64).reshape(count, coefficients, 3)
     result, first = np.empty_like(table), 0
     for size in (3, 5, 7):
         if first + size > coefficients:
             break
         band = slice(first, first + size)
-        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]  # old functions in terms of the new
+        matrix = np.linalg.lstsq(values[:, band], rotated_values[:, band], rcond=None)[0]
         result[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
         first += size
     return result.reshape(count, 3 * coefficients)
 
 
 def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Floats]) -> Floats:
-    """Return the coefficients, [N, K, 3], whose colors are closest to `curve` of the colors over all directions.
+    """Apply a color curve to coefficients, [N, K, 3], by least squares over all directions.
 
     With band 0 only, the result is exact.
     """
-    half = _directions()
-    values = basis(np.concatenate([half, -half]))[:, : coefficients.shape[1] - 1]
+    directions = _directions()
+    values = basis(np.concatenate([directions, -directions]))[:, : coefficients.shape[1] - 1]
     values = np.concatenate([np.full((len(values), 1), BAND_0), values], axis=1)
     fit, result = np.linalg.pinv(values), np.empty(coefficients.shape)
     for first in range(0, len(coefficients), ROWS):

@@ -25,14 +25,14 @@ from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, LOCK, STATUS, rais
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 
-# The owner of a folder, as its lock file names it, and messages about it.
+# The owner of a folder, read from its lock file, and messages about it.
 
 LOG = logging.getLogger("clsplat")
-LOCK_OFFSET = 1 << 20  # the locked byte; behind the text, because Windows blocks reads of a locked byte
+LOCK_OFFSET = 1 << 20  # position of the locked byte; after the text, because Windows blocks reads of a locked byte
 
 
 def owner_record() -> str:
-    """Return the lock file's text for this process."""
+    """Return the lock file's content for this process, as JSON."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return json.dumps({**asdict(Owner.current()), "time": time.time(), "command": command})
 
@@ -48,17 +48,17 @@ def read_owner(file: io.FileIO) -> dict[str, Any]:
 
 
 def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Return the owner that a lock file names if it is on another machine with invisible locks; else {}.
+    """Return the owner in a lock file if it is on another machine, whose lock may be invisible here; otherwise {}.
 
     Machines may share a name, so boot IDs are compared where both are known.
     Raises OutputError if the heartbeat in the run's status next to the file is recent.
     """
     owner = read_owner(file)
-    other, this = Owner.from_record(owner), Owner.current()
-    if other is None or (other.boot == this.boot if owner.get("boot") and this.boot else other.host == this.host):
+    holder, this = Owner.from_record(owner), Owner.current()
+    if holder is None or (holder.boot == this.boot if owner.get("boot") and this.boot else holder.host == this.host):
         return {}
-    beat = _heartbeat(path)
-    if beat is not None and (age := time.time() - beat) < HEARTBEAT_TIMEOUT:
+    heartbeat = _heartbeat(path)
+    if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
             f"{in_use_message(folder, owner)}; its heartbeat is {max(0, age):.0f} s old, but the lock is free here; "
             f"if that process has exited, wait a minute or remove {path}"
@@ -67,18 +67,19 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
 
 
 def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Wait for the next heartbeat, and return what `require_stale_heartbeat` does if none comes in time.
+    """Wait until the owner's heartbeat is stale, and return the same as `require_stale_heartbeat`.
 
-    Only a change of the heartbeat counts, not its time: the clocks of two machines may differ.
+    A heartbeat is recognized by a change, not by its time, because the clocks of two machines may differ.
+    Raises OutputError if there is one.
     """
-    beat, end, is_logged = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
+    heartbeat, deadline, is_logged = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
         try:
             return require_stale_heartbeat(file, path, folder)
         except OutputError:
-            if _heartbeat(path) != beat:
+            if _heartbeat(path) != heartbeat:
                 raise
-            if time.monotonic() >= end:
+            if time.monotonic() >= deadline:
                 return read_owner(file)
             if not is_logged:
                 is_logged = True
@@ -87,7 +88,10 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
 
 
 def _heartbeat(path: Path) -> float | None:
-    """Return the time of the status next to a lock in seconds since 1970; None if there is none or the run ended."""
+    """Return the time of a run's last status, in seconds since 1970; None without a status, or if the run has ended.
+
+    The status is in the same folder as `path`, the lock file.
+    """
     with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
         status = read_json(path.with_name(STATUS), limit=LOCK_OFFSET)
         return None if status.get("state") in END_STATES else float(status["time"])
@@ -98,11 +102,11 @@ def lost_lock_message(path: Path, folder: Path) -> str:
     """Return the message about a lock file that was removed or replaced."""
     try:
         owner = read_json(path, limit=LOCK_OFFSET)
-        by = f", and process {owner['process']} on {owner['host']} holds it now"
+        holder = f", and process {owner['process']} on {owner['host']} holds it now"
     except (DataError, KeyError, TypeError):
-        by = ""
+        holder = ""
     return (
-        f"{folder}: {path.name} was removed or replaced while this process held it{by}; nothing more was written; "
+        f"{folder}: {path.name} was removed or replaced while this process held it{holder}; nothing more was written; "
         "resume the run when no other process uses it"
     )
 
@@ -131,8 +135,8 @@ _locked_files_lock = threading.Lock()
 def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
     """Lock a folder during the block, with the lock file `path`, by default `run.lock` inside.
 
-    Yields a function that raises OutputError if that file was removed or replaced, so that another process may use the
-    folder.  Raises OutputError, with process and host, if another process holds the lock.
+    Yields a function that raises OutputError if that file was removed or replaced, since another process may then use
+    the folder.  Raises OutputError, with process and host, if another process holds the lock.
     """
     path = _resolve(folder, path or folder / LOCK)
     with _reserve(path, folder):
@@ -169,7 +173,7 @@ def _reserve(path: Path, folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> bool:
-    """Raise OutputError if `lock_folder` would do so at once; nothing is written.
+    """Raise OutputError if `lock_folder` would fail at once, without writing anything.
 
     Returns False if `lock_folder` would wait for the heartbeat of a run on another machine.
     """
@@ -207,7 +211,7 @@ def _require_not_held(path: Path, folder: Path) -> None:
 
 
 def _acquire(path: Path, folder: Path) -> io.FileIO:
-    """Open and lock a lock file, and write this process into it.  Raises OutputError, OSError."""
+    """Open and lock a lock file, and record this process as its owner.  Raises OutputError, OSError."""
     while True:
         file, is_new = _open_lock_file(path)
         if file is None:
@@ -225,7 +229,7 @@ def _acquire(path: Path, folder: Path) -> io.FileIO:
 
 
 def _open_lock_file(path: Path) -> tuple[io.FileIO | None, bool]:
-    """Open a lock file; return it, or None if its owner is removing it, and whether this process created it."""
+    """Return an open lock file, or None if its owner is removing it, and whether this process created it."""
     with suppress(FileExistsError):
         return path.open("x+b", buffering=0), True
     with suppress(FileNotFoundError):
@@ -271,15 +275,15 @@ def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
 
 def _remove(file: io.FileIO, path: Path) -> None:
     """Remove an open file from its path, but not a newer file at the same path."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # cleaned up later if this process is killed
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # cleaned up later if this process is killed
     with suppress(FileNotFoundError):
-        os.replace(path, aside)
-        if _is_still_at(file, aside):
-            aside.unlink()
+        os.replace(path, temporary)
+        if _is_still_at(file, temporary):
+            temporary.unlink()
         else:
             with suppress(FileExistsError):  # a third process has created one
-                os.link(aside, path)
-            aside.unlink()
+                os.link(temporary, path)
+            temporary.unlink()
 
 
 def _system_lock(file: io.FileIO) -> bool:

@@ -56,7 +56,7 @@ def cache_folder() -> Path:
 
 
 def user_cache_folders() -> list[Path]:
-    """Return the folder in POCL_CACHE_DIR, which PoCL prefers to the cache folder."""
+    """Return the folder in POCL_CACHE_DIR, which PoCL uses instead of its default; an empty list if it is not set."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 
 
@@ -74,7 +74,7 @@ def _write_fault(folder: Path) -> str:
 
 
 def space_fault(folder: Path) -> str:
-    """Return why built kernels may not fit in a folder, or ''."""
+    """Return why built kernels may not fit in a folder, or '' if they do."""
     with suppress(OSError, AttributeError):  # the free space is unknown
         if (free := shutil.disk_usage(folder).free) < MIN_SPACE:
             return f"{folder}: has only {free >> 10} KiB of free space, too little for built kernels"
@@ -82,7 +82,7 @@ def space_fault(folder: Path) -> str:
 
 
 def _temporary_cache_folder() -> Path:
-    """Return a private folder in the temporary folder, the same for all processes of a user if possible.
+    """Return a private folder in the system's temporary folder, if possible the same for all processes of a user.
 
     Raises OutputError if there is no temporary folder.
     """
@@ -110,7 +110,7 @@ def _is_private(folder: Path) -> bool:
     return stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077
 
 
-# CPU cores: which ones a process may use, and pinning a process to some of them.
+# CPU cores that a process may use, and pinning processes to cores.
 
 THREAD_VARIABLES = (  # environment variables that set the number of threads of a runtime
     "POCL_MAX_PTHREAD_COUNT",  # PoCL before 4
@@ -128,12 +128,12 @@ def usable_cores() -> tuple[int, ...]:
 
 
 def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
-    """Split cores into equal parts of neighboring cores, which share caches and memory.
+    """Split cores evenly into groups of adjacent cores, which share caches and memory.
 
     Leftover cores stay unused, so that all processes have the same number.
     """
     count = len(cores) // processes
-    return [tuple(cores[number * count : (number + 1) * count]) for number in range(processes)]
+    return [tuple(cores[process * count : (process + 1) * count]) for process in range(processes)]
 
 
 def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -171,21 +171,21 @@ class Owner:
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any]) -> "Owner | None":
-        """Return the process that a file names, or None.  Values that older files lack are those of this process."""
-        process, this = values.get("process"), cls.current()
+        """Return the process named in a record, or None.  Values that older records lack are those of this process."""
+        process, current = values.get("process"), cls.current()
         if type(process) is not int or process <= 0:
             return None
-        host, namespace = values.get("host", this.host), values.get("pid_namespace") or this.pid_namespace
-        return cls(process, host, namespace, values.get("boot") or this.boot)
+        host, namespace = values.get("host", current.host), values.get("pid_namespace") or current.pid_namespace
+        return cls(process, host, namespace, values.get("boot") or current.boot)
 
     @property
     def host_slug(self) -> str:
-        """The host's name as part of a file name."""
+        """The host's name, with characters that are unsafe in file names replaced by underscores."""
         return re.sub(r"[^0-9A-Za-z-]", "_", self.host) or "host"
 
     @property
     def is_local(self) -> bool:
-        """Whether its process ID is valid here."""
+        """Whether its process ID is valid on this host and in this container."""
         return replace(self, process=os.getpid()) == Owner.current()
 
     @property
@@ -251,7 +251,7 @@ def _is_alive_on_windows(kernel: Any, process: int) -> bool:
 
 
 def process_limit(name: Literal["RLIMIT_AS", "RLIMIT_FSIZE"]) -> int | None:
-    """Return the bytes of address space (`ulimit -v`) or of a file (`ulimit -f`) that a process may use, if limited."""
+    """Return the limit on the address space (`ulimit -v`) or on file sizes (`ulimit -f`) in bytes, or None."""
     try:
         import resource
     except ImportError:  # Windows

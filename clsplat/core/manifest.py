@@ -1,4 +1,4 @@
-"""Record which files of a folder a tool wrote and from which sources, to resume calls and to keep users' files."""
+"""Record which files in a folder a tool wrote, and from which sources, to resume calls and to keep users' files."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ RECORD = ".manifest.jsonl"
 
 
 class Manifest:
-    """The record of a folder: one line per written file, with a hash of its sources.
+    """The record of a folder, with one line per file that a tool wrote and a hash of its sources.
 
     A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
     written.  So every file that exists is complete and was made from the sources in its last line.  Temporary files of
@@ -63,11 +63,11 @@ class Manifest:
         return path.relative_to(self.folder).as_posix()
 
 
-def hash_values(*parts: object) -> str:
+def hash_values(*values: object) -> str:
     """Return a hash of values; a path is hashed by the content of its file.  Raises DataError."""
     state = hashlib.sha256()
-    for part in parts:
-        content = sha256(part) if isinstance(part, Path) else repr(part)
+    for value in values:
+        content = sha256(value) if isinstance(value, Path) else repr(value)
         state.update(f"{content}\n".encode())
     return state.hexdigest()
 

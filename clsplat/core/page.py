@@ -1,4 +1,4 @@
-"""Write HTML pages that open offline: one file with its style, charts, and images inside.
+"""Render HTML pages that open offline: each page is one file that contains its styles, charts, and images.
 
 Templates, styles, and scripts are in `templates/`.  Templates escape every value except the charts of
 `clsplat.viewer.charts` and the scripts and styles of the package.
@@ -50,7 +50,7 @@ def safe_charts(drawings: Iterable[str]) -> list[Markup]:
 
 @dataclass(frozen=True)
 class Inline:
-    """A script or style of the package, and the hash by which a page's content security policy allows it."""
+    """A script or style of the package, with the hash by which a page's content security policy allows it."""
 
     text: Markup
     hash: str
@@ -77,11 +77,11 @@ def duration_text(seconds: float) -> str:
 
 
 def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
-    """Encode an RGB image, [height, width, 3], as a data URL: .jpg, or lossless .png."""
+    """Encode an RGB image, [height, width, 3], as a data URL, in JPEG or, with suffix .png, losslessly."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
-    kind = "jpeg" if suffix == ".jpg" else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+    subtype = "jpeg" if suffix == ".jpg" else "png"
+    return f"data:image/{subtype};base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
 def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
@@ -100,6 +100,6 @@ THUMBNAIL = 160  # px, the longer side
 
 
 def summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
-    """Return a table of names and values, and named images, [height, width, 3], as an HTML fragment."""
+    """Return an HTML fragment with a table of names and values, and with named RGB images, [height, width, 3]."""
     thumbnails = [(name, data_url(shrink(image, THUMBNAIL))) for name, image in images]
     return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

@@ -20,18 +20,18 @@ MAX_POLLS = 40  # longer intervals keep polls below this number, since a poll ma
 
 
 class Listener(Protocol):
-    """Called with the label, the number done, the total, and the time left, if known."""
+    """A function that is called with a label, the number of finished items, the total, and the time left, if known."""
 
     def __call__(self, label: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
-_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of log lines about counts
+_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # level of log lines about counts
 
 
 @contextmanager
 def log_level(level: int) -> Iterator[None]:
-    """Drop log messages of the block below a level, because the caller reports the same."""
+    """Drop log messages below a level during the block, because the caller reports the same information."""
     previous = LOG.level
     LOG.setLevel(level)
     try:
@@ -42,7 +42,7 @@ def log_level(level: int) -> Iterator[None]:
 
 @contextmanager
 def captured_log(level: int) -> Iterator[list[str]]:
-    """Collect log messages of the block at or above a level instead of logging them."""
+    """Yield a list that collects the block's log messages at or above a level, instead of logging them."""
     messages: list[str] = []
 
     def capture(record: logging.LogRecord) -> bool:
@@ -78,7 +78,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def counts_as_debug() -> Iterator[None]:
-    """Log the counts of the block at debug level, because something else shows them."""
+    """Log the block's counts at debug level, because the caller shows them in another way."""
     token = _level.set(logging.DEBUG)
     try:
         yield
@@ -90,9 +90,9 @@ class Count:
     """A counter of finished items; `label` describes them, such as 'photographs decoded'."""
 
     def __init__(self, label: str, total: int, is_even: bool = True) -> None:
-        """is_even: whether items take about the same time, so that the time left can be estimated."""
+        """is_even: whether all items take about the same time, so that the time left can be estimated."""
         self.label, self.total, self.done, self.is_even = label, total, 0, is_even
-        self._start: tuple[float, int] | None = None  # time, and number of items done before
+        self._start: tuple[float, int] | None = None  # time of the first report, and number of items then done
         self._logged = time.monotonic()
         self.reach(0)
 
@@ -123,14 +123,14 @@ class Count:
 def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
     """Yield the items and count them; an item is done when the next one is requested."""
     count = Count(label, total)
-    for number, item in enumerate(items, 1):
+    for done, item in enumerate(items, 1):
         yield item
-        count.reach(number)
+        count.reach(done)
 
 
 @contextmanager
 def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
-    """Report progress of the block from a thread that polls how many items are done."""
+    """Report the progress of the block from a thread that calls `poll` for the number of finished items."""
     stop, context = threading.Event(), contextvars.copy_context()
 
     def watch() -> None:

@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 
 def rotation_matrix(w: ArrayLike, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
     """Return the rotation matrices [..., 3, 3] of unit quaternions whose components have the shape [...]."""
-    w, x, y, z = (np.asarray(part, np.float64) for part in (w, x, y, z))
+    w, x, y, z = (np.asarray(component, np.float64) for component in (w, x, y, z))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -27,10 +27,10 @@ def unit_quaternions(rotations: NDArray[np.floating]) -> Floats:
 def multiply(left: Floats, right: Floats) -> Floats:
     """Multiply quaternions, [N, 4]; one of the two may be [4]."""
     (w, x, y, z), (a, b, c, d) = left.T, right.T
-    parts = [
+    components = [
         w * a - x * b - y * c - z * d,
         w * b + x * a + y * d - z * c,
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     ]
-    return np.stack(parts, axis=1)
+    return np.stack(components, axis=1)

@@ -22,7 +22,7 @@ KINDS = {
     stat.S_IFBLK: "a device",
 }
 
-STARTS = (  # of files that are not what their names say: their first bytes, content, and remedy
+STARTS = (  # the first bytes of unexpected content, its description, and a remedy
     (b"version https://git-lfs", "a Git LFS pointer", "fetch the content with `git lfs pull`"),
     (b"<!doctype", "a web page", "download the file itself"),
     (b"<html", "a web page", "download the file itself"),
@@ -31,7 +31,7 @@ STARTS = (  # of files that are not what their names say: their first bytes, con
 
 
 def require_content(path: Path, data: bytes, kind: type[ClsplatError] = DataError) -> None:
-    """Raise `kind`, with the cause, if a file that starts with `data` is empty or a failed download."""
+    """Raise an error of type `kind` if a file that starts with `data` is empty or a failed download."""
     if not data:
         raise kind(f"{path}: the file is empty; copy or export it again")
     for start, content, remedy in STARTS:
@@ -65,7 +65,7 @@ def read_file(
 def read_text(
     path: Path, expected: str = "a text file", kind: type[ClsplatError] = DataError, limit: int | None = None
 ) -> str:
-    """Return the UTF-8 text of a regular file.  Raises DataError, or `kind`, with the line of invalid bytes."""
+    """Return the UTF-8 text of a regular file.  Raises DataError, or another `kind`, with the line of invalid bytes."""
     try:
         return read_file(path, expected, kind, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:

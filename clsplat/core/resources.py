@@ -36,12 +36,12 @@ def full_version() -> str:
 def list_sources() -> list[str]:
     """Return names and hashes of all Python files and kernels, which determine the results."""
     tools = PACKAGE / "data_tools"  # in a wheel; a checkout has it next to the package
-    python = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
-    kernels = resource_dir("cl_kernels")
-    texts = [path for pattern in ("*.cl", "*.h") for path in kernels.rglob(pattern)]
+    modules = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
+    folder = resource_dir("cl_kernels")
+    kernels = [path for pattern in ("*.cl", "*.h") for path in folder.rglob(pattern)]
     return [
         f"{path.relative_to(root).as_posix()} {sha256(path)}"
-        for root, paths in ((PACKAGE, python), (kernels, texts))
+        for root, paths in ((PACKAGE, modules), (folder, kernels))
         for path in sorted(paths)
     ]
 
@@ -58,7 +58,7 @@ def _list_code_files() -> list[str]:
 
 
 def _commit(root: Path) -> str:
-    """Return the commit of a checkout with unchanged code, else ""."""
+    """Return the commit of a checkout, or "" if its code has uncommitted changes or it is not a checkout."""
     if not (root / ".git").exists() or _git(root, "status", "--porcelain", "--", *CODE) != "":
         return ""
     return _git(root, "rev-parse", "--short=7", "HEAD") or ""
@@ -67,12 +67,12 @@ def _commit(root: Path) -> str:
 def _git(root: Path, *arguments: str) -> str | None:
     """Return the output of git, or None if it fails or is not installed."""
     try:
-        completed = subprocess.run(
+        process = subprocess.run(
             ["git", "--no-optional-locks", "-C", str(root), *arguments], capture_output=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return completed.stdout.decode("utf-8", "replace").strip()
+    return process.stdout.decode("utf-8", "replace").strip()
 
 
 def _digest(lines: Sequence[str]) -> str:

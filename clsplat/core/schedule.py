@@ -64,7 +64,7 @@ class Curve(Settings):
 
 
 class _Curves:
-    """Marks a field that accepts any curve, recognized by its keys."""
+    """An annotation of a field that accepts any curve, recognized by its keys."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         kinds = [kind for kind in Settings.subclasses if issubclass(kind, Curve) and not inspect.isabstract(kind)]
@@ -142,7 +142,7 @@ NOTATIONS = (
 
 
 def explain_schedule(more: str = "") -> WrapValidator:
-    """Report errors of all notations as one sentence; `more` names further values that the field accepts."""
+    """Return a validator that reports errors in any notation as one sentence; `more` names other accepted values."""
     return in_one_sentence(NOTATIONS + more)
 
 
@@ -150,7 +150,7 @@ Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explain_sc
 
 
 def schedule_values(schedule: Schedule) -> list[float]:
-    """Return all values in a schedule's notation."""
+    """Return all values in a schedule, including its smallest and largest."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Curve) else [schedule]
@@ -164,7 +164,7 @@ def divide(schedule: Schedule, factor: float) -> Schedule:
 
 
 class Bounded:
-    """Requires the values of a schedule to be from `minimum` (excluded if `exclusive`) to `maximum`."""
+    """A validator that requires a schedule's values to be from `minimum`, or above it if `exclusive`, to `maximum`."""
 
     def __init__(self, minimum: float, exclusive: bool = False, maximum: float = math.inf) -> None:
         self.minimum, self.exclusive, self.maximum = minimum, exclusive, maximum
@@ -207,14 +207,14 @@ def fires_at(every: float, step: int) -> bool:
 
 def count_fired(every: float, step: int) -> int:
     """Return how often the event has fired up to and including a step."""
-    steps, parts = _ratio(every)
-    return ((step + 1) * parts - 1) // steps
+    steps, events = _ratio(every)
+    return ((step + 1) * events - 1) // steps
 
 
 def fire_step(every: float, number: int) -> int:
     """Return the step at which the event fires for the `number`-th time, counted from 1."""
-    steps, parts = _ratio(every)
-    return number * steps // parts
+    steps, events = _ratio(every)
+    return number * steps // events
 
 
 def fire_steps(every: float, start: int, stop: int) -> list[int]:
@@ -226,5 +226,5 @@ def fire_steps(every: float, start: int, stop: int) -> list[int]:
 
 @lru_cache(maxsize=1024)
 def _ratio(every: float) -> tuple[int, int]:
-    """Return the interval as an exact ratio of its decimal notation, so that coinciding events keep coinciding."""
+    """Return the interval, in decimal notation, as an exact ratio, so that coinciding events keep coinciding."""
     return Fraction(str(every)).as_integer_ratio()

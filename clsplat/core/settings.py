@@ -41,10 +41,10 @@ class Settings(BaseModel):
     output_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume: the model does not depend on them
     training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the bits then change too
     step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
-    keyed_by_type: ClassVar[bool] = False  # a list has each type at most once and is addressed by type
+    keyed_by_type: ClassVar[bool] = False  # lists contain each type at most once, and items are addressed by type
     rate_keys: ClassVar[frozenset[str]] = (
         frozenset()
-    )  # schedules that are divided by that scale, so that sums stay the same
+    )  # schedules whose values are divided when training is longer, so that sums stay the same
     family: ClassVar[str] = ""  # another name, next to its type, that `conflicts` may use
     unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, each with advice
     conflicts: ClassVar[Mapping[str, str]] = {}
@@ -63,7 +63,7 @@ class Settings(BaseModel):
         return self.conflicts
 
     def check_pipeline(self, pipeline: Any) -> None:
-        """Raise ConfigError if the whole pipeline file (PipelineFile) lacks something that this needs."""
+        """Raise ConfigError if the pipeline (a PipelineFile) lacks something that these settings need."""
 
     def parts(self) -> dict[str, Any]:
         """Return the values by key, except values without effect."""
@@ -112,8 +112,8 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
         except (OSError, TypeError, SyntaxError):
             continue
         assert isinstance(tree, ast.ClassDef)
-        for field, below in itertools.pairwise(tree.body):
-            match field, below:
+        for node, next_node in itertools.pairwise(tree.body):
+            match node, next_node:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                     texts[name] = inspect.cleandoc(text)
     return {name: text for name, text in texts.items() if name in kind.model_fields}
@@ -128,7 +128,7 @@ def variant_tag(kind: type[Settings]) -> tuple[str, str] | None:
 
 
 def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
-    """Return what changing a key on resume affects, or None if it may not change."""
+    """Return what a change of a key on resume affects, or None if the key may not change."""
     bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
         return "output"
@@ -142,15 +142,15 @@ def variants(base: type[Base]) -> dict[str, type[Base]]:
 
 @functools.lru_cache(maxsize=256)
 def _variants_by_name(base: type[Base], subclasses: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
-    named: dict[str, type[Base]] = {}
+    by_name: dict[str, type[Base]] = {}
     for kind in subclasses:
         if not issubclass(kind, base) or (tag := variant_tag(kind)) is None:
             continue
-        if tag[1] in named:
-            classes = " and ".join(f"{other.__module__}.{other.__name__}" for other in (named[tag[1]], kind))
+        if tag[1] in by_name:
+            classes = " and ".join(f"{variant.__module__}.{variant.__name__}" for variant in (by_name[tag[1]], kind))
             raise ConfigError(f"two variants of {base.__name__} have the name '{tag[1]}': {classes}; rename one")
-        named[tag[1]] = kind
-    return named
+        by_name[tag[1]] = kind
+    return by_name
 
 
 def invalid_variant_reason(kind: type[Settings]) -> str | None:
@@ -176,14 +176,14 @@ def needs_settings(kind: type[Settings]) -> bool:
 
 
 class Variants:
-    """Marks a field that accepts a variant of a base: a mapping with its name, or only the name."""
+    """An annotation of a field that accepts a variant of `base`: a mapping with its name, or only its name."""
 
     def __init__(self, base: type[Settings]) -> None:
         self.base = base
 
     @property
     def tag(self) -> str:
-        """The field that names the variants."""
+        """The field that contains a variant's name."""
         return next((tag[0] for kind in variants(self.base).values() if (tag := variant_tag(kind))), TAGS[-1])
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -209,7 +209,10 @@ def _check_path(text: str) -> str:
 
 
 def in_one_sentence(expected: str) -> WrapValidator:
-    """Report an error in any notation of a field as one sentence: a validator's first message, or `expected`."""
+    """Return a validator that reports an error in any notation of a field as one sentence.
+
+    The sentence is the first message of a validator, or `expected`.
+    """
 
     def validate_any(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
@@ -233,7 +236,7 @@ def is_input_path(kind: type[Settings], key: str) -> bool:
 
 
 class VariantName:
-    """Marks a field that accepts the name of a variant of a base for which `accepts` is true."""
+    """An annotation of a field that accepts the name of a variant of `base` for which `accepts` returns True."""
 
     def __init__(self, base: type[Base], accepts: Callable[[type[Base]], bool] = lambda kind: True) -> None:
         self.base, self._accepts = base, accepts
@@ -261,9 +264,9 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild_models() -> None:
     """Rebuild all models, so that their fields accept variants defined later, such as those of a plug-in."""
-    complete = [kind for kind in Settings.subclasses if kind.__pydantic_complete__]  # others are built on first use
-    for kind in complete:  # schemas contain those of nested variants
+    built_models = [kind for kind in Settings.subclasses if kind.__pydantic_complete__]  # others: built on first use
+    for kind in built_models:  # schemas contain those of nested variants
         if "__pydantic_core_schema__" in vars(kind):
             del kind.__pydantic_core_schema__
-    for kind in complete:
+    for kind in built_models:
         kind.model_rebuild(force=True)

@@ -37,8 +37,8 @@ _received = _Received()
 def exit_on_signals() -> None:
     """Make signals exit the process with a message and exit code 130, except in `stopping_on_signals` blocks.
 
-    For startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and some
-    libraries catch every exception.
+    Call it at startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
+    some libraries catch every exception.
     """
     for number in _handlers():
         signal.signal(number, _exit)
@@ -51,7 +51,7 @@ def _exit(number: int, frame: Any) -> NoReturn:
 
 
 def stop_when_stdin_closes() -> None:
-    """Stop the process as SIGTERM does when stdin closes: the parent process exited or asked it to stop."""
+    """Stop the process, as SIGTERM does, when its parent closes stdin to stop it, or exits."""
     threading.Thread(target=_watch_stdin, name="input", daemon=True).start()
 
 
@@ -191,9 +191,9 @@ STDOUT, STDERR = Stream("stdout"), Stream("stderr")
 
 def install() -> None:
     """Make printing never fail, and open closed descriptors on the null device, so that no later file gets them."""
-    for number in (0, 1, 2):
+    for descriptor in (0, 1, 2):
         try:
-            os.fstat(number)
+            os.fstat(descriptor)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # os.open returns the lowest free number
     STDOUT.install()
@@ -224,7 +224,10 @@ def _silence(stream: Any) -> None:
 
 
 def take_stdin() -> int:
-    """Return a private descriptor of stdin, and give runtimes an empty one: on Windows, querying a pipe can block."""
+    """Return a private descriptor of stdin, and replace stdin by an empty one for OpenCL runtimes.
+
+    On Windows, querying a pipe can block.
+    """
     pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)
     os.close(empty)

@@ -111,10 +111,10 @@ def logging_to(path: Path) -> Iterator[None]:
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or use another folder")
     formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
-    first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
+    header = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
     with raising_output_error(path):
         with path.open("a", encoding="utf-8") as file:
-            file.write(formatter.format(first) + "\n")
+            file.write(formatter.format(header) + "\n")
         handler = _LogFile(path)
     handler.setFormatter(formatter)
     level = LOG.level
@@ -136,26 +136,24 @@ def logging_to(path: Path) -> Iterator[None]:
 
 def progress_line(progress: TrainingProgress) -> str:
     """Format the progress at a step as one line."""
-    p = progress
-    prefix = "" if p.growth_known else "at least "
-    count = "" if p.gaussians is None else f"gaussians {p.gaussians:,}  "
+    prefix = "" if progress.growth_known else "at least "
+    count = "" if progress.gaussians is None else f"gaussians {progress.gaussians:,}  "
     return (
-        f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  {count}"
-        f"{p.milliseconds:.1f} ms/step  {prefix}{clock(p.seconds_left)} left"
+        f"step {progress.step}/{progress.steps}  loss {progress.loss:.4f}  psnr {progress.psnr:.1f}  {count}"
+        f"{progress.milliseconds:.1f} ms/step  {prefix}{clock(progress.seconds_left)} left"
     )
 
 
 def device_text(device: dict[str, Any]) -> str:
     """Format a device from `clsplat.devices`, and whether it works, as lines of text."""
-    d = device
-    sizes = f"{d['memory'] / 2**30:.1f} GiB of memory, buffers up to {d['allocation'] / 2**30:.1f} GiB"
-    limits = f"groups up to {d['group']}, {d['local_memory'] >> 10} KiB local, {d['float_width']} lanes"
+    sizes = f"{device['memory'] / 2**30:.1f} GiB of memory, buffers up to {device['allocation'] / 2**30:.1f} GiB"
+    limits = f"groups up to {device['group']}, {device['local_memory'] >> 10} KiB local, {device['float_width']} lanes"
     return (
-        f"{d['name']} ({d['kind']}, {d['units']} units)\n"
-        f"  runtime   {d['platform']}\n"
+        f"{device['name']} ({device['kind']}, {device['units']} units)\n"
+        f"  runtime   {device['platform']}\n"
         f"  limits    {sizes}, {limits}\n"
-        f"  schedule  {d['schedule']}\n"
-        f"  state     {'does not work: ' + d['fault'] if d['fault'] else 'works'}"
+        f"  schedule  {device['schedule']}\n"
+        f"  state     {'does not work: ' + device['fault'] if device['fault'] else 'works'}"
     )
 
 
@@ -188,13 +186,13 @@ def counts_on_terminal() -> Iterator[None]:
 
 
 class _RunBar:
-    """The bar of a run, computed from its status whenever it is drawn, so that training never waits for it."""
+    """The progress bar of a run, computed from its status when drawn, so that training never waits for it."""
 
     def __init__(self, status: StatusSource) -> None:
         self.status, self.bar = status, _new_bar()
         self.task = self.bar.add_task("", total=None)
         self.last: tuple[float, TrainingProgress] | None = None  # time, report
-        self.first: tuple[float, int, int] | None = None  # time, step, and last step at the first drawing
+        self.first: tuple[float, int, int] | None = None  # time, step, and number of steps when first drawn
 
     def report(self, progress: TrainingProgress) -> None:
         self.last = time.monotonic(), progress
