@@ -1,1 +1,1 @@
-"""Is a device right, and how fast: the float64 reference, the checks, doctor and bench."""
+"""Check that a device computes correctly and measure its speed, with a float64 reference, doctor and bench."""

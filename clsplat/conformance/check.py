@@ -1,4 +1,4 @@
-"""Define checks of a device: named functions that compare kernels with the reference and yield deviations."""
+"""Define device checks: named functions that compare kernels with the reference and yield deviations."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -37,8 +37,8 @@ class Deviation:
     def text(self) -> str:
         """The deviation as a sentence."""
         if self.counts:
-            wrong = "1 wrong value" if self.value == 1 else f"{self.value:g} wrong values"
-            return f"{self.kernel} gives {wrong} in {self.label}" + (f", bound {self.bound:g}" if self.bound else "")
+            count = "1 wrong value" if self.value == 1 else f"{self.value:g} wrong values"
+            return f"{self.kernel} gives {count} in {self.label}" + (f", bound {self.bound:g}" if self.bound else "")
         return f"{self.kernel} differs by {self.value:.1g} in {self.label}, bound {self.bound:.1g}"
 
 
@@ -48,35 +48,35 @@ def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
 
 
 def compare(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
-    """Compare by norm: for gradients, whose small components suffer from cancellation."""
+    """Compare by norm.  Use this for gradients, whose small components suffer from cancellation."""
     return Deviation(kernel, label, relative_error(value, expected), bound)
 
 
 def compare_max(
     kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float, floor: float = 0.0
 ) -> Deviation:
-    """Compare value by value: the largest |value - expected| / (|expected| + floor)."""
+    """Compare value by value.  The deviation is the largest |value - expected| / (|expected| + floor)."""
     if value.size == 0:
         return Deviation(kernel, label, 0.0, bound)
-    difference, size = np.abs(np.subtract(value, expected, dtype=np.float64)), np.abs(expected) + floor
-    error = np.where(difference == 0, 0, difference / np.where(size > 0, size, 1e-30))
+    difference, scale = np.abs(np.subtract(value, expected, dtype=np.float64)), np.abs(expected) + floor
+    error = np.where(difference == 0, 0, difference / np.where(scale > 0, scale, 1e-30))
     return Deviation(kernel, label, float(error.max()), bound)
 
 
 def match(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
-    """Count the values that differ from `expected`."""
+    """Count the values that differ from `expected`; none may."""
     return count_true(kernel, label, value != expected)
 
 
 def count_true(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
-    """Count the True values of a mask."""
+    """Count the True values of a mask; up to `allowed` pass."""
     return Deviation(kernel, label, float(np.count_nonzero(mask)), allowed, counts=True)
 
 
 def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
-    """Compare images, [C, H, W]; in a few pixels, a splat may be on the other side of a threshold.
+    """Compare images, [C, H, W].  A few pixels may differ more, where a splat is on the other side of a threshold.
 
-    One splat more or less changes a pixel by up to 1/255 of its color, and colors are at most 3.
+    Such a splat changes a pixel by up to 1/255 of its color, and colors are at most 3.
     """
     difference = np.abs(value - expected).max(axis=0)
     yield Deviation(kernel, f"{label}: largest difference", float(difference.max()), 1.5e-2)
@@ -86,7 +86,7 @@ def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[
 
 @dataclass(frozen=True)
 class Note:
-    """Data that a check reports in addition to deviations, under a name."""
+    """Named data that a check reports in addition to its deviations."""
 
     name: str
     data: dict[str, Any]
@@ -105,7 +105,7 @@ class Check:
     run: Run
 
     def deviations(self, device: Device) -> Results:
-        """Yield the deviations on a device; random numbers depend only on the check's name."""
+        """Run the check on a device and yield its results.  Random numbers depend only on the check's name."""
         return self.run(device, np.random.default_rng(list(self.name.encode())))
 
 
@@ -116,7 +116,10 @@ class Checks:
     checks: list[Check] = field(default_factory=list)
 
     def add(self, *kernels: str) -> Callable[[Run], Run]:
-        """Add a function as a check of these kernels; the check's name is the function's, with spaces."""
+        """Return a decorator that adds a function as a check of `kernels`.
+
+        The name of the check is the name of the function, with spaces instead of underscores.
+        """
 
         def register(run: Run) -> Run:
             self.checks.append(Check(getattr(run, "__name__", "check").replace("_", " "), kernels, run))

@@ -23,7 +23,7 @@ from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
-BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not need
+BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not use
 REPORT = "report it with the file of `clsplat doctor --html FILE`"
 REMEDY = f"update the device's driver or use another device (`clsplat devices` lists them), and {REPORT}"
 
@@ -42,9 +42,12 @@ class Verdict:
 
 
 def judge(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
-    """Judge the results of each schedule, and of the checks that run `once` per device."""
+    """Return the verdict on a device from the results of each schedule, and of the checks that run `once` per device.
+
+    default: the schedule that the device uses by default.
+    """
     verdict = _judge_failures(default, schedules, once)
-    if verdict.usable and any(result.damaged_cache for part in (*schedules.values(), once) for result in part):
+    if verdict.usable and any(result.damaged_cache for results in (*schedules.values(), once) for result in results):
         advice = f"remove {kernel_caches()}, which fill again" + (f"; {verdict.advice}" if verdict.advice else "")
         return Verdict(True, f"{verdict.text}, after removing its damaged cache of built kernels", advice)
     return verdict
@@ -55,18 +58,18 @@ def _judge_failures(
 ) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
     other_failures = [text for result in once for text in result.failures]
-    passing = [name for name, texts in failures.items() if not texts]
-    if passing and (default in passing or default not in failures):
+    passing_schedules = [name for name, texts in failures.items() if not texts]
+    if passing_schedules and (default in passing_schedules or default not in failures):
         return _judge_default(failures, other_failures)
-    if passing:
+    if passing_schedules:
         reason = f"with the {default} schedule, {failures[default][0]}"
-        return Verdict(True, f"use it with --set rasterizer.schedule={passing[0]}: {reason}", REMEDY)
-    wrong_results = [result for result in schedules[default] if not result.passes]
-    if all(_is_bitonic(result) for result in wrong_results):
+        return Verdict(True, f"use it with --set rasterizer.schedule={passing_schedules[0]}: {reason}", REMEDY)
+    failed_results = [result for result in schedules[default] if not result.passes]
+    if all(_is_bitonic(result) for result in failed_results):
         return Verdict(True, f"use it with --set rasterizer.sort=radix: {failures[default][0]}", REMEDY)
-    first, more = failures[default][0], sum(map(len, failures.values())) - 1
-    others_text = f"; {pluralize(more, 'more failure')}" if more else ""
-    return Verdict(False, f"do not use it: {first}{others_text}", REMEDY)
+    first, more_count = failures[default][0], sum(map(len, failures.values())) - 1
+    more_text = f"; {pluralize(more_count, 'more failure')}" if more_count else ""
+    return Verdict(False, f"do not use it: {first}{more_text}", REMEDY)
 
 
 def _judge_default(failures: Mapping[str, list[str]], other_failures: list[str]) -> Verdict:
@@ -108,12 +111,12 @@ class DeviceReport:
 
     @property
     def failures(self) -> dict[str, list[str]]:
-        """A sentence for each failure, by schedule; memory and speed under ''."""
-        parts = {**self.schedules, "": self.once}
-        return {name: [text for result in part for text in result.failures] for name, part in parts.items()}
+        """A sentence for each failure, by schedule; the key of memory and speed is ''."""
+        by_schedule = {**self.schedules, "": self.once}
+        return {name: [text for result in results for text in result.failures] for name, results in by_schedule.items()}
 
     def note(self, name: str) -> dict[str, Any] | None:
-        """Return the data that a check noted under a name, or None."""
+        """Return the data of the note with a name, or None if no check reported it."""
         for result in (*self.once, *self.schedules.get(self.default, [])):
             for note in result.notes:
                 if note.name == name:
@@ -147,7 +150,7 @@ class DeviceReport:
         return "\n".join(lines)
 
     def memory(self) -> str:
-        """Return the size of the largest buffer that was tested, as a sentence; '' if it was not."""
+        """Return the size of the largest buffer that was tested, as a sentence; '' if none was tested."""
         note = self.note("memory")
         if note is None:
             return ""
@@ -170,19 +173,19 @@ class DeviceReport:
 def summary(results: list[CheckResult]) -> str:
     """Return the number of checks, comparisons and failures, as a sentence."""
     deviations = [deviation for result in results for deviation in result.deviations]
-    wrong = sum(not deviation.passes for deviation in deviations)
-    stopped = sum(result.fault is not None for result in results)
+    failure_count = sum(not deviation.passes for deviation in deviations)
+    fault_count = sum(result.fault is not None for result in results)
     seconds = sum(result.seconds for result in results)
-    words = [f"{wrong} failed"] if wrong else []
-    words += [f"{pluralize(stopped, 'check')} could not be completed"] if stopped else []
-    outcome = " and ".join(words) or "all passed"
+    problems = [f"{failure_count} failed"] if failure_count else []
+    problems += [f"{pluralize(fault_count, 'check')} could not be completed"] if fault_count else []
+    outcome = " and ".join(problems) or "all passed"
     return f"{len(results)} checks, {len(deviations)} comparisons: {outcome} ({seconds:.0f} s)"
 
 
 def _failure_lines(failures: list[str]) -> list[str]:
-    more = len(failures) - MAX_FAILURES
+    more_count = len(failures) - MAX_FAILURES
     lines = [f"          {text}" for text in failures[:MAX_FAILURES]]
-    return [*lines, f"          … and {more} more"] if more > 0 else lines
+    return [*lines, f"          … and {more_count} more"] if more_count > 0 else lines
 
 
 def _to_plain(result: CheckResult) -> dict[str, Any]:
@@ -226,9 +229,9 @@ def examine(device: str | Device | None = None) -> DeviceReport:
 
 
 def _is_due(schedule: str, report: DeviceReport) -> bool:
-    """Return whether to check a schedule: simt always, wide where it is the default or a CPU fails with simt.
+    """Return whether to check a schedule: always simt, and wide if it is the default or if a CPU fails with simt.
 
-    Other devices have no use for wide, and some compilers take many minutes for its vectors.
+    Other devices do not benefit from wide, and some compilers need many minutes for its vectors.
     """
     if schedule == "simt" or report.default == "wide":
         return True
@@ -236,12 +239,12 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
 
 
 def progress(schedule: str, result: CheckResult) -> str:
-    """Return a line of the log for one check."""
+    """Return the log line of one check."""
     failures = result.failures
     count = len(result.deviations)
-    passed = f"{pluralize(count, 'comparison')} passed" if count else "measured"
-    words = f"WRONG: {failures[0]}" if failures else passed
-    return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {words}"
+    success = f"{pluralize(count, 'comparison')} passed" if count else "measured"
+    outcome = f"WRONG: {failures[0]}" if failures else success
+    return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {outcome}"
 
 
 # The report as an HTML page that opens offline, to attach to a bug report.
@@ -259,15 +262,15 @@ def check_html_path(out: Path) -> None:
 
 
 def write_page(report: DeviceReport, out: Path) -> None:
-    """Write the report as HTML.  Raises OutputError."""
+    """Write the report as an HTML page.  Raises OutputError."""
     write_text(out, report_page(report))
 
 
 def report_page(report: DeviceReport) -> str:
-    """Return the report as HTML."""
+    """Return the report as an HTML page."""
     verdict = report.verdict
-    parts = {f"The {name} schedule": results for name, results in report.schedules.items()}
-    parts |= {"Memory and speed": report.once}
+    sections = {f"The {name} schedule": results for name, results in report.schedules.items()}
+    sections |= {"Memory and speed": report.once}
     return render(
         "doctor.html.j2",
         title=f"Doctor: {report.info.name}",
@@ -279,11 +282,11 @@ def report_page(report: DeviceReport) -> str:
         facts=_facts(report),
         parts={
             name: (summary(results), [(result, largest_error(result)) for result in results])
-            for name, results in parts.items()
+            for name, results in sections.items()
         },
         speed=report.note("speed"),
         speed_text=report.speed(),
-        logs=[(name, result) for name, results in parts.items() for result in results if result.log],
+        logs=[(name, result) for name, results in sections.items() for result in results if result.log],
     )
 
 
@@ -322,7 +325,7 @@ def largest_error(result: CheckResult) -> str:
 
 
 def _excess(deviation: Deviation) -> float:
-    """Return a deviation divided by its bound; infinity for NaN and for wrong counts."""
+    """Return a deviation divided by its bound; infinity if it exceeds the bound or is NaN."""
     if not deviation.passes:
         return float("inf")
     return deviation.value / deviation.bound if deviation.bound else 0.0

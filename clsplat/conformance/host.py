@@ -11,8 +11,8 @@ from clsplat.core import machine
 from clsplat.core.machine import available_memory
 from clsplat.core.resources import full_version
 
-CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change the code
-CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not change the code
+CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change kernels
+CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not change kernels
 PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_")
 
 
@@ -32,8 +32,8 @@ def system() -> dict[str, Any]:
 
 def code_variables() -> dict[str, str]:
     """Return the environment variables that may change how compilers and runtimes build kernels."""
-    neutral = (*CACHES, *machine.THREAD_VARIABLES)
-    return {name: value for name, value in _variables(CODE).items() if not name.startswith(neutral)}
+    ignored_prefixes = (*CACHES, *machine.THREAD_VARIABLES)
+    return {name: value for name, value in _variables(CODE).items() if not name.startswith(ignored_prefixes)}
 
 
 def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:

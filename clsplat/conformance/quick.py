@@ -29,19 +29,20 @@ SORTS = ("radix", "bitonic")  # each has a record
 def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
     """Open a device as `open_device` does, log its name, and ensure that it computes correctly.
 
-    Call this to open the device before rendering or training.
+    Use this to open the device for rendering or training.
     """
-    opened = open_device(device, schedule)
-    LOG.info("device: %s", opened.text)
-    ensure_correct(opened, sort)
-    return opened
+    result = open_device(device, schedule)
+    LOG.info("device: %s", result.text)
+    ensure_correct(result, sort)
+    return result
 
 
 def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     """Compare the essential kernels with the reference, on the first use of a device, driver and kernel version.
 
     The checks run in a child process, so that the state of the open device does not change.  The bitonic sort is
-    checked if the run may choose it.  Raises DeviceError if the device computes wrongly, and MemoryLimitError.
+    checked if the run may choose it.  Raises DeviceError if the device computes wrongly, and MemoryLimitError if it has
+    too little memory.
     """
     info, schedule = device.info, device.schedule
     bitonic = resolve_sort(device, sort) != "radix"
@@ -63,21 +64,24 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
 
 
 def remember(info: DeviceInfo, schedule: FixedSchedule, sorts: Sequence[str] = SORTS) -> None:
-    """Record that a device computes correctly; if the cache cannot be written, the next run checks it again."""
+    """Record that a device computes correctly.  If the cache cannot be written, the next run checks it again."""
     with suppress(OutputError):
         for sort in sorts:
             write_text(_record_file(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
 
 
 def forget(info: DeviceInfo, schedule: FixedSchedule) -> None:
-    """Remove the records of a device that computes wrongly: the next run checks it again."""
+    """Remove the records of a device that computes wrongly, so that the next run checks it again."""
     for sort in SORTS:
         with suppress(OSError):
             _record_file(info, schedule, sort).unlink(missing_ok=True)
 
 
 def _record_file(info: DeviceInfo, schedule: FixedSchedule, sort: str) -> Path:
-    """Return the file of a result, named by all that affects it: checks, device, driver, kernels, build options."""
+    """Return the path of a record.
+
+    Its name is a hash of all that affects the results: checks, device, driver, kernels, and build options.
+    """
     checks = (__version__, _hash_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_macros(info, schedule).items()), _hash_kernels())

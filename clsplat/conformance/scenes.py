@@ -40,8 +40,8 @@ class Case:
 
     def model(self, device: Device) -> DeviceModel:
         gaussians = Gaussians(device, self.parameters)
-        numbers = self.near, self.variance, self.compensate, self.pixel_box
-        return DeviceModel(gaussians, self.degree, *numbers, self.dropout)
+        settings = self.near, self.variance, self.compensate, self.pixel_box
+        return DeviceModel(gaussians, self.degree, *settings, self.dropout)
 
     def device_camera(self, device: Device) -> DeviceCamera:
         return upload_camera(device, self.view)
@@ -66,12 +66,13 @@ class Case:
         fx, fy, cx, cy = (float(np.float32(value)) for value in (c.fx, c.fy, c.cx, c.cy))
         return ref.PinholeCamera(pose, fx, fy, cx, cy, c.width, c.height)
 
-    def numbers(self) -> dict[str, float]:
-        numbers = {"near": self.near, "variance": self.variance, "compensate": self.compensate}
-        return numbers | {"pixel_box": self.pixel_box}
+    def projection_settings(self) -> dict[str, float]:
+        settings = {"near": self.near, "variance": self.variance, "compensate": self.compensate}
+        return settings | {"pixel_box": self.pixel_box}
 
     def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
-        splats = ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
+        settings = self.projection_settings()
+        splats = ref.project(self.gaussians(), self.camera(), self.degree, **settings, thresholds=thresholds)
         if self.dropout:
             dropped = ref.drop_mask(**vars(self.dropout), count=len(splats.visible))
             for values in (values for values in vars(splats).values() if isinstance(values, np.ndarray)):
@@ -80,7 +81,7 @@ class Case:
 
 
 def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: Any) -> Case:
-    """Return `count` Gaussians of a few pixels, spread over the view and slightly beyond it."""
+    """Return a case of `count` Gaussians, each a few pixels large, spread over the view and slightly beyond it."""
     focal = 0.9 * width
     depth = rng.uniform(1.5, 6, count)
     offsets = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
@@ -100,14 +101,17 @@ def random_case(rng: np.random.Generator, count: int, width: int = 40, height: i
 
 
 def add_world_filter(case: Case, rng: np.random.Generator) -> Case:
-    """Return the same Gaussians with a 3D filter of about half their size."""
+    """Return the case with a 3D filter of about half the size of each Gaussian."""
     sizes = np.exp(case.parameters["log_scales"].mean(axis=1, keepdims=True))
     variance = (sizes * rng.uniform(0.2, 0.8, sizes.shape)) ** 2
     return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
 
 
 def needle_case(rng: np.random.Generator, count: int, aspect: float, **changes: Any) -> Case:
-    """Return Gaussians nearly parallel to the image, with `aspect` as the ratio of screen axes after filtering."""
+    """Return a case of long Gaussians nearly parallel to the image.
+
+    aspect: ratio of a splat's axes on the screen, after the screen filter.
+    """
     case = random_case(rng, count, **changes)
     pose, focal, p = case.view.world_to_camera, case.view.camera.fx, case.parameters
     depth = p["means"] @ pose[2, :3] + pose[2, 3]
@@ -133,14 +137,17 @@ def safe_case(
     change: Callable[[dict[str, NDArray[Any]]], None] = lambda parameters: None,
     **changes: Any,
 ) -> Case:
-    """Return a scene in which no pixel is within `margin` of a threshold, so that float32 and float64 blend alike."""
+    """Return a random case in which no pixel is within `margin` of a threshold: float32 and float64 blend alike.
+
+    change: function that edits the parameters of each candidate in place.
+    """
     for _ in range(200):
         case = random_case(rng, count, width, height, **changes)
         change(case.parameters)
         gaps = ref.margin(case.project(), width, height)
         if min(gaps.alpha, gaps.transmittance, gaps.cap) > margin and gaps.depth > min(margin, 2e-6):
             return case
-    raise AssertionError("no scene with these margins was found")
+    raise AssertionError("found no scene with these margins")
 
 
 Floats = NDArray[Any]
@@ -159,41 +166,41 @@ def sums_to_gradients(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
 
 
 def gradients_to_sums(splats: Splats, gradients: ref.SplatGradients) -> Floats:
-    """Convert gradients of splats to sums over pixels, [N, PIXEL_SUMS]: the inverse of sums_to_gradients."""
+    """Convert gradients of splats to sums over pixels, [N, PIXEL_SUMS].  This is the inverse of sums_to_gradients."""
     shape, mean2d = gradients.conic, gradients.mean2d
     a, b, c = np.where(splats.visible[:, None], splats.conic, [1.0, 0.0, 1.0]).T
     if splats.pixel_box:
-        swapped = a > c
-        yy, k = np.where(swapped, a, c), b / np.where(swapped, a, c)
+        is_swapped = a > c
+        yy, k = np.where(is_swapped, a, c), b / np.where(is_swapped, a, c)
         t2 = (a * c - b * b) / yy
-        grad_t2, grad_xy, grad_yy = np.where(swapped, shape[:, ::-1].T, shape.T)
+        grad_t2, grad_xy, grad_yy = np.where(is_swapped, shape[:, ::-1].T, shape.T)
         grad_k = yy * (grad_xy + 2 * k * grad_t2)
         grad_s = 2 * (yy * (grad_yy - k * k * grad_t2) + k * grad_k)
-        position, second = mean2d, np.stack([grad_k, grad_s, 2 * t2 * grad_t2], axis=1)
+        position, second_order = mean2d, np.stack([grad_k, grad_s, 2 * t2 * grad_t2], axis=1)
     else:
         u, v = mean2d.T
         position = np.stack([b * v - c * u, b * u - a * v], axis=1) / (a * c - b * b)[:, None]
-        second = shape * [-2.0, -1.0, -2.0]
+        second_order = shape * [-2.0, -1.0, -2.0]
     power = (gradients.opacity * splats.opacity)[:, None]
-    return np.concatenate([power, position, second, gradients.color], axis=1) * splats.visible[:, None]
+    return np.concatenate([power, position, second_order, gradients.color], axis=1) * splats.visible[:, None]
 
 
 def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
-    """Apply the chain rule to gradients of k = xy / yy, ln s and ln t, with s² = yy and t² = xx - xy² / yy.
+    """Return dL/d(xx, xy, yy), [N, 3], from gradients of k = xy / yy, ln s and ln t, [N, 3].
 
-    If xx > yy, x and y are swapped.
+    s² = yy and t² = xx - xy² / yy.  If xx > yy, x and y are swapped.
     """
     gradient = np.zeros((len(m), 3))
     for n in np.flatnonzero(splats.visible):
         xx, xy, yy = splats.conic[n]
-        swapped = xx > yy
-        if swapped:
+        is_swapped = xx > yy
+        if is_swapped:
             xx, yy = yy, xx
         k, t2 = xy / yy, xx - xy * xy / yy
         grad_k, grad_s, grad_t = m[n]
         grad_t2 = grad_t / (2 * t2)
         grad_yy = -grad_k * k / yy + grad_s / (2 * yy) + grad_t2 * k * k
         gradient[n] = grad_t2, grad_k / yy - 2 * k * grad_t2, grad_yy
-        if swapped:
+        if is_swapped:
             gradient[n] = gradient[n, ::-1]
     return gradient

@@ -31,11 +31,11 @@ class CheckResult:
     seconds: float = 0.0
     deviations: list[Deviation] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
-    fault: str | None = None  # why it could not be completed
+    fault: str | None = None  # the reason why the check could not be completed
     log: str = ""  # log of a failed build
     out_of_memory: bool = False  # whether the fault is a lack of memory
     hangs: bool = False  # whether the fault is a timeout or unreadable output
-    damaged_cache: bool = False  # whether it failed, but succeeded with empty caches of built kernels
+    damaged_cache: bool = False  # whether the check failed, but passed with empty caches of built kernels
 
     @property
     def passes(self) -> bool:
@@ -44,8 +44,8 @@ class CheckResult:
     @property
     def failures(self) -> list[str]:
         """A sentence for each failure."""
-        stopped = [f"{self.name}: {shorten(self.fault, 240)}"] if self.fault else []
-        return stopped + [deviation.text for deviation in self.deviations if not deviation.passes]
+        faults = [f"{self.name}: {shorten(self.fault, 240)}"] if self.fault else []
+        return faults + [deviation.text for deviation in self.deviations if not deviation.passes]
 
 
 def run_checks(
@@ -54,19 +54,19 @@ def run_checks(
     """Run checks on a device with a schedule; yield each result when it is complete.
 
     A check without output for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
-    built kernels, until that does not help.
+    built kernels; after the first repetition that fails too, no more checks are repeated.
     """
     remaining, retry = list(checks), True
     while remaining:
-        finished = 0
+        finished_count = 0
         for result in _run_in_process(info, schedule, remaining, seconds):
             if retry and result.fault and not result.out_of_memory and not result.hangs:
-                repeated = _run_with_empty_caches(info, schedule, remaining[finished], seconds)
-                retry = repeated.fault is None
-                result = repeated if retry else result
-            finished += 1
+                second_result = _run_with_empty_caches(info, schedule, remaining[finished_count], seconds)
+                retry = second_result.fault is None
+                result = second_result if retry else result
+            finished_count += 1
             yield result
-        remaining = remaining[finished:]
+        remaining = remaining[finished_count:]
 
 
 def _run_with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> CheckResult:
@@ -79,7 +79,7 @@ def _run_with_empty_caches(info: DeviceInfo, schedule: str, check: Check, second
 def _run_in_process(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float, variables: Mapping[str, str] | None = None
 ) -> Iterator[CheckResult]:
-    """Yield the results of checks up to and including the first that ends the process: at least one."""
+    """Yield the results of the checks, up to and including the first check that ends the process."""
     command = [sys.executable, *WORKER, *map(str, info.index), schedule]
     names = [check.name for check in checks]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
@@ -112,7 +112,10 @@ def _run_in_process(
 
 
 def _read_result(result: CheckResult, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
-    """Read the lines of one check; return None if it is complete, "" if the process ended, else why to stop it."""
+    """Read the output of one check.
+
+    Return None if the check is complete, "" if the process has ended, and otherwise the reason to stop the process.
+    """
     while True:
         try:
             text = lines.get(timeout=seconds)
@@ -142,14 +145,14 @@ def _forward_lines(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
 
 
 def _exit_reason(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
-    """Return why a process ended: its signal or exit code, and the last line that it wrote."""
+    """Return why a process ended, as a sentence with its signal or exit code, and the last line that it wrote."""
     try:
         code = process.wait(EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return "closes its output but does not exit"
     errors.seek(0)
     output_lines = [line.strip() for line in errors.read().splitlines() if line.strip()]
-    last = f" ({shorten(output_lines[-1], 300)})" if output_lines else ""
+    last_line = f" ({shorten(output_lines[-1], 300)})" if output_lines else ""
     if code < 0:
-        return f"the runtime crashes with {signal_name(code)}{last}"
-    return f"the process exits with code {code}{last}"
+        return f"the runtime crashes with {signal_name(code)}{last_line}"
+    return f"the process exits with code {code}{last_line}"

@@ -1,7 +1,7 @@
-"""Run checks on a device, given by platform and device number, and print their results as lines of JSON.
+"""Run checks on a device and print their results as lines of JSON.
 
-A runtime may abort the process; the parent then knows which check was running.  The process exits when its parent
-closes stdin or exits.
+Arguments: platform number, device number, schedule, and the names of the checks.  If the OpenCL runtime aborts the
+process, the parent knows which check was running.  The process exits when its parent closes stdin or exits.
 """
 
 import json
@@ -25,7 +25,7 @@ MAX_LOG = 4000  # characters of a build log
 
 
 def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> None:
-    """Open the device and run the checks with these names."""
+    """Run the checks with these names on a device, which the first check opens."""
     threading.Thread(target=_exit_with_parent, args=(take_stdin(),), daemon=True).start()
     out = take_stdout()
     info = next(info for info in list_devices() if info.index == (platform, number))
@@ -61,7 +61,7 @@ def _fault_source(error: Exception) -> str:
 
 
 def _exit_with_parent(pipe: int) -> None:
-    """Exit at once when the parent closes its end of a pipe or exits."""
+    """Exit at once when the parent exits or closes its end of the pipe."""
     while os.read(pipe, 1024):
         pass
     os._exit(1)

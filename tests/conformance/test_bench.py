@@ -63,11 +63,11 @@ def test_moving_case_changes_nothing(device, rng):
 
 def test_case_has_no_edits_due_and_is_timed_after_warm_up(device):
     timed = case(device, *SIZE, load("smoke").settings)
-    assert not timed.clock
+    assert not timed.step_times
     assert not timed.stages
     timed.step(record=True)
     timed.repeat()
-    assert len(timed.clock) == len(timed.steps) == 1
+    assert len(timed.step_times) == len(timed.mean_step_times) == 1
     assert all(len(times) == 1 for times in timed.stages.values())
 
 

@@ -48,7 +48,7 @@ def test_reference_gradient_matches_finite_differences(rng):
     """By parameters, so that depths move too."""
     case = random_case(rng, 5, 24, 20)
     gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
-    numbers = {**case.numbers(), "thresholds": ref.SMOOTH}
+    numbers = {**case.projection_settings(), "thresholds": ref.SMOOTH}
 
     def loss(moved: ref.RawGaussians) -> float:
         splats = ref.project(moved, camera, case.degree, **numbers)

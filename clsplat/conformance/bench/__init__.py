@@ -1,1 +1,1 @@
-"""Times of training steps next to the peaks of the device."""
+"""Measure the time of training steps, and compare it with the peaks of the device."""

@@ -1,4 +1,4 @@
-"""Time training steps of several scenes in turns, so that a slow period of the machine affects all; take medians."""
+"""Time training steps of several scenes alternately, so that a slow machine affects all of them; report medians."""
 
 import statistics
 import time
@@ -36,7 +36,7 @@ from clsplat.training.motion import MotionRates
 from clsplat.training.records import stage_milliseconds
 from clsplat.training.trainer import StepTrainer
 
-MIN_SECONDS = 2e-3  # shortest measurement, of which the first launch and the final wait take about 0.02 ms
+MIN_SECONDS = 2e-3  # shortest measurement; the first launch and the final wait take about 0.02 ms of it
 
 
 @dataclass(frozen=True)
@@ -49,42 +49,42 @@ class Peaks:
 
 
 def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
-    """Measure the rates of multiply-adds, exponentials and copies; return the best of `repeats`."""
+    """Measure the rates of multiply-adds, exponentials and copies; return the best of `repeats` measurements."""
     program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
     group = int(device.tuning["GROUP"])
     is_cpu = device.info.kind == "CPU"
     items = 64 * group * max(1, device.info.units // (8 if is_cpu else 2))  # a GPU unit runs about 2048 at once
     result = device.empty(items * lanes)
 
-    def time_launches(launch: Callable[[], None], times: int) -> float:
+    def time_launches(launch: Callable[[], None], count: int) -> float:
         device.finish()
         start = time.perf_counter()
-        for _ in range(times):
+        for _ in range(count):
             launch()
         device.finish()
         return time.perf_counter() - start
 
-    def seconds(launch: Callable[[], None]) -> float:
-        times = 1
-        time_launches(launch, times)  # the first launch compiles
-        while (elapsed := time_launches(launch, times)) < MIN_SECONDS:
-            times *= 4
-        return min([elapsed, *(time_launches(launch, times) for _ in range(repeats - 1))]) / times
+    def time_launch(launch: Callable[[], None]) -> float:
+        count = 1
+        time_launches(launch, count)  # the first launch compiles
+        while (elapsed := time_launches(launch, count)) < MIN_SECONDS:
+            count *= 4
+        return min([elapsed, *(time_launches(launch, count) for _ in range(repeats - 1))]) / count
 
     floats, copy_group = max(lanes, 4), program.peak_copy.group[0]  # per item, and items per group
     rounds = 40_000 if is_cpu else 4000  # enough for the system to distribute the threads
-    fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
-    exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
+    fma_time = time_launch(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
+    exp_time = time_launch(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
     length = min(64 << 20, device.info.allocation // 16 // 4) // (floats * copy_group) * (floats * copy_group)
-    source, copied = device.zeros(length), device.zeros(length)
-    copy = seconds(lambda: program.peak_copy(items=length // floats, values=source, copied=copied))
+    src, dst = device.zeros(length), device.zeros(length)
+    copy_time = time_launch(lambda: program.peak_copy(items=length // floats, values=src, copied=dst))
     work = items * lanes * rounds
-    return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)
+    return Peaks(16 * work / fma_time / 1e9, 2 * work / exp_time / 1e9, 8 * length / copy_time / 1e9)
 
 
 @dataclass(frozen=True)
 class Work:
-    """The work of one step."""
+    """The amount of work of one training step."""
 
     gaussians: int
     pairs: int
@@ -93,16 +93,16 @@ class Work:
 
 
 def floors(work: Work, peaks: Peaks) -> dict[str, float]:
-    """Return a lower bound on the time of each stage, ms.
+    """Return a lower bound on the time of each stage, in ms.
 
     Blending is counted in vector instructions of 16 lanes (31 per row forward; 80 per row and 60 per pair backward),
-    issued at the rate of multiply-adds.  Other stages are counted in operations and bytes (236 bytes of parameters per
-    Gaussian, 59 parameters with a gradient and two moments, 64 bytes per record, …).
+    issued at the rate of multiply-adds.  Other stages are counted in operations and bytes: 236 bytes of parameters per
+    Gaussian, 59 parameters with a gradient and two moments, 64 bytes per record, and so on.
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
 
-    def floor(operations: float, bytes_moved: float) -> float:
-        return 1e3 * max(operations / (1e9 * peaks.gflops), bytes_moved / (1e9 * peaks.gbytes))
+    def floor(operations: float, traffic: float) -> float:
+        return 1e3 * max(operations / (1e9 * peaks.gflops), traffic / (1e9 * peaks.gbytes))
 
     vector = 2 * 16  # operations of a multiply-add instruction
     return {
@@ -126,13 +126,13 @@ TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; a rate
 
 @dataclass
 class BenchResult:
-    """The times of one scene, ms."""
+    """The times of one scene, in ms."""
 
     work: Work
     stages: dict[str, float]
     floors: dict[str, float]
     step: float  # wall-clock time, with a wait for the device after each step
-    steps: float  # of one of `STEPS` steps without a wait between them, as in a training
+    steps: float  # mean time of `STEPS` steps without waits between them, as in a training run
     densify: float
     host: float  # time of the step minus that of the device's stages
     memory: int  # bytes on the device, at peak
@@ -140,7 +140,7 @@ class BenchResult:
 
 
 class BenchCase:
-    """A scene for training steps with a pipeline's losses, statistics and rendering.
+    """A scene on which to time training steps with a pipeline's losses, statistics and rendering.
 
     An exported model has the 3D filter baked into its scales, so that the filter takes no time here.
     """
@@ -168,19 +168,19 @@ class BenchCase:
             Rates(**rates, motion=motion),
             rows=optimize.update,
         )
-        self.clock: list[float] = []
-        self.steps: list[float] = []
+        self.step_times: list[float] = []
+        self.mean_step_times: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)
-        self.densify: list[float] = []
+        self.densify_times: list[float] = []
         self.frame: Frame | None = None
         for _ in range(WARM_UP_STEPS):
             self.step(record=False)
-        self.step(record=False, stale=PARAMETERS)  # as at a step with an edit: gradients are written to memory
+        self.step(record=False, stale=PARAMETERS)  # writes gradients to memory, as a step with an edit does
         self.edit()
         self.memory = device.peak - self._initial_bytes
 
     def step(self, record: bool, stale: Collection[str] = ()) -> None:
-        """Do one training step.  record: keep its times.  stale: parameters that are not updated."""
+        """Do one training step.  record: whether to record its times; stale: parameters that are not updated."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
@@ -190,18 +190,18 @@ class BenchCase:
         self.device.timings.sampling = False
         self.frame = view.frame
         if record:
-            self.clock.append(1e3 * seconds)
+            self.step_times.append(1e3 * seconds)
             for name, milliseconds in stage_milliseconds(self.device.timings).items():
                 self.stages[name].append(milliseconds)
 
     def repeat(self) -> None:
-        """Do `STEPS` training steps without a wait between them; record the mean time."""
+        """Do `STEPS` training steps without waits between them; record the mean time."""
         self.device.finish()
         start = time.perf_counter()
         for _ in range(STEPS):
             self.trainer.step(self.photograph, 1)
         self.device.finish()
-        self.steps.append(1e3 * (time.perf_counter() - start) / STEPS)
+        self.mean_step_times.append(1e3 * (time.perf_counter() - start) / STEPS)
 
     def edit(self) -> None:
         """Do one density edit that rearranges all tables and changes nothing."""
@@ -210,27 +210,27 @@ class BenchCase:
         edit = Edit(self.trainer.model.gaussians, self.trainer.stats, SceneScale(1.0), step=1, seed=0)
         densify(edit, [PruneLarge(size_above=1e30)], self.trainer.rasterizer.tiler)
         self.device.finish()
-        self.densify.append(1e3 * (time.perf_counter() - start))
+        self.densify_times.append(1e3 * (time.perf_counter() - start))
 
     def result(self, peaks: Peaks) -> BenchResult:
         """Return the medians of all times, with the floors for `peaks`."""
-        work = self._work()
+        work = self._measure_work()
         stages = {name: statistics.median(times) for name, times in self.stages.items()}
-        clock = statistics.median(self.clock)
-        host = clock - sum(stages.values())
-        steps, densify_ms = statistics.median(self.steps), statistics.median(self.densify[1:])
+        step = statistics.median(self.step_times)
+        host = step - sum(stages.values())
+        steps, densify_ms = statistics.median(self.mean_step_times), statistics.median(self.densify_times[1:])
         return BenchResult(
-            work, stages, floors(work, peaks), clock, steps, densify_ms, host, self.memory, self._planned()
+            work, stages, floors(work, peaks), step, steps, densify_ms, host, self.memory, self._planned_bytes()
         )
 
-    def _planned(self) -> int:
+    def _planned_bytes(self) -> int:
         camera = self.photograph.camera
         gaussians = self.trainer.model.gaussians
         pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
         info, components = gaussians.device.info, gaussians.components
         return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).required_bytes(gaussians.count)
 
-    def _work(self) -> Work:
+    def _measure_work(self) -> Work:
         assert self.frame is not None
         lists, camera = self.frame.lists, self.frame.camera
         records = self.frame.splats.get().reshape(-1, RECORD)[lists.pair_splat.get()[: lists.pairs]]
@@ -245,7 +245,7 @@ class BenchCase:
 
 
 def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[str, BenchResult]:
-    """Time each scene `repeats` times, in turns; return the results by name."""
+    """Time each scene `repeats` times, alternating between scenes; return the results by name."""
     for _ in range(repeats):
         for case in cases.values():
             case.step(record=True)
@@ -297,14 +297,14 @@ def case(device: Device, width: int, height: int, count: int, settings: Pipeline
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
     """Return a benchmark of a splat file, or of Gaussians from a point cloud, at the first training view."""
-    opened, background = settings.scene.read(scene)
+    loaded_scene, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
-    near = with_near(settings, near_plane(opened))
-    return BenchCase(device, parameters, photographs.get(opened.split("train")[0]), background, near)
+    settings = with_near(settings, near_plane(loaded_scene))
+    return BenchCase(device, parameters, photographs.get(loaded_scene.split("train")[0]), background, settings)
 
 
 def with_near(settings: PipelineFile, near: float) -> PipelineFile:
-    """Return the settings with this near plane, scene units, instead of `auto`."""
+    """Return the settings with `near`, in scene units, as the near plane if theirs is `auto`."""
     model = settings.model.model_copy(update={"near": near})
     return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

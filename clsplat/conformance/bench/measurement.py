@@ -18,7 +18,7 @@ from clsplat.pipeline.loading import load
 
 EXPECTED = "the JSON of an earlier `clsplat bench --json`"
 UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
-WHOLE = {"host": "host", "step": "step", "steps without waits": "steps", "densify": "densify"}  # rows, and their keys
+TOTALS = {"host": "host", "step": "step", "steps without waits": "steps", "densify": "densify"}  # row labels and keys
 MAX_PEAK_RATIO = 1.1  # largest ratio of two peaks for times to be comparable
 
 
@@ -59,16 +59,16 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
         raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED}: create it again") from error
     if actual.pipeline != name:
         raise ConfigError(f"{path}: expected the pipeline '{name}', got {quote(actual.pipeline)}")
-    return {key: value for key, value in data.items() if key != "against"}  # its own baseline
+    return {key: value for key, value in data.items() if key != "against"}  # the baseline of that measurement
 
 
 def peaks_text(peaks: dict[str, float]) -> str:
-    """Return the peaks of a device, as in the `data` of a measurement, as text."""
+    """Return the peaks of a device as text.  peaks: the key `peaks` in the `data` of a measurement."""
     return f"{peaks['gflops']:.0f} GFLOP/s, {peaks['gexp']:.1f} Gexp/s, copy {peaks['gbytes']:.1f} GB/s"
 
 
 def compare_conditions(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
-    """Return lines about differences between the `data` of two measurements, other than times."""
+    """Return lines of text about differences between the `data` of two measurements, other than times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
     if earlier["device"] != now["device"]:
         lines.append(f"  on another device: {quote(earlier['device'])}")
@@ -76,23 +76,24 @@ def compare_conditions(now: dict[str, Any], earlier: dict[str, Any]) -> list[str
     if any(not 1 / MAX_PEAK_RATIO <= ratio <= MAX_PEAK_RATIO for ratio in ratios.values()):
         changes = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
         lines.append(f"  the device now gives {changes}: compare ratios to the floors")
-    if missing := [name for name in now["scenes"] if name not in earlier["scenes"]]:
-        lines.append(f"  without scenes: {', '.join(missing)}; it has {', '.join(earlier['scenes']) or 'none'}")
+    if missing_names := [name for name in now["scenes"] if name not in earlier["scenes"]]:
+        lines.append(f"  without scenes: {', '.join(missing_names)}; it has {', '.join(earlier['scenes']) or 'none'}")
     return lines
 
 
 def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str:
-    """Return the times of one scene as text.  earlier: the same scene in an earlier measurement."""
+    """Return a table of the times of one scene.  earlier: data of the same scene in an earlier measurement, or None."""
     work, mib = result.work, 2**20
     counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
     rows = [(stage, ms, result.floors.get(stage)) for stage, ms in result.stages.items()]
     total = sum(result.floors.values())
-    rows += [(row, getattr(result, key), total if "step" in row else None) for row, key in WHOLE.items()]
-    before = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in WHOLE.items()}} if earlier else {}
+    rows += [(row, getattr(result, key), total if "step" in row else None) for row, key in TOTALS.items()]
+    old_times = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in TOTALS.items()}} if earlier else {}
     cells = [["stage", "ms", "floor", "ratio", *(("was", "now/was") if earlier else ())]]
     for stage, ms, floor in rows:
         ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
-        comparison = (f"{before[stage]:.2f}", f"{ms / before[stage]:.2f}") if before.get(stage, 0) > 0 else ()
+        old_ms = old_times.get(stage, 0)
+        comparison = (f"{old_ms:.2f}", f"{ms / old_ms:.2f}") if old_ms > 0 else ()
         cells.append([stage, f"{ms:.2f}", *ratio, *comparison])
     memory = f"memory {result.memory / mib:,.0f} MiB at peak; training plans {result.planned / mib:,.0f} MiB"
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left_columns=1)}\n{memory}", "  ")
@@ -113,11 +114,11 @@ class Measurement:
         return {"device": self.device, "pipeline": self.pipeline, "peaks": asdict(self.peaks), "scenes": scenes}
 
     def text(self, earlier: dict[str, Any]) -> str:
-        """Return tables of the times, next to the `data` of an earlier measurement unless that is empty."""
-        head = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
+        """Return tables of the times.  earlier: `data` of an earlier measurement to compare with, or an empty dict."""
+        header = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
         earlier_scenes = earlier.get("scenes", {})
         tables = [table(name, result, earlier_scenes.get(name)) for name, result in self.results.items()]
-        return "\n".join([*head, *(compare_conditions(self.data(), earlier) if earlier else ()), *tables])
+        return "\n".join([*header, *(compare_conditions(self.data(), earlier) if earlier else ()), *tables])
 
 
 def measure(
@@ -130,15 +131,15 @@ def measure(
     schedule: Schedule = "auto",
     device: str | Device | None = None,
 ) -> Measurement:
-    """Time a training step on fixed scenes, and on a model with a view of its scene.  Raises ClsplatError."""
-    if unknown := [name for name in scenes if name not in SIZES]:
-        raise ConfigError(f"--scenes: expected names from {', '.join(SIZES)}, got '{unknown[0]}'")
+    """Time training steps on synthetic scenes, and on a model with a view of its scene.  Raises ClsplatError."""
+    if unknown_names := [name for name in scenes if name not in SIZES]:
+        raise ConfigError(f"--scenes: expected names from {', '.join(SIZES)}, got '{unknown_names[0]}'")
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
     settings = load(pipeline).settings
-    opened = open_device(device, schedule)
-    peaks = measure_peaks(opened)
-    cases = {name: case(opened, *SIZES[name], settings) for name in scenes}
+    bench_device = open_device(device, schedule)
+    peaks = measure_peaks(bench_device)
+    cases = {name: case(bench_device, *SIZES[name], settings) for name in scenes}
     if model is not None and scene is not None:
-        cases[model.stem] = real_case(opened, model, scene, settings)
-    return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
+        cases[model.stem] = real_case(bench_device, model, scene, settings)
+    return Measurement(bench_device.text, settings.name, peaks, run_bench(cases, peaks, repeats))
