@@ -1,1 +1,1 @@
-"""Splat files: a module for each format, and one table of them."""
+"""Read and write splat files: one module per format, and `table`, which lists the formats."""

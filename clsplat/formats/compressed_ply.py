@@ -1,10 +1,10 @@
-"""Read the compressed PLY of PlayCanvas: 16 bytes per splat plus 3(K-1) for SH, in chunks of 256 with own ranges.
+"""Read the compressed PLY of PlayCanvas: 16 bytes per splat, plus 3(K-1) for SH, in chunks of 256 splats.
 
-chunk   min and max of x y z, scale_x y z, and r g b, float32; in old files colors have no min and max: [0, 1]
+chunk   min and max of x y z, scale_x y z, and r g b, float32; old files have none for colors: [0, 1]
 vertex  packed_position   x << 21 | y << 11 | z    11, 10, and 11 bits within the chunk's range
         packed_rotation   index of the largest of w x y z << 30, the others 10 bits each of c / sqrt 2 + 1/2
-        packed_scale      log scales, packed as the position;    packed_color   r << 24 | g << 16 | b << 8 | opacity
-sh      f_rest_i, uchar, channel-major: (byte + 1/2) / 256 of [-4, 4]; 0 and 255 are the exact ends
+        packed_scale      log scales, packed like the position;    packed_color   r << 24 | g << 16 | b << 8 | opacity
+sh      f_rest_i, uchar, channel-major: (byte + 1/2) / 256 of [-4, 4]; 0 and 255 are exactly -4 and 4
 """
 
 import os
@@ -30,15 +30,15 @@ from clsplat.formats.splats import (
 )
 
 CHUNK = 256  # splats
-BITS = (11, 10, 11)  # of x, y, and z
+BITS = (11, 10, 11)  # for x, y, and z
 SH_RANGE = 8.0  # from -4 to 4
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 AXES, SCALES, COLORS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
-_ENDS = [f"{end}_{name}" for group in (AXES, SCALES, COLORS) for end in ("min", "max") for name in group]
+_BOUNDS = [f"{bound}_{name}" for group in (AXES, SCALES, COLORS) for bound in ("min", "max") for name in group]
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Return whether a PLY contains packed splats."""
+    """Return whether the vertices of a PLY are packed splats."""
     return set(PACKED) <= set(header.dtype.names or ())
 
 
@@ -56,12 +56,12 @@ def read_compressed_ply(path: Path) -> SplatFile:
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
     chunks, vertices = _require_match(path, header, tables)
     require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
-    per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
-    color, alpha = _colors(vertices, chunks, per_splat)
+    chunk = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
+    color, alpha = _colors(vertices, chunks, chunk)
     parameters = {
-        "means": _spread(_fields(vertices["packed_position"], BITS), chunks, AXES, per_splat).astype(np.float32),
+        "means": _dequantize(_unpack(vertices["packed_position"], BITS), chunks, AXES, chunk).astype(np.float32),
         "quats": _quaternions(vertices["packed_rotation"]),
-        "log_scales": _spread(_fields(vertices["packed_scale"], BITS), chunks, SCALES, per_splat).astype(np.float32),
+        "log_scales": _dequantize(_unpack(vertices["packed_scale"], BITS), chunks, SCALES, chunk).astype(np.float32),
         "logit_opacity": logits(alpha[:, None]),
         "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": _harmonics(path, tables.get("sh"), len(vertices)),
@@ -70,8 +70,8 @@ def read_compressed_ply(path: Path) -> SplatFile:
 
 
 def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the chunks and vertices.  Raises DataError if they do not match."""
-    if not {"chunk", "vertex"} <= tables.keys() or not set(_ENDS[:12]) <= set(tables["chunk"].dtype.names or ()):
+    """Return the chunks and vertices.  Raises DataError if they are missing or do not match."""
+    if not {"chunk", "vertex"} <= tables.keys() or not set(_BOUNDS[:12]) <= set(tables["chunk"].dtype.names or ()):
         raise DataError(f"{path}: a compressed PLY needs the ranges of its splats in 'element chunk'; export it again")
     if not is_compressed(header) or any(header.dtype[name].str[1:] != "u4" for name in PACKED):
         raise DataError(f"{path}: expected 'property uint' for {', '.join(PACKED)}; export it again")
@@ -84,7 +84,7 @@ def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]
 
 
 def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np.float32]:
-    """Return the bands above 0, coefficient-major, [count, 3(K-1)]."""
+    """Return the SH coefficients above band 0, coefficient-major, [count, 3(K-1)].  Raises DataError."""
     if table is None:
         return np.zeros((count, 0), np.float32)
     columns = len(table.dtype.names or ())
@@ -101,8 +101,8 @@ def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np
     return reorder_columns(levels[table.view("u1").reshape(count, columns)], 3, columns // 3)
 
 
-def _fields(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
-    """Unpack fields of the given bits, the first in the highest bits, as numbers in [0, 1], [N, fields]."""
+def _unpack(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """Unpack bit fields, the most significant first, as fractions in [0, 1], [N, fields].  bits: of each field."""
     columns, shift = [], 32
     for width in bits:
         shift -= width
@@ -110,26 +110,26 @@ def _fields(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
     return np.stack(columns, axis=1)
 
 
-def _spread(
-    fractions: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], per_splat: NDArray[np.integer]
+def _dequantize(
+    fractions: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], chunk: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """Scale numbers in [0, 1] to the range of each splat's chunk."""
-    low, high = (np.stack([chunks[f"{end}_{n}"] for n in names], axis=1).astype(np.float64) for end in ("min", "max"))
+    """Scale fractions in [0, 1] to the range of each splat's chunk, [N, columns].  chunk: [N]."""
+    low, high = (np.stack([chunks[f"{b}_{n}"] for n in names], axis=1).astype(np.float64) for b in ("min", "max"))
     with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
-        values: NDArray[np.float64] = low[per_splat] + fractions * (high - low)[per_splat]
+        values: NDArray[np.float64] = low[chunk] + fractions * (high - low)[chunk]
     return values
 
 
 def _colors(
-    vertices: NDArray[Any], chunks: NDArray[Any], per_splat: NDArray[np.integer]
+    vertices: NDArray[Any], chunks: NDArray[Any], chunk: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return colors, [N, 3], and opacities, [N]."""
-    fractions = _fields(vertices["packed_color"], (8, 8, 8, 8))
-    if set(_ENDS[12:]) <= set(chunks.dtype.names or ()):
-        return _spread(fractions[:, :3], chunks, COLORS, per_splat), fractions[:, 3]
+    """Return the colors, [N, 3], and opacities, [N]."""
+    fractions = _unpack(vertices["packed_color"], (8, 8, 8, 8))
+    if set(_BOUNDS[12:]) <= set(chunks.dtype.names or ()):
+        return _dequantize(fractions[:, :3], chunks, COLORS, chunk), fractions[:, 3]
     return fractions[:, :3], fractions[:, 3]
 
 
 def _quaternions(packed: NDArray[Any]) -> NDArray[np.float32]:
-    fractions = _fields(packed << np.uint32(2), (10, 10, 10))
+    fractions = _unpack(packed << np.uint32(2), (10, 10, 10))
     return from_smallest_three((packed >> np.uint32(30)).astype(np.intp), (fractions - 0.5) * 2**0.5)

@@ -1,4 +1,4 @@
-"""Pack numbers for compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
+"""Encode values for compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
 
 import hashlib
 import logging
@@ -17,32 +17,32 @@ from clsplat.core.files import open_atomic
 
 LOG = logging.getLogger("clsplat")
 MORTON_BITS = 21  # per axis: three fit into 63 bits
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components of each, in order
+_SMALLEST = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components by the index of the largest one
 _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
 
 
 def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the index of each unit quaternion's largest component, [N], and the others in order, [N, 3].
+    """Return the index of each unit quaternion's largest component, [N], and its other three, in order, [N, 3].
 
     Signs are chosen so that the largest is positive.
     """
     largest = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
     positive = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
-    return largest, positive[rows[:, None], _OTHERS[largest]]
+    return largest, positive[rows[:, None], _SMALLEST[largest]]
 
 
-def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float32]:
+def from_smallest_three(largest: NDArray[np.integer], smallest: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return unit quaternions [N, 4] from the result of `smallest_three`."""
-    quats = np.empty((len(others), 4))
-    rows = np.arange(len(others))
-    quats[rows[:, None], _OTHERS[largest]] = others
-    quats[rows, largest] = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
+    quats = np.empty((len(smallest), 4))
+    rows = np.arange(len(smallest))
+    quats[rows[:, None], _SMALLEST[largest]] = smallest
+    quats[rows, largest] = np.sqrt(np.maximum(1 - np.square(smallest).sum(axis=1), 0))
     return quats.astype(np.float32)
 
 
 def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Return the order of rows, [N], along a Morton curve through the bounding box of the means."""
+    """Return the row indices, [N], that sort means along a Morton curve through their bounding box."""
     if not len(means):
         return np.zeros(0, np.intp)
     low = means.min(axis=0).astype(np.float64)
@@ -62,27 +62,27 @@ def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which levels are outside of the range of a byte, before rounding, with the shape of `levels`."""
+    """Return a mask of the levels that do not round to a byte, with the shape of `levels`."""
     return (levels < -0.5) | (levels > 255.5)
 
 
 def warn_clipped(path: Path, name: str, ranges: str, is_clipped: NDArray[np.bool_]) -> None:
-    """Warn how many Gaussians have values outside of a format's range.  is_clipped: [N, K], one row per Gaussian."""
+    """Warn how many Gaussians have values outside a format's range.  is_clipped: mask of these values, [N, K]."""
     if count := int(is_clipped.any(axis=1).sum()):
         LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
 
-# Lossless WebP images of 8-bit RGBA pixels that store numbers.
+# Lossless WebP images whose 8-bit RGBA pixels store values.
 
-LOSSLESS = 101  # a quality above 100 makes OpenCV write lossless WebP
-MAX_SIDE = 16383  # px, limit of the format
+LOSSLESS = 101  # a quality above 100 selects lossless WebP in OpenCV
+MAX_SIDE = 16383  # px, the limit of WebP
 BGRA = [2, 1, 0, 3]
 
 
 def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
-    """Encode pixels [n, 4] as an image, row by row, padded with zeros; alpha must be at least 1.
+    """Encode pixels, [n, 4] RGBA, row by row as an image padded with zeros; alpha must be at least 1.
 
-    WebP drops the color under an alpha of 0, so the image is decoded to verify it.  Raises OutputError if it differs.
+    WebP drops colors where alpha is 0, so the image is decoded to verify it.  Raises OutputError if it differs.
     """
     height = -(-len(pixels) // width)
     image = np.zeros((height * width, 4), np.uint8)
@@ -98,7 +98,7 @@ def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
 def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
     """Decode the pixels of an image, [n, 4] RGBA, row by row, with `min_pixels` <= n <= `max_pixels`.
 
-    Raises DataError for another size, before decoding, and for another format.
+    Raises DataError for another format, and, before decoding, for another size.
     """
     width, height = size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:
@@ -116,7 +116,7 @@ def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int)
 
 
 def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Decode pixels; the fourth channel may be missing if all alphas are 255."""
+    """Decode pixels, [n, 4]; the image may have no alpha channel if alpha is 255 everywhere."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
         return np.zeros((0, 4), np.uint8)
@@ -126,7 +126,7 @@ def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
-    """Return width and height from the header.  Raises DataError for another format."""
+    """Return the width and height, px, from the header of an image.  Raises DataError for another format."""
     kind = data[12:16]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
         if kind == b"VP8L":
@@ -142,13 +142,13 @@ def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
 
 
 class Output:
-    """A file that is written once from start to end."""
+    """A file that is written from start to end, and the SHA-256 of its bytes."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._sum = file, hashlib.sha256()
 
     def write(self, data: bytes) -> None:
-        """Append bytes."""
+        """Append bytes to the file."""
         self._file.write(data)
         self._sum.update(data)
 
@@ -167,6 +167,6 @@ def write_bytes(path: Path, data: bytes) -> str:
 
 @contextmanager
 def open_hashed(path: Path) -> Iterator[Output]:
-    """Open a file for atomic writing, like `open_atomic`, and hash what is written.  Raises OutputError."""
+    """Open a file for atomic writing, like `open_atomic`, and hash the written bytes.  Raises OutputError."""
     with open_atomic(path) as file:
         yield Output(file)

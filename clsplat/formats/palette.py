@@ -1,72 +1,71 @@
-"""Compute codebooks of numbers and palettes of vectors, with the same bits on every machine and thread count.
+"""Compute codebooks of scalars and palettes of vectors, bit-identical on all machines and for any number of threads.
 
-Order-dependent sums run in a fixed order.  Matrix products, whose order the library chooses, only multiply whole
-numbers that are exact in float32.
+Order-dependent sums run in a fixed order.  Matrix products, whose order of summation the library chooses, only multiply
+integers whose products and sums are exact in float32.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-ENTRIES = 256  # of a codebook
+ENTRIES = 256  # values of a codebook
 CODEBOOK_ROUNDS, LLOYD_STEPS, PALETTE_ROUNDS = 4, 8, 10
 BLOCK = 1024  # rows whose distances are in memory at once
 SAMPLE = 8  # training points per palette entry
-LEVELS = 511  # whole numbers on each side of 0; sums of 45 products stay below 2^24
+LEVELS = 511  # integers on each side of 0; sums of 45 products stay below 2^24
 TAIL = 1e-4  # fraction of values that may be clipped to LEVELS
 
 
 def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray[np.float64]:
-    """Return ENTRIES numbers, ascending, that approximate `values` with little squared error.
+    """Return a codebook, [ENTRIES] in ascending order, that approximates `values` with a small squared error.
 
-    Rounds of Lloyd's iteration (1982); between rounds, two cells are merged if that costs less than splitting another
-    cell gains.  If `values` has at most ENTRIES different numbers, these are returned exactly, with the last repeated;
-    otherwise the same is tried for `values` rounded to multiples of `step`.
+    If there are at most ENTRIES distinct values, these are returned exactly, and the last one is repeated.  Otherwise,
+    the same is tried for `values` rounded to multiples of `step`.  If that fails, too, rounds of Lloyd's iteration
+    (1982) compute the codebook.  Between rounds, two cells are merged if this costs less than splitting another gains.
     """
-    ordered = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
-    for values in [ordered] + ([np.rint(ordered / step) * step] if step else []):
-        distinct = np.unique(values)
+    sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
+    for candidates in [sorted_values] + ([np.rint(sorted_values / step) * step] if step else []):
+        distinct = np.unique(candidates)
         if len(distinct) <= ENTRIES:
             return np.concatenate([distinct, np.full(ENTRIES - len(distinct), distinct[-1])])
-    cells = _Cells(ordered)
-    cuts = _first_cuts(ordered)
+    cells = _Cells(sorted_values)
+    cuts = _first_cuts(sorted_values)
     for _ in range(CODEBOOK_ROUNDS):
         for _ in range(LLOYD_STEPS):
             means = np.sort(cells.means(cuts))
-            cuts[1:-1] = np.searchsorted(ordered, (means[1:] + means[:-1]) / 2)
+            cuts[1:-1] = np.searchsorted(sorted_values, (means[1:] + means[:-1]) / 2)
         cuts = cells.rebalance(cuts)
     return np.sort(cells.means(cuts))
 
 
 class _Cells:
-    """Sorted values in consecutive cells; cell i has the values from cuts[i] to cuts[i + 1]."""
+    """Sorted values in consecutive cells; cell i contains sorted_values[cuts[i] : cuts[i + 1]]."""
 
-    def __init__(self, ordered: NDArray[np.float64]) -> None:
-        self.ordered, self.center = ordered, ordered[len(ordered) // 2]
-        offsets = ordered - self.center
-        self.sums, self.squares = _sums(offsets), _sums(np.square(offsets))
+    def __init__(self, sorted_values: NDArray[np.float64]) -> None:
+        self.sorted_values, self.center = sorted_values, sorted_values[len(sorted_values) // 2]
+        offsets = sorted_values - self.center
+        self.sums, self.squares = _prefix_sums(offsets), _prefix_sums(np.square(offsets))
 
     def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the mean of each cell, or the value before an empty cell."""
+        """Return the mean of each cell; for an empty cell, the value before it."""
         first, last = cuts[:-1], cuts[1:]
         mean: NDArray[np.float64] = (self.sums[last] - self.sums[first]) / np.maximum(last - first, 1) + self.center
-        return np.where(last > first, mean, self.ordered[np.maximum(first, 1) - 1])
+        return np.where(last > first, mean, self.sorted_values[np.maximum(first, 1) - 1])
 
     def errors(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the squared errors of cells."""
+        """Return the squared error of each cell, from index `first` up to, but not including, `last`."""
         total = self.sums[last] - self.sums[first]
         return np.asarray(self.squares[last] - self.squares[first] - np.square(total) / np.maximum(last - first, 1))
 
     def rebalance(self, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Merge the cheapest pair of cells and split the worst cell, as long as that reduces the error."""
+        """Repeatedly merge the cheapest pair of cells and split the worst cell while this reduces the error."""
         for _ in range(ENTRIES):
             errors = self.errors(cuts[:-1], cuts[1:])
             loss = self.errors(cuts[:-2], cuts[2:]) - errors[:-1] - errors[1:]
-            middle = np.clip(
-                np.searchsorted(self.ordered, self.means(cuts)), cuts[:-1], cuts[1:]
-            )  # clipped for empty cells
+            middle = np.searchsorted(self.sorted_values, self.means(cuts))
+            middle = np.clip(middle, cuts[:-1], cuts[1:])  # clipped for empty cells
             gain = errors - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
             split = int(gain.argmax())
-            loss[max(split - 1, 0) : split + 1] = np.inf  # neighbors of the split cell
+            loss[max(split - 1, 0) : split + 1] = np.inf  # pairs that include the split cell
             merge = int(loss.argmin())
             if gain[split] <= loss[merge] * (1 + 1e-9):
                 break
@@ -74,20 +73,20 @@ class _Cells:
         return cuts
 
 
-def _sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return prefix sums, [N + 1], relative to the middle, which keeps their precision there."""
+def _prefix_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return prefix sums, [N + 1], with 0 at the middle index, where they are therefore most precise."""
     middle = len(values) // 2
     lower, upper = np.cumsum(values[:middle][::-1])[::-1], np.cumsum(values[middle:])
     return np.concatenate([-lower, [0.0], upper])
 
 
-def _first_cuts(ordered: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return cells whose density is the cube root of that of the values (Panter and Dite 1951)."""
-    edges = np.linspace(ordered[0], ordered[-1], 4 * ENTRIES + 1)
-    positions = np.searchsorted(ordered, edges)
+def _first_cuts(sorted_values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return cuts whose density is the cube root of the density of the values (Panter and Dite 1951)."""
+    edges = np.linspace(sorted_values[0], sorted_values[-1], 4 * ENTRIES + 1)
+    positions = np.searchsorted(sorted_values, edges)
     weight = np.concatenate([[0.0], np.cumsum(np.cbrt(np.diff(positions)))])
-    cuts = np.searchsorted(ordered, np.interp(np.linspace(0, weight[-1], ENTRIES + 1), weight, edges))
-    cuts[0], cuts[-1] = 0, len(ordered)
+    cuts = np.searchsorted(sorted_values, np.interp(np.linspace(0, weight[-1], ENTRIES + 1), weight, edges))
+    cuts[0], cuts[-1] = 0, len(sorted_values)
     return cuts.astype(np.int64)
 
 
@@ -101,13 +100,13 @@ def palette(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return at most `entries` vectors, [E, c], that approximate points [N, c], and the label of each point, [N].
 
-    Lloyd's iteration on a sample of the points, initialized with evenly spaced ones; a vector without points moves to
-    the point with the largest error.  At most 45 components.  `weights`, [N], give the probability of each point in
-    the sample.  At most `entries` different points are returned exactly.
+    If there are at most `entries` distinct points, these are returned exactly.  Otherwise, Lloyd's iteration runs on a
+    sample of the points, and starts from evenly spaced ones.  A vector without points moves to the point with the
+    largest error.  Points have at most 45 components.  weights: relative probabilities of sampling each point, [N].
     """
-    if (exact := unique_points(points, entries)) is not None:
-        return exact
-    integers = _whole_numbers(points)
+    if (distinct := unique_points(points, entries)) is not None:
+        return distinct
+    integers = _to_integers(points)
     rows = _sample_rows(len(points), SAMPLE * entries, weights)
     sample, integer_sample = points[rows].astype(np.float64), integers[rows]
     starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
@@ -129,17 +128,17 @@ def palette(
 def _nearest_vectors(
     points: NDArray[np.float32], vectors: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the nearest vector of [E, c] for each point of [N, c], the first if equal, and half the squared distance.
+    """Return the index of the vector, [E, c], nearest to each point, [N, c], and half their squared distance, both [N].
 
-    All are whole numbers from -LEVELS to LEVELS, so all results are exact.
+    The first vector wins ties.  Points and vectors are integers from -LEVELS to LEVELS, so all results are exact.
     """
-    half = np.square(vectors).sum(axis=1) / 2
+    half_squares = np.square(vectors).sum(axis=1) / 2
     labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
-    space = np.empty((BLOCK, len(vectors)), np.float32)
+    buffer = np.empty((BLOCK, len(vectors)), np.float32)
     for start in range(0, len(points), BLOCK):
         block = points[start : start + BLOCK]
-        distances = np.matmul(block, vectors.T, out=space[: len(block)])
-        np.subtract(half, distances, out=distances)
+        distances = np.matmul(block, vectors.T, out=buffer[: len(block)])
+        np.subtract(half_squares, distances, out=distances)
         best = distances.argmin(axis=1)
         labels[start : start + BLOCK] = best
         distance[start : start + BLOCK] = distances[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
@@ -147,7 +146,7 @@ def _nearest_vectors(
 
 
 def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return ascending rows of points that train a palette, evenly spaced by weight, or by row without weights."""
+    """Return ascending rows for training a palette, evenly spaced in total weight, or in number without one."""
     max_rows = min(count, max_rows)
     if not weights.any():
         return np.linspace(0, count - 1, max_rows).astype(np.int64)
@@ -155,15 +154,15 @@ def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDA
     return np.asarray(np.searchsorted(total, (np.arange(max_rows) + 0.5) / max_rows * total[-1]))
 
 
-def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Scale and round values to whole numbers from -LEVELS to LEVELS."""
+def _to_integers(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scale and round values to integers from -LEVELS to LEVELS."""
     largest = robust_max(values) or np.float32(1)
     return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))
 
 
 def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Return the distinct points in order of appearance and the label of each point; None if more than `max_points`."""
-    if len(np.unique(points[:, 0])) > max_points:  # decides at once for most models
+    if len(np.unique(points[:, 0])) > max_points:  # a fast test that suffices for most models
         return None
     distinct, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
     if len(distinct) > max_points:
@@ -176,6 +175,6 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:
     """Return the absolute value that only a fraction TAIL of the values exceeds; 0 for no values."""
-    size = np.abs(values).ravel()
-    index = min(int((1 - TAIL) * size.size), size.size - 1)
-    return np.float32(np.partition(size, index)[index] if size.size else 0)
+    sizes = np.abs(values).ravel()
+    index = min(int((1 - TAIL) * sizes.size), sizes.size - 1)
+    return np.float32(np.partition(sizes, index)[index] if sizes.size else 0)
