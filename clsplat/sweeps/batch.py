@@ -1,4 +1,4 @@
-"""Run cells through a store with an engine, and copy their results to folders with their names."""
+"""Run cells on an engine, keep their results in a store, and copy them to folders with the names of the cells."""
 
 import logging
 import threading
@@ -37,9 +37,9 @@ from clsplat.training.status import StatusFile, read_status
 
 
 def copy_result(source: Path, target: Path) -> None:
-    """Copy a result to a folder, by hard links except for files that grow; the manifest comes last.
+    """Copy the folder of a result, by hard links except for files that a run appends to.  Raises OutputError.
 
-    Raises OutputError.
+    The manifest is copied last, so that it marks a complete copy.
     """
     with raising_output_error(target):
         for old in (target / MANIFEST, *checkpoint.list_files(target)):  # the checkpoints may belong to another run
@@ -49,14 +49,14 @@ def copy_result(source: Path, target: Path) -> None:
 
 
 def has_result(source: Path, target: Path) -> bool:
-    """Return whether a folder holds the files of a result, as `copy_result` wrote them.
+    """Return whether `target` contains a complete and unchanged copy of the result in `source`.
 
-    Raises ConfigError if the run in it was continued with other settings.
+    Raises ConfigError if the run in `target` was continued with other settings.
     """
-    copied = None
+    copied_hash = None
     with suppress(DataError, KeyError, TypeError):
-        copied = read_json(target / MANIFEST)["files"][PIPELINE]
-    if copied and try_sha256(target / PIPELINE) not in (None, copied):
+        copied_hash = read_json(target / MANIFEST)["files"][PIPELINE]
+    if copied_hash and try_sha256(target / PIPELINE) not in (None, copied_hash):
         raise ConfigError(
             f"{target}: the run was continued with other settings after the sweep; move that folder away, "
             "and run the sweep again with --resume"
@@ -65,23 +65,23 @@ def has_result(source: Path, target: Path) -> bool:
     return state.phase is Phase.DONE and state.sums == read_sums(source) and not state.bad_files
 
 
-PROGRESS_INTERVAL_S = 2.0  # between two reads of the cells' status files
-MAX_NAMES = 4  # of cells in the progress line
+PROGRESS_INTERVAL_S = 2.0  # time between two reads of the cells' status files
+MAX_NAMES = 4  # number of cells in the progress line
 
 LOG = logging.getLogger("clsplat")
 
 
 @dataclass
 class Batch:
-    """Runs cells together, and reports their progress."""
+    """A set of cells that run together, with their progress and results."""
 
     name: str
     text: str  # distinguishes batches with the same name
     cells: Sequence[matrix.Cell]
-    out: Path  # parent of the folders of results
+    out: Path  # folder that receives a subfolder with the result of each cell
     store: Store
     failures: Failures
-    overwrites: bool = False  # whether the contents of those folders are replaced
+    overwrites: bool = False  # whether the subfolders are replaced even if they contain the result already
     running: dict[str, CellRun] = field(default_factory=dict)
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     _keys: dict[str, str] = field(default_factory=dict)
@@ -92,23 +92,23 @@ class Batch:
         self._count, self._last_report = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
-        """Called once, before the first cell starts."""
+        """Do something before the first cell starts; called once."""
 
     def on_change(self, started: str | None) -> None:
-        """Called when a cell has started, with its name, or has ended, with None."""
+        """React to a change.  started: name of the cell that has started; None: a cell has ended."""
 
     def require_lock(self) -> None:
         """Raise OutputError if the folder now belongs to another process."""
 
     def run(self, execution: Execution, device: str | None) -> None:
-        """Run every cell whose result is not in the store; `failures` collects the failed ones.
+        """Run every cell whose result is not in the store, and record the failed cells in `failures`.
 
-        device: for the engine inline.  Raises Interrupted, BitsMismatch.
+        device: name of the only device to use; None: the devices of `execution`.  Raises Interrupted, BitsMismatch.
         """
         has_started = threading.Event()
         with stopping_on_signals(lambda: ask_to_stop(self._stop, has_started)), terminal.counts_on_terminal():
-            pending = self._pending_cells()
-            if not pending:
+            pending_cells = self._pending_cells()
+            if not pending_cells:
                 self.ready()
                 return
             with _engine(execution, self.store, device, self._is_stopped) as engine:
@@ -117,10 +117,10 @@ class Batch:
                     self.store, engine, execution.placement.bits == "same", options, self._stop.is_set
                 )
                 has_started.set()
-                self._dispatch(dispatcher, pending)
+                self._dispatch(dispatcher, pending_cells)
 
     def _report_progress(self) -> None:
-        """Report the progress of running cells from their files, at most once per interval."""
+        """Read the progress of running cells from their files, and report it, at most once per interval."""
         if time.monotonic() - self._last_report < PROGRESS_INTERVAL_S:
             return
         self._last_report = time.monotonic()
@@ -131,39 +131,39 @@ class Batch:
             if isinstance(step, int):
                 done += step
                 progress.append(f"{name} {step}/{self._steps[name]}")
-        named = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
-        self._count.label = f"steps ({named})" if progress else "steps"
+        names = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
+        self._count.label = f"steps ({names})" if progress else "steps"
         self._count.reach(min(done, self._count.total))
 
     def _is_stopped(self) -> bool:
-        """Return whether a signal has arrived, and report progress, as the engine inline calls this regularly."""
+        """Report progress, because the inline engine calls this regularly; return whether a signal has arrived."""
         self._report_progress()
         return self._stop.is_set()
 
     def _pending_cells(self) -> list[PendingCell]:
-        """Return the cells without an outcome; cells whose scenes cannot be read are recorded as failures."""
-        scenes, pending = Scenes(self.store.prepared), []
+        """Return the cells without an outcome.  If the scene of a cell cannot be read, record a failure instead."""
+        scenes, pending_cells = Scenes(self.store.prepared), []
         for cell in self.cells:
             if cell.name in self.outcomes:
                 continue
             with self.failures.recording(cell.name):
-                pending.append(pending_cell(cell, scenes, self.store))
-        return pending
+                pending_cells.append(pending_cell(cell, scenes, self.store))
+        return pending_cells
 
-    def _dispatch(self, dispatcher: Dispatcher, pending: Sequence[PendingCell]) -> None:
+    def _dispatch(self, dispatcher: Dispatcher, pending_cells: Sequence[PendingCell]) -> None:
         dispatcher.on_end, dispatcher.poll = self._note_end, self._report_progress
 
         def note_start(cell: CellRun) -> None:
             if dispatcher.is_same and not self._keys:  # so that `clsplat status` shows waiting cells
-                for waiting in pending:
-                    self._keys[waiting.cell.name] = waiting.in_class(cell.spec["bits"]).key
+                for pending in pending_cells:
+                    self._keys[pending.cell.name] = pending.in_class(cell.spec["bits"]).key
                     with suppress(ClsplatError):  # reported when that cell runs
-                        self.store.add(waiting.in_class(cell.spec["bits"]))
+                        self.store.add(pending.in_class(cell.spec["bits"]))
             self._note_start(cell)
 
         dispatcher.on_start = note_start
         self.ready()
-        dispatcher.run(pending)
+        dispatcher.run(pending_cells)
 
     def _note_start(self, cell: CellRun) -> None:
         if self._keys.get(cell.name) != cell.key or not self.running:
@@ -188,7 +188,7 @@ class Batch:
         self.on_change(None)
 
     def _copy(self, cell: CellRun) -> None:
-        """Copy a result to the folder with the cell's name, unless it is there already."""
+        """Copy the result of a cell to the folder with the cell's name, unless that folder has it already."""
         result, target = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.recording(cell.name):
             if self.overwrites or not has_result(result, target):
@@ -197,7 +197,7 @@ class Batch:
 
 
 def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
-    """Let running cells save their state and stop; before any has started, and at the second signal, stop at once."""
+    """Let running cells save their state and stop.  Before the first cell, and at the second signal, stop at once."""
     if stop.is_set() or not has_started.is_set():
         stop_at_once()
     stop.set()
@@ -205,14 +205,14 @@ def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
 
 @contextmanager
 def _engine(execution: Execution, store: Store, device: str | None, is_stopped: Callable[[], bool]) -> Iterator[Engine]:
-    names = None if execution.devices == "auto" else execution.devices
+    configured_names = None if execution.devices == "auto" else execution.devices
     if execution.engine == "inline":
-        chosen = [device] if device else names[:1] if names else [""]
-        engine: Engine = InlineEngine(store, find_slots("inline", chosen)[0], is_stopped)
+        device_names = [device] if device else configured_names[:1] if configured_names else [""]
+        engine: Engine = InlineEngine(store, find_slots("inline", device_names)[0], is_stopped)
     else:
         from clsplat.sweeps import dask  # Dask may not be installed
 
-        engine = dask.engine(execution, store, [device] if device else names)
+        engine = dask.engine(execution, store, [device] if device else configured_names)
     try:
         yield engine
     finally:
@@ -220,19 +220,19 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
 
 
 def pending_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
-    """Return the cell of a matrix, after running its `prepare` steps.
+    """Run the `prepare` steps of a cell, and return it as a cell that waits for a device.
 
     Raises ConfigError, DataError, and the errors of the steps.
     """
-    if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
-        prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
+    if planned_steps := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
+        prepare(planned_steps, cell.pipeline.settings.scene.folder, store.prepared)
     facts = scenes.facts(cell.pipeline)
-    without_class = CellRun.from_pipeline(cell.name, cell.pipeline, facts.digest, bits="")
-    return PendingCell(without_class, count_steps(cell.pipeline) * facts.pixels)
+    cell_run = CellRun.from_pipeline(cell.name, cell.pipeline, facts.digest, bits="")
+    return PendingCell(cell_run, count_steps(cell.pipeline) * facts.pixels)
 
 
 def count_steps(pipeline: Pipeline) -> int:
-    """Return the number of steps of all trainings of a pipeline."""
+    """Return the total number of training steps of a pipeline."""
     return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Training))
 
 
@@ -247,20 +247,21 @@ def run_one(
     device: str | None = None,
     retries: int = 3,
 ) -> Path:
-    """Run a cell of a matrix, or a pipeline as a cell, unless its result is in the store; return its folder.
+    """Run a cell of a matrix, or a pipeline as a cell, unless its result is in the store; return the result's folder.
 
-    index: index of the cell in the matrix, from 0.  Raises ClsplatError with the exit code of the run.
+    root: the folder of the store.  index: index of the cell in the matrix, from 0.  Raises ClsplatError with the exit
+    code of the run.
     """
     experiment = load_experiment(pipeline, overrides)
     if experiment is None:
         if index:
             raise ConfigError(f"{pipeline}: is a single pipeline without cell {index}; remove --index")
-        loaded = load(pipeline, list(overrides))
-        cells = [MatrixCell(loaded.settings.name, loaded)]
-        experiment = Experiment(loaded.path, loaded.settings.name, "", cells)
+        single_pipeline = load(pipeline, list(overrides))
+        cells = [MatrixCell(single_pipeline.settings.name, single_pipeline)]
+        experiment = Experiment(single_pipeline.path, single_pipeline.settings.name, "", cells)
     elif index is None or not 0 <= index < len(experiment.cells):
-        last = len(experiment.cells) - 1
-        raise ConfigError(f"{pipeline}: is a matrix; give the number of a cell, --index 0 to {last}")
+        last_index = len(experiment.cells) - 1
+        raise ConfigError(f"{pipeline}: is a matrix; give the number of a cell, --index 0 to {last_index}")
     matrix_cell = experiment.cells[index or 0]
     store, stop, has_started = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, has_started)):
@@ -291,8 +292,8 @@ def run_sweep(
 ) -> None:
     """Run every cell of a matrix whose result is not in the store, and write compare.html.
 
-    device: for the engine inline.  A failed cell does not stop the others; at the end a ClsplatError is raised with
-    the exit code of the first one.  Raises Interrupted, BitsMismatch.
+    device: name of the only device to use; None: the devices of `execution`.  A failed cell does not stop the others;
+    at the end, a ClsplatError is raised with the exit code of the first failure.  Raises Interrupted, BitsMismatch.
     """
     store = Store(execution.store_folder(state.out))
     with open_matrix(experiment, state, start) as (status, failures):
@@ -302,13 +303,13 @@ def run_sweep(
         )
         sweep.status = status
         for cell in experiment.cells if start == "resume" else ():
-            if RunState.read(state.out / cell.name).is_complete(cell.pipeline):  # here or elsewhere
+            if RunState.read(state.out / cell.name).is_complete(cell.pipeline):  # whichever machine ran it
                 sweep.outcomes[cell.name] = Outcome("published")
         sweep.run(execution, device)
 
 
 class _Sweep(Batch):
-    """A batch in the folder of a matrix, with its status."""
+    """The cells of a matrix, with a status file in the folder of the matrix."""
 
     status: StatusFile
 

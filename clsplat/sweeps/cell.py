@@ -1,4 +1,4 @@
-"""Identify cells, the runs of a sweep, by a hash of everything that determines their bits."""
+"""Identify cells, which are the runs of a sweep, by a hash of everything that determines their bits."""
 
 import hashlib
 import json
@@ -26,29 +26,29 @@ from clsplat.scene.view import NO_FILE
 
 # Fingerprints of the content of a scene, and of the program.
 
-HASH_DIGITS = 16  # hexadecimal
-# these decode photos, initialize Gaussians and compress models (OpenCV includes libwebp)
+HASH_DIGITS = 16  # number of hexadecimal digits
+# libraries that decode photos, initialize Gaussians, and compress models (OpenCV includes libwebp)
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "deflate")
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """A fingerprint of a scene, and its size."""
+    """The fingerprint and the size of a scene."""
 
     digest: str
-    pixels: float  # of all training images; determines the order of cells
+    pixels: float  # total number in all training images; determines the order of cells
 
 
 @cache
 def code_digest() -> str:
-    """Return a hash of the program: the package, its kernels, and the libraries that affect the bits."""
+    """Return a hash of the program: the package, its kernels, and the versions of libraries that affect the bits."""
     libraries = [*_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()]
     return _digest([__version__, *list_sources(), *libraries])
 
 
 @cache
 def tools_digest() -> str:
-    """Return a hash of the other libraries that affect the output of `prepare`."""
+    """Return a hash of the versions of further libraries that affect the output of `prepare`."""
     return _digest(_versions("pycolmap"))
 
 
@@ -59,7 +59,7 @@ def _versions(*names: str) -> Iterator[str]:
 
 
 def _builtin_zstd() -> str:
-    """Return the version of Python's built-in Zstandard (3.14 and later), or an empty string."""
+    """Return the version of Zstandard in Python's standard library (3.14 and later), or an empty string."""
     with suppress(ImportError):
         from compression import zstd
 
@@ -72,7 +72,7 @@ def _digest(parts: Iterable[str]) -> str:
 
 
 def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
-    """Read a scene, and hash its files with `digest_of`; photos are not decoded.  Raises DataError."""
+    """Read a scene, hash its files with `digest_of`, and return both; photos are not decoded.  Raises DataError."""
     scene, _ = settings.apply(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
     files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
@@ -80,18 +80,18 @@ def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple
 
 
 class Scenes:
-    """Fingerprints of scenes; each file is hashed once."""
+    """A cache of the fingerprints of scenes; each file is hashed only once."""
 
     def __init__(self, prepared: Path) -> None:
-        """prepared: the folder with the output of `prepare`."""
+        """prepared: the folder for the output of `prepare`."""
         self._prepared = prepared
         self._cache: dict[str, SceneFacts] = {}
         self._digest_of = cache(_digest_of)
 
     def facts(self, pipeline: Pipeline) -> SceneFacts:
-        """Return the facts of a pipeline's scene.
+        """Return the fingerprint and the size of a pipeline's scene.
 
-        The digest is the one that a run writes to inputs.json, or to prepared.json if `prepare` makes the scene.
+        The fingerprint is the digest that a run writes to inputs.json, or to prepared.json if it has `prepare` steps.
         Raises DataError if the scene cannot be read, and ConfigError if the pipeline has no scene.
         """
         settings = pipeline.settings
@@ -105,8 +105,8 @@ class Scenes:
         settings = pipeline.settings.scene
         if steps := pipeline.settings.prepare:
             return SceneFacts(plan(steps, settings.folder, self._prepared)[-1].key, 0.0)
-        original, identity = identify(settings, self._digest_of)
-        pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
+        scene, identity = identify(settings, self._digest_of)
+        pixels = sum(view.camera.width * view.camera.height for view in scene.split("train")) / settings.downscale**2
         return SceneFacts(identity.digest, float(pixels))
 
 
@@ -116,11 +116,11 @@ def _digest_of(path: Path) -> str:
     return ""
 
 
-KEY = 20  # hexadecimal digits of the hash that names a cell
+KEY = 20  # number of hexadecimal digits of a cell's key
 
 
 def is_key(value: Any) -> bool:
-    """Return whether a value, such as one in an untrusted store, can name the folder of a cell."""
+    """Return whether a value, for example from an untrusted store, has the format of a cell's key."""
     return isinstance(value, str) and re.fullmatch(f"[0-9a-f]{{{KEY}}}", value) is not None
 
 
@@ -128,26 +128,27 @@ def is_key(value: Any) -> bool:
 class CellRun:
     """A run of a sweep, with the text of its pipeline file on this machine."""
 
-    name: str  # in its sweep
-    spec: dict[str, Any]  # the hashed values of the key: pipeline, scene, code, bits
-    text: str  # the resolved pipeline, with absolute paths
+    name: str  # name in the sweep
+    spec: dict[str, Any]  # the values whose hash is the key: pipeline, scene, code, bits
+    text: str  # the resolved pipeline as YAML, with absolute paths
     files: dict[str, str] = field(default_factory=dict)  # hashes of the input files of the pipeline, by path
 
     @classmethod
     def from_pipeline(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "CellRun":
-        """Return the cell of a pipeline.  scene: the fingerprint of its scene; bits: the bits class of its device.
+        """Return the cell of a pipeline.
 
-        Raises DataError if an input file of the pipeline cannot be read.
+        scene: the fingerprint of its scene.  bits: the bits class of its device.  Raises DataError if an input file of
+        the pipeline cannot be read.
         """
-        absolute = with_absolute_paths(pipeline)
-        spec = {"pipeline": with_content_hashes(absolute), "scene": scene, "code": code_digest(), "bits": bits}
+        resolved_pipeline = with_absolute_paths(pipeline)
+        spec = {"pipeline": with_content_hashes(resolved_pipeline), "scene": scene, "code": code_digest(), "bits": bits}
         if pipeline.settings.prepare:
             spec["tools"] = tools_digest()
-        return cls(name, spec, absolute.text(), content_hashes(absolute))
+        return cls(name, spec, resolved_pipeline.text(), content_hashes(resolved_pipeline))
 
     @classmethod
     def from_json(cls, text: str) -> "CellRun":
-        """Return the cell from the text returned by `json`."""
+        """Return a cell from its JSON."""
         return cls(**json.loads(text))
 
     def json(self) -> str:
@@ -155,7 +156,7 @@ class CellRun:
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError if an input file on this machine differs from the file hashed for the key."""
+        """Raise DataError if an input file on this machine differs from the file that was hashed for the key."""
         for path, digest in self.files.items():
             if hash_content(Path(path)) != digest:
                 raise DataError(

@@ -1,4 +1,4 @@
-"""Run an attempt in a child process, which ends when its supervisor does."""
+"""Run an attempt in a child process that ends if its supervisor ends."""
 
 import os
 import subprocess
@@ -22,14 +22,14 @@ PROCESS_GROUP: dict[str, Any] = (
 )
 POLL = 0.25  # seconds between two checks of a process
 STOP_TIMEOUT_S = 90.0  # for the last step and its checkpoint, before the process is killed
-Command = Sequence[str]  # words; the placeholders are filled in on the machine that runs it
+Command = Sequence[str]  # arguments; the machine that runs it replaces the placeholders
 PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
 
 
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
-    """Return the command of a run on a device; the run ends when its standard input closes.
+    """Return the command that executes a run on a device.  The run ends when its standard input is closed.
 
-    -P keeps the working folder off the import path.
+    The option -P keeps the working folder out of the import path.
     """
     plugin_options = [word for path in plugins for word in ("--plugin", str(path))]
     device_options = ["--device", device] if device else []
@@ -50,7 +50,7 @@ def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
 
 
 def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
-    """Fill a pipeline file and a run folder into a command."""
+    """Replace the placeholders of a command with the interpreter, a pipeline file, and a run folder."""
     values = {PYTHON: sys.executable, FILE: str(pipeline), OUT: str(out)}
     return [values.get(word, word) for word in command]
 
@@ -58,8 +58,8 @@ def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
 def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], cores: Cores = ()) -> int:
     """Run an attempt to its end; return its exit code, or the negative number of the signal that ended it.
 
-    If `is_stopped`, the run saves its state and ends.  cores: to pin it to; empty: the cores of this process.
-    Raises LeaseLost.
+    is_stopped: returns whether the run has to save its state and end.  cores: the cores that the run is pinned to;
+    empty: the cores of this process.  Raises LeaseLost.
     """
     with raising_output_error(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
         process = subprocess.Popen(
@@ -85,7 +85,7 @@ def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], b
 
 
 def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: Callable[[], bool]) -> int:
-    stop_time: float | None = None  # when the run was asked to stop
+    stop_time: float | None = None  # time of the request to stop
     while True:
         try:
             return process.wait(POLL)
@@ -101,5 +101,5 @@ def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: 
 
 
 def plugin_files() -> list[Path]:
-    """Return the plug-in files that child processes have to load; installed plug-ins load automatically."""
+    """Return the plug-in files that child processes have to load; installed plug-ins are loaded automatically."""
     return [plugin.path for plugin in plugins.loaded_plugins() if not plugin.installed]

@@ -1,7 +1,7 @@
 """Run cells with Dask: on a cluster of this machine, or through a scheduler elsewhere.
 
-Dask provides membership, liveness, and a queue.  The store lets cells resume, counts each once, and stops them.  At
-most one cell per device is in flight, because a worker that dies loses all cells in its queue.
+Dask keeps track of workers and provides a queue.  The store makes it possible to resume and stop cells, and accepts one
+result per cell.  Each device has at most one cell at a time, because a worker that dies loses all cells in its queue.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ from clsplat.sweeps.engines import NO_DEVICE_TIMEOUT_S, CellLost, Ticket
 from clsplat.sweeps.store import Store
 from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 
-# Dask and its settings.  No other module imports it.
+# Dask and its settings.  No other module imports Dask.
 
 try:
     import dask
@@ -44,7 +44,7 @@ LOOPBACK = "127.0.0.1"
 SIDES = ("client", "worker", "scheduler")
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
-    "distributed.scheduler.worker-ttl": "60s",  # then a frozen worker is dropped, and its cell continues elsewhere
+    "distributed.scheduler.worker-ttl": "60s",  # after this, a frozen worker is dropped; its cell continues elsewhere
     "distributed.worker.preload": ["clsplat.sweeps.preload"],
     "distributed.worker.memory.target": False,  # these limits do not apply to the child process that runs the cell
     "distributed.worker.memory.spill": False,
@@ -55,7 +55,7 @@ SETTINGS = {
 
 
 def require_certificates(tls: Tls) -> None:
-    """Raise ConfigError if a file cannot be read, or key and certificate do not match; Dask would not name the file."""
+    """Raise ConfigError, which names the file, if a file cannot be read, or if key and certificate do not match."""
     for key in ("ca", "cert", "key"):
         try:
             read_file(Path(getattr(tls, key)))
@@ -67,7 +67,7 @@ def require_certificates(tls: Tls) -> None:
     except ssl.SSLError as error:
         raise ConfigError(f"tls.ca (--tls-ca): {tls.ca}: expected a certificate in PEM ({error.reason})") from error
     try:
-        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # without this, it asks in the terminal
+        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # else OpenSSL asks for it in the terminal
     except (ssl.SSLError, ValueError) as error:
         reason = getattr(error, "reason", None) or error
         raise ConfigError(
@@ -77,11 +77,11 @@ def require_certificates(tls: Tls) -> None:
 
 
 def security(tls: Tls | None) -> Any:
-    """Return certificates for distributed, or None.  Raises ConfigError."""
+    """Return the `distributed.Security` with the certificates of `tls`; None without TLS.  Raises ConfigError."""
     if tls is None:
         return None
     require_certificates(tls)
-    sides = {f"tls_{side}_{part}": getattr(tls, part) for side in SIDES for part in ("cert", "key")}
+    sides = {f"tls_{side}_{item}": getattr(tls, item) for side in SIDES for item in ("cert", "key")}
     return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
 
 
@@ -92,7 +92,7 @@ def warn_of_open_port(execution: Execution) -> None:
 
 
 def scheduler_error(execution: Execution, error: BaseException) -> DeviceError:
-    """Return the error for an unreachable scheduler."""
+    """Return the error for an unreachable scheduler, with the reason and a remedy."""
     reason = one_line(error.__cause__ or error) or "no answer"
     remedy = "start it with `dask scheduler`"
     if execution.tls:
@@ -101,19 +101,19 @@ def scheduler_error(execution: Execution, error: BaseException) -> DeviceError:
 
 
 LOG = logging.getLogger("clsplat")
-WORKERS_INTERVAL_S = 5.0  # between two checks of the workers
-CONNECT_TIMEOUT_S = 20.0  # for connecting to a scheduler
+WORKERS_INTERVAL_S = 5.0  # time between two checks of the workers
+CONNECT_TIMEOUT_S = 20.0  # maximum time for connecting to a scheduler
 
 
 def work(cell: str, store: str, command: list[str], options: str) -> str:
-    """Run a cell on a worker; arguments and result are text."""
+    """Run a cell on a worker; return its `Outcome` as JSON.  cell, options: as JSON."""
     outcome = run_cell(CellRun.from_json(cell), Store(Path(store)), command, CellOptions(**json.loads(options)))
     return json.dumps(asdict(outcome))
 
 
 def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
-    """Return the engine that `execution` selects.  Raises DeviceError if there are no devices."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # workers start with -P: they import nothing from the working folder
+    """Return the engine for `execution`.  Raises DeviceError if there are no devices."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # like -P, so that workers import nothing from the working folder
     with ExitStack() as settings:
         settings.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
         cluster = _engine(execution, store, devices)
@@ -147,7 +147,7 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
 class _Future:
     def __init__(self, cluster: "Cluster", future: Any, address: str | None) -> None:
         self._cluster, self.future, self._address = cluster, future, address
-        self.is_over = False  # a released future has no state
+        self.is_over = False  # recorded here, because a released future has no state
 
     def outcome(self) -> Outcome | None:
         state = self.future.status
@@ -173,9 +173,10 @@ class Cluster:
     def __init__(
         self, client: Any, store: Store, cluster: Any = None, local_slots: list[DeviceSlot] | None = None
     ) -> None:
-        """cluster: starts and restarts local workers.  local_slots: their devices; any worker can use any device.
+        """client: the Dask client.  cluster: starts and restarts local workers.  local_slots: the local devices.
 
-        With a remote scheduler both are None, and each worker has a device.
+        Any local worker can use any local device.  With a remote scheduler, `cluster` and `local_slots` are None, and
+        each worker has one device.
         """
         self._client, self._store, self._cluster, self._local_slots = client, store, cluster, local_slots
         self._sweep = uuid.uuid4().hex
@@ -183,13 +184,13 @@ class Cluster:
         self._slots: list[DeviceSlot] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
-        self.settings = ExitStack()  # of Dask, restored when the cluster closes
+        self.settings = ExitStack()  # Dask settings, restored when the cluster is closed
         self.make_command = lambda device: run_command(device, plugin_files())
 
     def slots(self) -> list[DeviceSlot]:
-        """Return the devices with a live worker.
+        """Return the devices of live workers.
 
-        Raises DeviceError if the scheduler has ended, or there was no worker of this version for a minute.
+        Raises DeviceError if the scheduler has ended, or if there has been no worker of this version for a minute.
         """
         now = time.monotonic()
         if now - self._last_check >= WORKERS_INTERVAL_S or (not self._slots and now - self._last_check >= 0.5):
@@ -203,8 +204,8 @@ class Cluster:
         self.addresses = set(workers)
         if self._cluster and len(workers) < (count := len(self._local_slots or ())):
             self._cluster.scale(count)  # Dask does not restart a worker that dies while it starts
-        remote = [slot for address, worker in workers.items() if (slot := slot_from_worker(address, worker))]
-        self._slots = remote if self._local_slots is None else self._local_slots if workers else []
+        remote_slots = [slot for address, worker in workers.items() if (slot := slot_from_worker(address, worker))]
+        self._slots = remote_slots if self._local_slots is None else self._local_slots if workers else []
         if self._slots:
             self._last_worker = now
         elif now - self._last_worker > NO_DEVICE_TIMEOUT_S:
@@ -226,7 +227,7 @@ class Cluster:
 
     def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
         slot_options = replace(options, worker=slot.worker, sweep=self._sweep, cores=slot.cores)
-        address = slot.worker if self._local_slots is None else None
+        worker_address = slot.worker if self._local_slots is None else None
         with self._requires_scheduler():
             future = self._client.submit(
                 work,
@@ -235,19 +236,19 @@ class Cluster:
                 list(self.make_command(slot.device)),
                 json.dumps(asdict(slot_options)),
                 key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
-                workers=[address] if address else None,
+                workers=[worker_address] if worker_address else None,
                 pure=False,
             )
-        ticket = _Future(self, future, address)
-        self._tickets = [*(pending for pending in self._tickets if not pending.is_over), ticket]
+        ticket = _Future(self, future, worker_address)
+        self._tickets = [*(old_ticket for old_ticket in self._tickets if not old_ticket.is_over), ticket]
         return ticket
 
     def close(self) -> None:
-        """Let running cells save their state and end, then close the local workers."""
+        """Let running cells save their state and end; then close the client and the local workers."""
         if self._pending:
             self._store.stop(self._sweep)
-        end = time.monotonic() + STOP_TIMEOUT_S
-        while self._pending and time.monotonic() < end:
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        while self._pending and time.monotonic() < deadline:
             time.sleep(0.1)
         if self._pending:
             LOG.warning("some cells did not end in %.0f s", STOP_TIMEOUT_S)
@@ -265,10 +266,10 @@ class Cluster:
 
 
 def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
-    """Test each device with a short run, and work for a scheduler until it ends or a signal arrives (`clsplat worker`).
+    """Test each device with a short run, and run cells of a scheduler until it ends or a signal arrives.
 
-    execution: the engine names the scheduler.  devices: names; default: all working devices.  Raises DeviceError if
-    there is no device, or the scheduler does not respond.
+    This is `clsplat worker`.  execution: has the address of the scheduler.  devices: names of devices; default: all
+    working devices.  Raises DeviceError if there is no device, or if the scheduler does not respond.
     """
     if execution.tls:
         require_certificates(execution.tls)  # before the devices are tested, which takes a while
@@ -284,7 +285,7 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
 
 
 def _constant_metric(text: str, worker: object) -> str:
-    """Return the description of a worker's device, as a Dask metric."""
+    """Return `text`, the description of a worker's device; Dask calls this as the function of a metric."""
     return text
 
 

@@ -1,7 +1,7 @@
 """Find devices and their bits classes: a class is the hash of the result of a fixed run.
 
-Names of devices are not enough: different runtimes may give the same bits, and one runtime may give different bits on
-another processor.  Devices of one class can continue each other's cells.
+The name of a device is not enough, because different runtimes may compute the same bits, and the same runtime may
+compute different bits on another processor.  Devices of the same class can continue each other's cells.
 """
 
 import json
@@ -27,28 +27,28 @@ from clsplat.pipeline.files import shipped_pipelines
 from clsplat.sweeps.cell import code_digest
 
 LOG = logging.getLogger("clsplat")
-Parts = list[tuple[int, ...]]  # the cores of each run; (): all cores, not pinned
+Parts = list[tuple[int, ...]]  # for each run, the cores that it is pinned to; (): all cores
 
 
 def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
-    """Return the cores of the runs of each device: `packing` runs on a CPU, one on other devices.
+    """Return, for each device, the cores of each of its runs.
 
-    Raises ConfigError if there are more runs than cores.
+    packing: number of runs on a CPU; other devices have one run.  Raises ConfigError if there are more runs than cores.
     """
     cores = machine.usable_cores()
     if packing > len(cores):
         raise ConfigError(
             f"execution.packing: {packing} runs cannot share {pluralize(len(cores), 'core')}; set at most {len(cores)}"
         )
-    parts: Parts = machine.split_cores(cores, packing) if packing > 1 else [()]
-    return [parts if info.kind == "CPU" else [()] for info in devices]
+    core_sets: Parts = machine.split_cores(cores, packing) if packing > 1 else [()]
+    return [core_sets if info.kind == "CPU" else [()] for info in devices]
 
 
-METRIC_KEY = "clsplat"  # of the Dask metric in which a worker describes its device
-CLASS_DIGITS = 8  # hexadecimal digits of a bits class
-RUN_TIMEOUT_S = 600.0  # for the fixed run; some runtimes take minutes to build kernels
+METRIC_KEY = "clsplat"  # name of the Dask metric in which a worker describes its device
+CLASS_DIGITS = 8  # number of hexadecimal digits of a bits class
+RUN_TIMEOUT_S = 600.0  # maximum time of the fixed run; some runtimes need minutes to build kernels
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
-PIPELINE = "smoke"  # has growth and opacity resets; the settings add all SH bands and both filters
+PIPELINE = "smoke"  # includes growth and opacity resets; SETTINGS add all SH bands and both filters
 SETTINGS = (
     "model.sh_degree=3",
     "model.world_filter={type: smoothing, variance: 0.2}",
@@ -60,16 +60,16 @@ SETTINGS = (
 class DeviceSlot:
     """A device, or a part of a CPU, that runs one cell at a time."""
 
-    worker: str  # name or address of its worker
+    worker: str  # name or address of the worker
     device: str  # a value for `--device`
     bits: str  # bits class
-    text: str = ""  # description
-    cores: tuple[int, ...] = ()  # if several runs share a CPU; (): all cores
-    memory: int = sys.maxsize  # available to a run, bytes
+    text: str = ""  # description of the device
+    cores: tuple[int, ...] = ()  # cores of the part, if several runs share a CPU; (): all cores
+    memory: int = sys.maxsize  # memory available to a run, bytes
 
 
 def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
-    """Return the device that a Dask worker describes, or None for a worker of another program or version."""
+    """Return the device that a Dask worker describes; None if the worker is of another program or version."""
     try:
         values = json.loads(str(worker["metrics"][METRIC_KEY]))
         if values["code"] != code_digest():
@@ -83,32 +83,32 @@ def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
 def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
     """Return slots for the working devices of this machine, or for named devices, with their bits classes.
 
-    packing: number of runs that share a CPU; each gets a slot.
-    Raises DeviceError if no device works, or a named one does not, and ConfigError for more runs than cores.
+    packing: number of runs that share a CPU; each has a slot.
+    Raises DeviceError if no device or a named device does not work, and ConfigError if there are more runs than cores.
     """
     infos = list_devices()
     chosen = [choose(name) for name in devices] if devices is not None else [info for info in infos if not info.fault()]
     if not chosen:
         raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []
-    for info, parts in zip(chosen, split_device_cores(chosen, packing), strict=True):
-        bits, memory = bits_class(info, infos), info.memory // len(parts)
+    for info, core_sets in zip(chosen, split_device_cores(chosen, packing), strict=True):
+        bits, memory = bits_class(info, infos), info.memory // len(core_sets)
         slot = DeviceSlot(worker, device_query(info, infos), bits, info.text, memory=memory)
-        slots += [replace(slot, cores=part) for part in parts]
+        slots += [replace(slot, cores=cores) for cores in core_sets]
     return slots
 
 
 def device_query(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
     """Return a value for `--device` that matches only this device."""
-    words = f"{info.platform} {info.name} {info.kind}"
-    matches = [other.index for other in infos if other.matches(words)]
-    return f"{words}:{matches.index(info.index)}"
+    query = f"{info.platform} {info.name} {info.kind}"
+    matches = [other.index for other in infos if other.matches(query)]
+    return f"{query}:{matches.index(info.index)}"
 
 
 def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the bits class of a device; the result is cached by device, driver, and program version.
+    """Return the bits class of a device, which is cached by device, driver, and program version.
 
-    Raises DeviceError if the run fails.
+    Raises DeviceError if the fixed run fails.
     """
     key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped_pipelines()[PIPELINE])
     cache_file = cache_folder() / "bits" / f"{key[:16]}.json"
@@ -124,19 +124,19 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
 
 def _hash_fixed_run(device: str) -> str:
-    with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
-        scene, out = Path(name, "scene"), Path(name, "run")
+    with tempfile.TemporaryDirectory(prefix="clsplat-") as temp_folder:
+        scene, out = Path(temp_folder, "scene"), Path(temp_folder, "run")
         settings = [word for setting in SETTINGS for word in ("--set", setting)]
         _run_command(device, "data", "synthetic", str(scene), *SCENE_OPTIONS)
-        run = "run", str(shipped_pipelines()[PIPELINE])
-        words = (*run, "--scene", str(scene), "--out", str(out), "--device", device)
-        _run_command(device, *words, *settings)
+        command = "run", str(shipped_pipelines()[PIPELINE])
+        arguments = (*command, "--scene", str(scene), "--out", str(out), "--device", device)
+        _run_command(device, *arguments, *settings)
         return sha256(out / "point_cloud.ply")[:CLASS_DIGITS]
 
 
-def _run_command(device: str, *words: str) -> None:
-    """Run a command of the test.  Raises DeviceError if it fails."""
-    result = run_module("clsplat", *words, seconds=RUN_TIMEOUT_S)
+def _run_command(device: str, *arguments: str) -> None:
+    """Run a `clsplat` command of the fixed run.  Raises DeviceError if it fails."""
+    result = run_module("clsplat", *arguments, seconds=RUN_TIMEOUT_S)
     if result.code is None:
         raise DeviceError(f"{device}: the test run did not end within {RUN_TIMEOUT_S:.0f} s")
     if result.code:

@@ -1,4 +1,4 @@
-"""Assign the cells of a sweep to the devices of an engine: longest cells first, one per device, in one bits class."""
+"""Assign the cells of a sweep to the devices of an engine: the longest cells first, and one cell per device."""
 
 import logging
 import time
@@ -19,24 +19,24 @@ class Ticket(Protocol):
     """A cell that is running on an engine."""
 
     def outcome(self) -> Outcome | None:
-        """Return how the cell ended, or None while it runs.  Raises CellLost if its process is gone."""
+        """Return how the cell ended, or None while it runs.  Raises CellLost if its process no longer exists."""
 
 
 class CellLost(Exception):
-    """The process that ran a cell is gone; the cell continues from its checkpoint elsewhere."""
+    """The process of a cell no longer exists; the cell continues from its checkpoint in another process."""
 
 
 class Engine(Protocol):
-    """Provides devices, and runs cells on them."""
+    """A provider of devices that runs cells on them."""
 
     def slots(self) -> list[DeviceSlot]:
-        """Return the devices that are available now.  Raises ClsplatError if there will be none."""
+        """Return the devices that are available now.  Raises ClsplatError if none can become available."""
 
     def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
         """Start a cell on a free device."""
 
     def close(self) -> None:
-        """End all running cells."""
+        """Stop all running cells, and release the devices."""
 
 
 class _FinishedTicket:
@@ -48,7 +48,7 @@ class _FinishedTicket:
 
 
 class InlineEngine:
-    """Runs one cell at a time, as a child of this process."""
+    """An engine that runs one cell at a time, in a child process."""
 
     def __init__(self, store: Store, slot: DeviceSlot, is_stopped: Callable[[], bool]) -> None:
         self._store, self._slot, self._is_stopped = store, slot, is_stopped
@@ -65,8 +65,8 @@ class InlineEngine:
 
 
 LOG = logging.getLogger("clsplat")
-POLL_INTERVAL_S = 0.05  # between two checks of running cells
-NO_DEVICE_TIMEOUT_S = 60.0  # a sweep ends after this time without a suitable device
+POLL_INTERVAL_S = 0.05  # time between two checks of running cells
+NO_DEVICE_TIMEOUT_S = 60.0  # a sweep fails after this time without a suitable device
 
 
 @dataclass(frozen=True)
@@ -75,16 +75,16 @@ class PendingCell:
 
     cell: CellRun  # without a bits class
     cost: float  # steps times pixels; determines the order of cells
-    too_small: int = 0  # memory of the largest device that was too small, bytes
+    too_small: int = 0  # memory of the largest device whose memory was insufficient, bytes
 
     def in_class(self, bits: str) -> CellRun:
-        """Return the cell in a bits class."""
+        """Return the cell with a bits class."""
         return replace(self.cell, spec={**self.cell.spec, "bits": bits})
 
 
 @dataclass
 class Dispatcher:
-    """Assigns cells to devices until all have ended."""
+    """A loop that assigns cells to devices until all cells have ended."""
 
     store: Store
     engine: Engine
@@ -94,52 +94,52 @@ class Dispatcher:
     on_start: Callable[[CellRun], None] = lambda cell: None
     on_end: Callable[[CellRun, Outcome], None] = lambda cell, outcome: None
     poll: Callable[[], None] = lambda: None  # called regularly
-    bits: str | None = None  # bits class of all cells, once chosen
+    bits: str | None = None  # chosen bits class of all cells; None: not chosen yet, or `is_same` is False
     _last_available: float = field(default_factory=time.monotonic)  # when a device of that class was last available
     _unsuitable: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
-    """All devices, and those on which no waiting cell can run."""
+    """All devices, and the devices on which no pending cell can run."""
     _running: dict[DeviceSlot, tuple[PendingCell, CellRun, Ticket]] = field(default_factory=dict)
 
     def run(self, cells: Sequence[PendingCell]) -> None:
         """Run all cells, and call `on_end` for each.
 
-        Raises BitsMismatch if two runs of a cell differ, Interrupted, and the errors of the engine; `close` of the
-        engine then ends the running cells.
+        Raises BitsMismatch if two runs of a cell differ, Interrupted, and the errors of the engine.  After an error,
+        the caller has to close the engine, which stops the running cells.
         """
-        waiting = sorted(cells, key=lambda pending: -pending.cost)
-        while waiting or self._running:
+        pending_cells = sorted(cells, key=lambda pending: -pending.cost)
+        while pending_cells or self._running:
             if self.is_stopped():
                 raise Interrupted("stopped; continue with the same command and --resume")
-            self._assign(waiting)
+            self._assign(pending_cells)
             count = len(self._running)
             for slot in list(self._running):
-                self._collect(slot, waiting)
+                self._collect(slot, pending_cells)
             self.poll()
-            if (self._running and len(self._running) == count) or (waiting and not self._running):
+            if (self._running and len(self._running) == count) or (pending_cells and not self._running):
                 time.sleep(POLL_INTERVAL_S)
 
-    def _assign(self, waiting: list[PendingCell]) -> None:
+    def _assign(self, pending_cells: list[PendingCell]) -> None:
         slots = sorted(self.engine.slots(), key=lambda slot: -slot.memory)  # the longest cell gets the largest device
         classes = [slot.bits for slot in slots]
         if self.is_same and self.bits is None and classes:
-            self.bits = self._choose_class(classes, waiting)
+            self.bits = self._choose_class(classes, pending_cells)
         self._require_class(classes)
         if self._unsuitable[0] != slots:
             self._unsuitable = (slots, set())
         for slot in slots:
             if slot in self._running or slot in self._unsuitable[1]:
                 continue
-            index = next((i for i, pending in enumerate(waiting) if self._fits(pending, slot, slots)), None)
+            index = next((i for i, pending in enumerate(pending_cells) if self._fits(pending, slot, slots)), None)
             if index is None:
-                self._unsuitable[1].add(slot)  # each check reads the store, so do not repeat it
+                self._unsuitable[1].add(slot)  # because each check reads the store
                 continue
-            pending = waiting.pop(index)
+            pending = pending_cells.pop(index)
             cell = pending.in_class(slot.bits)
             self.on_start(cell)
             self._running[slot] = (pending, cell, self.engine.start(cell, slot, self.options))
 
     def _choose_class(self, classes: Sequence[str], cells: Sequence[PendingCell]) -> str:
-        """Return the class with the most devices; in a tie, the one with the most published cells, then by name."""
+        """Return the class with the most devices.  Break ties by the number of published cells, then by name."""
         counts = Counter(classes)
         candidates = sorted(bits for bits in counts if counts[bits] == max(counts.values()))
         return max(
@@ -160,42 +160,45 @@ class Dispatcher:
             )
 
     def _fits(self, pending: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
-        """Return whether a cell may run on a device: in its class, and larger than devices that were too small."""
+        """Return whether a cell may run on a device.
+
+        The device must be in its bits class, and if possible larger than devices whose memory was insufficient.
+        """
         allowed = self._allowed_slots(pending, slots)
         return slot in ([other for other in allowed if other.memory > pending.too_small] or allowed)
 
     def _allowed_slots(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
-        """Return the devices on which a cell may run; a started cell stays in its class while devices are available."""
+        """Return the devices on which a cell may run.  A started cell stays in its class while it has devices."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
         classes = {slot.bits for slot in slots if not pending.too_small}
-        started = [bits for bits in classes if self.store.folder(pending.in_class(bits).key).path.is_dir()]
-        return [slot for slot in slots if not started or slot.bits in started]
+        started_classes = [bits for bits in classes if self.store.folder(pending.in_class(bits).key).path.is_dir()]
+        return [slot for slot in slots if not started_classes or slot.bits in started_classes]
 
-    def _collect(self, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
+    def _collect(self, slot: DeviceSlot, pending_cells: list[PendingCell]) -> None:
         pending, cell, ticket = self._running[slot]
         try:
             outcome = ticket.outcome()
         except CellLost:
             self.store.log_event("lost", cell=cell.key, worker=slot.worker)
-            self._requeue(pending, slot, waiting)
+            self._requeue(pending, slot, pending_cells)
             return
         if outcome is None:
             return
         if outcome.state == "different":
             raise BitsMismatch(outcome.message)
-        larger = replace(pending, too_small=slot.memory)
+        retry = replace(pending, too_small=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
-            other.memory > slot.memory for other in self._allowed_slots(larger, self.engine.slots())
+            other.memory > slot.memory for other in self._allowed_slots(retry, self.engine.slots())
         ):
             LOG.warning("cell %s: %s; trying a larger device", cell.name, outcome.message)
-            self._requeue(larger, slot, waiting)
+            self._requeue(retry, slot, pending_cells)
             return
         del self._running[slot]
         self.on_end(cell, outcome)
 
-    def _requeue(self, pending: PendingCell, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
-        """Return a cell to the queue, and free its device."""
+    def _requeue(self, pending: PendingCell, slot: DeviceSlot, pending_cells: list[PendingCell]) -> None:
+        """Put a cell back at the front of the queue, and free its device."""
         del self._running[slot]
-        waiting.insert(0, pending)
+        pending_cells.insert(0, pending)
         self._unsuitable[1].clear()

@@ -56,7 +56,8 @@ def run_pipeline(
 ) -> None:
     """Run a pipeline in its folder, with a log and a progress bar.
 
-    state: the folder before the run.  minutes: as for `Job.run`.  Raises ClsplatError; status.json holds the reason.
+    state: the state of the folder before the run.  minutes: as for `Job.run`.  Raises ClsplatError, and writes it to
+    status.json.
     """
     outputs.check_output_paths(pipeline, state)
     out = state.out
@@ -91,15 +92,15 @@ MAX_MINUTES = 525_600  # a year
 
 @dataclass(frozen=True)
 class Job:
-    """A checked pipeline or matrix, and the folder it runs in."""
+    """A checked pipeline or matrix, and the folder in which it runs."""
 
     work: Pipeline | Experiment
-    state: RunState  # the folder before the run
+    state: RunState  # state of the folder before the run
     start: Start
 
     @property
     def out(self) -> Path:
-        """The folder it runs in."""
+        """The folder in which the job runs."""
         return self.state.out
 
     @classmethod
@@ -112,15 +113,16 @@ class Job:
         start: Start = "new",
         execution: dict[str, Any] | None = None,
     ) -> "Job":
-        """Check a pipeline file, or a shipped pipeline by name.  Raises ConfigError.
+        """Check a pipeline file, or a shipped pipeline given by its name.  Raises ConfigError.
 
-        out: default runs/NAME, with a number appended if that folder holds another run.  overrides:
-        'stage.key=value'.  start: "resume" continues from the newest checkpoint, "restart" runs from the first step
-        in a folder that holds a run.  execution: replaces the `execution` of a matrix.
+        out: the run folder; default: runs/NAME, with a number appended if that folder has another run.
+        overrides: settings in the form 'stage.key=value'.
+        start: "resume" continues from the newest checkpoint; "restart" replaces the run in the folder by a new one.
+        execution: replaces the `execution` of a matrix.
         """
         state = None
         if out is not None:
-            path_exists(out)  # raises if no file can have that name
+            path_exists(out)  # raises an error if the name is invalid
             state = RunState.read(out)
         return cls._open(pipeline, state, scene, overrides, start, execution)
 
@@ -162,7 +164,7 @@ class Job:
     ) -> "Job":
         """Open the run in a folder to continue it.  Raises ConfigError or DataError.
 
-        scene: the new folder of the photos, if they were moved.  execution: as for `open`.  steps: the new number of
+        scene: the new folder of the photos, if they have moved.  execution: as for `open`.  steps: the new number of
         training steps.
         """
         state = RunState.read(out)
@@ -177,7 +179,7 @@ class Job:
         return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
-        """Return what would run, as lines of text; for a single run, with a rough estimate of the time.
+        """Describe what would run, as lines of text; for a single run, include a rough time estimate.
 
         Raises the errors that `run` raises before it starts.
         """
@@ -186,11 +188,11 @@ class Job:
         return describe.describe(self.work, self.state, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
-        """Run the pipeline or matrix; finished outputs that are up to date are kept.
+        """Run the pipeline or matrix.  Nothing runs again if its outputs are complete and up to date.
 
-        live: the port of a live preview, 0 for any free one; None: no preview.  minutes: a time budget that starts
-        when the photos are read; the number of steps is chosen to fit it.
-        Raises ClsplatError; status.json holds the reason.
+        live: the port of a live preview; 0: any free port; None: no preview.
+        minutes: a time budget, which starts when the photos have been read and determines the number of steps.
+        Raises ClsplatError, and writes the reason to status.json.
         """
         if minutes is not None and not 0 < minutes <= MAX_MINUTES:
             raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0, up to {MAX_MINUTES:,}")
@@ -215,7 +217,7 @@ class Job:
 
 
 def _require_same_photos(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError if the photos changed after the run; prepared photos are not checked."""
+    """Raise ConfigError if the photos have changed since the run; photos with `prepare` steps are not checked."""
     scene = pipeline.settings.scene
     if not pipeline.settings.prepare and scene.folder.exists():
         _, identity = identify(scene, sha256)
@@ -224,7 +226,7 @@ def _require_same_photos(pipeline: Pipeline, out: Path) -> None:
 
 @contextmanager
 def live_preview(port: int | None) -> Iterator[Live | None]:
-    """Serve a live preview during the block and print its address; without a port, yield None.  Raises ConfigError."""
+    """Serve a live preview during the block, and print its address; without a port, yield None.  Raises ConfigError."""
     if port is None:
         yield None
         return
@@ -236,23 +238,23 @@ def live_preview(port: int | None) -> Iterator[Live | None]:
 def run_matrix(
     experiment: Experiment, state: RunState, device: str | Device | None, start: Start, live: Live | None = None
 ) -> None:
-    """Run every cell in its folder and write compare.html; a resumed matrix skips finished cells.
+    """Run every cell in its folder, and write compare.html.  A resumed matrix skips finished cells.
 
-    state: the folder before the run.
-    A failed cell does not stop the others; at the end a ClsplatError is raised with the exit code of the first failure.
-    Interrupted stops the whole matrix.
+    state: the state of the matrix folder before the run.
+    A failed cell does not stop the others.  At the end, a ClsplatError is raised with the exit code of the first
+    failure.  Interrupted stops the entire matrix.
     """
     out = state.out
-    states, done = read_cells(experiment, out, start)
+    states, done_names = read_cells(experiment, out, start)
     with open_matrix(experiment, state, start) as (status, failures):
         status.enter("running")
         for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
             title = f"cell {number} of {len(experiment.cells)}: {cell.name}"
             status.note(stage=cell.name)
-            LOG.info("%s is done" if cell.name in done else "%s", title)
+            LOG.info("%s is done" if cell.name in done_names else "%s", title)
             try:
                 with failures.recording(cell.name):
-                    if cell.name not in done:
+                    if cell.name not in done_names:
                         run_pipeline(cell.pipeline, states[cell.name], device, start, live)
             except Interrupted as error:
                 raise Interrupted(f"stopped in {title}; `clsplat resume {shell_quote(out)}` continues it") from error
@@ -279,19 +281,19 @@ def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterat
 
 
 def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[str, RunState], set[str]]:
-    """Return the state of each cell's folder, by name, and the names of the cells that a resumed matrix skips.
+    """Return the state of each cell's folder, by cell name, and the names of the cells that a resumed matrix skips.
 
-    Raises ConfigError if a cell was run with other settings.
+    Raises ConfigError if the run of a finished cell had other settings.
     """
     states = {cell.name: RunState.read(out / cell.name) for cell in experiment.cells}
-    resumed = experiment.cells if start == "resume" else []
-    for cell in resumed:
+    resumed_cells = experiment.cells if start == "resume" else []
+    for cell in resumed_cells:
         states[cell.name].require_same(cell.pipeline)
-    return states, {cell.name for cell in resumed if states[cell.name].is_complete(cell.pipeline)}
+    return states, {cell.name for cell in resumed_cells if states[cell.name].is_complete(cell.pipeline)}
 
 
 def check_matrix_folder(state: RunState) -> None:
-    """Raise ConfigError if the folder holds a single run, or unrelated files with the names that a matrix writes."""
+    """Raise ConfigError if the folder has a single run, or other files with names that a matrix would write."""
     outputs.check_names(state, MATRIX_FILES)
     outputs.require_inside(state.out, [state.out / PREPARED, state.out / UNDISTORTED])  # cells share them
     out = state.out
@@ -300,18 +302,18 @@ def check_matrix_folder(state: RunState) -> None:
 
 
 def describe_matrix(experiment: Experiment, state: RunState, device: str | Device | None, start: Start) -> str:
-    """Return a description of what would run, one line per cell.
+    """Describe what would run, one line per cell.
 
     Raises a ClsplatError with the exit code of the first cell that could not run.
     """
     check_matrix_folder(state)
     run_folder.check_run_folder(state, start)
     describe.check_unused(state.out)
-    cells, done = read_cells(experiment, state.out, start)
+    cells, done_names = read_cells(experiment, state.out, start)
     lines, refusals = [], Failures("cells")
     read = cache(read_run_scene)  # read each distinct scene once
     for cell in experiment.cells:
-        progress = "done" if cell.name in done else "unfinished" if (state.out / cell.name).exists() else ""
+        progress = "done" if cell.name in done_names else "unfinished" if (state.out / cell.name).exists() else ""
         try:
             if progress != "done":
                 describe.describe(cell.pipeline, cells[cell.name], device, start, read)
@@ -324,9 +326,9 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
 
 
 def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:
-    """Write the page that compares the finished cells.  Raises the errors of `write_comparison`."""
-    finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
+    """Write compare.html, which compares the finished cells.  Raises the errors of `write_comparison`."""
+    finished_folders = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
-    if finished:
-        write_comparison(finished, out / COMPARISON, experiment.name, remarks)
-        LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
+    if finished_folders:
+        write_comparison(finished_folders, out / COMPARISON, experiment.name, remarks)
+        LOG.info("%d runs compared in %s", len(finished_folders), out / COMPARISON)

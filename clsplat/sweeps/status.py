@@ -1,4 +1,4 @@
-"""Report the state of a store from its files."""
+"""Report the state of a store, from the files in it."""
 
 import time
 from contextlib import suppress
@@ -21,10 +21,11 @@ def is_store(folder: Path) -> bool:
 
 
 def store_status(root: Path) -> dict[str, Any]:
-    """Return the `cells` of a store with their states, `counts` of states, `events` by kind, and the current `time`.
+    """Return the `cells` of a store with their states, the number of cells in each state, and further totals.
 
-    A cell is published, failed, running, silent (no heartbeat for a minute), stopped, or waiting.
-    Raises DataError if the folder is not a store.
+    A cell is published, failed, running, silent (no heartbeat for a minute), stopped, or waiting.  Other keys: `store`,
+    `time` (now), `counts` (cells by state), and `events` (their number by kind).  Raises DataError if the folder is no
+    store.
     """
     store = Store.open(root)
     now = time.time()
@@ -41,48 +42,48 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
-    """Return the state of a cell.  names: the name of the sweep, and the name of the cell in it."""
+    """Return the state of a cell.  names: the name of its sweep, and its name in that sweep."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
     spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
     pipeline = spec["pipeline"]
-    facts = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
-    facts |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
+    common = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
+    common |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
-        values = {key: manifest.get(key) for key in ("device", "host", "worker")}
-        values["seconds"] = finite_number(manifest.get("seconds"))
-        return {**facts, "state": "published", **values, **_figures(folder)}
+        result = {key: manifest.get(key) for key in ("device", "host", "worker")}
+        result["seconds"] = finite_number(manifest.get("seconds"))
+        return {**common, "state": "published", **result, **_result_metrics(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
-    alive = [item for item in attempts if item.exit_code is None and now - item.last_beat < NO_BEAT_S]
-    if (failed := folder.failure()) and not alive:
-        return {**facts, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
-    last = (alive or attempts)[-1:]
-    return {**facts, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
+    live_attempts = [item for item in attempts if item.exit_code is None and now - item.last_beat < NO_BEAT_S]
+    if (failure := folder.failure()) and not live_attempts:
+        return {**common, "state": "failed", "message": failure.get("message"), "exit_code": failure.get("exit_code")}
+    latest = (live_attempts or attempts)[-1:]
+    return {**common, "attempts": len(attempts), **(_attempt(latest[0], now) if latest else {"state": "waiting"})}
 
 
 def _steps(pipeline: dict[str, Any]) -> int | None:
-    """Return the steps of all trainings of a resolved pipeline."""
+    """Return the total number of training steps of a resolved pipeline; None if the pipeline is damaged."""
     with suppress(KeyError, TypeError, AttributeError, ValueError, OverflowError):
         return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
     return None
 
 
-def _figures(folder: CellFolder) -> dict[str, Any]:
-    """Return the PSNR, SSIM, steps, and Gaussians of a result.
+def _result_metrics(folder: CellFolder) -> dict[str, Any]:
+    """Return the PSNR and SSIM, and the numbers of steps and Gaussians, of a result; empty if they cannot be read.
 
-    PSNR and SSIM are those of the first downscale factor, of test views if there are any, else of training views.
+    PSNR and SSIM are means over the test views, or the training views if there are none, at the first downscale factor.
     """
     with suppress(DataError):
         metrics = read_metrics(folder.result / METRICS)
-        sizes = [*metrics.test.values(), *metrics.train.values()]
-        quality = {"psnr": sizes[0].psnr, "ssim": sizes[0].ssim} if sizes else {}
+        averages = [*metrics.test.values(), *metrics.train.values()]
+        quality = {"psnr": averages[0].psnr, "ssim": averages[0].ssim} if averages else {}
         return {**quality, "step": metrics.steps, "gaussians": metrics.gaussians}
     return {}
 
 
 def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
-    """Return the state of a cell by its last attempt."""
+    """Return the state of a cell, from its last attempt."""
     status = read_status(attempt.path)
     silence = now - attempt.last_beat
     failure = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
@@ -97,8 +98,8 @@ def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
 
 def overview_text(status: dict[str, Any]) -> str:
     """Format the result of `store_status` as text, one line per cell."""
-    counts = ", ".join(f"{count} {state}" for state, count in sorted(status["counts"].items())) or "no cells"
-    lines = [f"{status['store']}: {counts}"]
+    counts_text = ", ".join(f"{count} {state}" for state, count in sorted(status["counts"].items())) or "no cells"
+    lines = [f"{status['store']}: {counts_text}"]
     for cell in status["cells"]:
         name = cell["name"] or f"{cell['pipeline']} seed={cell['seed']}"
         lines.append(f"{cell['key']}  {cell['state']:9}  {name}{_format_detail(cell)}")

@@ -1,17 +1,17 @@
 """Store the cells of a sweep in a folder that all machines share.
 
-    cells/<key>/spec.json           the hashed values of the key; written first, never changed
+    cells/<key>/spec.json           the values whose hash is the key; written first, never changed
                 attempts/<uuid>/    an ordinary run folder, written by a single process, with a lease.json
                 result/             the first attempt that finished, renamed, with its manifest.json
-                failed.json         why the cell failed
+                failed.json         the reason if the cell failed
     prepared/                       output of `prepare`
-    undistorted/<scene>-<code>/     undistorted photos, made once per host
-    sweeps/<name>-<hash>.json       the cells of a matrix by name
-    cancel/all  cancel/<key>        requests to stop cells that started earlier
+    undistorted/<scene>-<code>/     undistorted photos, computed once per host
+    sweeps/<name>-<hash>.json       the keys of the cells of a matrix, by name
+    cancel/all  cancel/<key>        requests to stop cells that started before the request
     events/<host>-<process>.jsonl   one file per process, so that no two append to the same file
 
-Engines start a cell at least once.  A cell counts once: attempts share no file, the bits do not depend on who runs the
-cell, and publishing is a rename.
+Engines may start a cell more than once, but each cell has a single result: attempts share no files, the bits do not
+depend on the process that runs the cell, and publishing is a rename.
 """
 
 import hashlib
@@ -63,10 +63,10 @@ GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # a run appends to these files,
 
 
 def copy_files(source: Path, target: Path, excluded: Collection[str]) -> None:
-    """Copy a folder recursively, except for names at its top level.
+    """Copy a folder recursively.  Raises OSError.
 
-    excluded: the names.  Existing files are replaced.  Partial files, and files that disappear meanwhile, are skipped.
-    Raises OSError.
+    excluded: names at the top level that are not copied.  Existing files are replaced.  Partial files, and files that
+    disappear during the copy, are skipped.
     """
     for base, folders, files in os.walk(source):
         relative = Path(base).relative_to(source)
@@ -86,7 +86,10 @@ def copy_files(source: Path, target: Path, excluded: Collection[str]) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Hard-link a file, or copy it if links are not possible; neither must change in place.  Raises OSError."""
+    """Hard-link a file, or copy it if links are not possible.  Raises OSError.
+
+    Both files may share their data, so neither must be modified in place.
+    """
     try:
         os.link(source, target)
     except FileExistsError:
@@ -105,7 +108,7 @@ ATTEMPT_FILES = frozenset(
 )  # not copied to other attempts; PREPARE_SUMMARY has a path
 MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that depend only on bits, not on time
 BEAT = 10.0  # seconds between two heartbeats of a lease
-Rank = tuple[bool, int]  # of a checkpoint: whether it belongs to a refit, and its step
+Rank = tuple[bool, int]  # order of checkpoints: whether it belongs to a refit, and its step
 
 
 class LeaseLost(OutputError):
@@ -121,23 +124,23 @@ class CellAttempt:
         self._last = -math.inf
 
     def take_lease(self, worker: str, since: float) -> None:
-        """Write the lease.  since: when the caller started, by the clock of the store.  Raises OutputError."""
+        """Write the lease.  since: start time of the caller, by the clock of the store.  Raises OutputError."""
         self._values = {**asdict(Owner.current()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
     def beat(self) -> None:
-        """Renew the lease every BEAT seconds.  Raises LeaseLost."""
+        """Renew the lease if it is older than BEAT seconds.  Raises LeaseLost."""
         if time.monotonic() - self._last >= BEAT:
             self.require_lease()
             self._write()
 
     def require_lease(self) -> None:
-        """Raise LeaseLost if the folder was removed."""
+        """Raise LeaseLost if the folder of the attempt was removed."""
         if not (self.path / LEASE).is_file():
             raise LeaseLost(f"{self.path}: the folder was removed during its run; run the sweep again")
 
     def end(self, exit_code: int) -> None:
-        """Record how the run ended, unless the folder was removed."""
+        """Record the exit code of the run, unless the folder was removed."""
         self._values["exit_code"] = exit_code
         if self.path.is_dir():
             self._write()
@@ -148,7 +151,7 @@ class CellAttempt:
 
     @cached_property
     def lease(self) -> dict[str, Any]:
-        """The contents of the lease; empty if it is missing or damaged."""
+        """The content of the lease; empty if the lease is missing or damaged."""
         with suppress(DataError):
             lease = read_json(self.path / LEASE)
             return lease if isinstance(lease, dict) else {}
@@ -156,7 +159,7 @@ class CellAttempt:
 
     @property
     def exit_code(self) -> int | None:
-        """The exit code of the run; None if it is running, or its process was killed."""
+        """The exit code of the run; None if the run has not ended, or if its supervisor was killed."""
         code = self.lease.get("exit_code")
         return code if isinstance(code, int) and abs(code) < 1 << 32 else None
 
@@ -166,7 +169,7 @@ class CellAttempt:
 
     @property
     def since(self) -> float:
-        """When the caller started, by the clock of the store."""
+        """The start time of the caller, by the clock of the store; 0 if unknown."""
         return finite_number(self.lease.get("since")) or 0.0
 
     @property
@@ -176,14 +179,14 @@ class CellAttempt:
 
     @property
     def last_beat(self) -> float:
-        """When the lease was last renewed, by the clock of the store."""
+        """The time when the lease was last renewed, by the clock of the store."""
         for path in (self.path / LEASE, self.path):
             with suppress(OSError):
                 return path.stat().st_mtime
         return math.inf
 
     def continue_from(self, others: Iterable["CellAttempt"]) -> None:
-        """Copy the files of the attempt with the newest readable checkpoint, by links if possible.
+        """Copy the newest readable checkpoint, and the other files of its attempt, by hard links if possible.
 
         Damaged checkpoints are skipped.  Raises OutputError.
         """
@@ -193,7 +196,7 @@ class CellAttempt:
                 target.parent.mkdir(exist_ok=True)
                 try:
                     link_or_copy(path, target)
-                except FileNotFoundError:  # its process has removed it
+                except FileNotFoundError:  # the process of that attempt has removed it
                     continue
                 copy_files(other.path, self.path, {*ATTEMPT_FILES, CHECKPOINTS})
             self._values["from"] = path.name
@@ -201,7 +204,7 @@ class CellAttempt:
             return
 
     def message(self, exit_code: int) -> str:
-        """Return why the run failed: the message of its status, or the last line that it printed."""
+        """Return the reason why the run failed: the message in its status, or the last line that it printed."""
         if text := read_status(self.path).get("message"):
             return str(text)
         lines: list[str] = []
@@ -211,10 +214,10 @@ class CellAttempt:
         return lines[-1].removeprefix("error: ") if lines else f"its process ended with {cause}"
 
     def manifest(self) -> dict[str, Any]:
-        """Write and return the manifest: hashes of all files, and of the bits.  Raises OutputError."""
+        """Write and return the manifest, with hashes of all files and of the bits.  Raises OutputError."""
         names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
-        hashed = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
-        files = {name: sha256(self.path / name, kind=OutputError) for name in hashed}
+        hashed_names = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
+        files = {name: sha256(self.path / name, kind=OutputError) for name in hashed_names}
         values = {
             "attempt": self.path.name,
             "from": self._values.get("from"),
@@ -230,11 +233,11 @@ class CellAttempt:
 
 
 def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
-    """Yield the readable checkpoints of attempts, newest first: rank, file, and attempt."""
-    saved = [
+    """Yield the rank, file, and attempt of each readable checkpoint, newest first."""
+    entries = [
         (_parse_rank(path.name), path, attempt) for attempt in attempts for path in checkpoint.list_files(attempt.path)
     ]
-    for rank, path, attempt in sorted(saved, key=lambda entry: entry[0], reverse=True):
+    for rank, path, attempt in sorted(entries, key=lambda entry: entry[0], reverse=True):
         try:
             checkpoint.load(path)
         except (DataError, ConfigError):
@@ -248,20 +251,20 @@ def _parse_rank(name: str) -> Rank:
 
 
 def hash_bits(folder: Path, files: dict[str, str]) -> str:
-    """Return a hash of everything that a device computed: model files, and metrics without times.
+    """Return a hash of everything that a device computed: the model files, and metrics other than times.
 
     files: hashes of the run's files, by name.
     """
     suffixes = tuple(suffix for codec in CODECS for suffix in codec.endings)
     models = {name: digest for name, digest in files.items() if name.lower().endswith(suffixes)}
-    figures: dict[str, Any] = {}
+    metric_values: dict[str, Any] = {}
     with suppress(DataError, AttributeError):
         metrics = read_json(folder / METRICS)
-        figures = {key: metrics.get(key) for key in ("gaussians", "steps", "seed")}
+        metric_values = {key: metrics.get(key) for key in ("gaussians", "steps", "seed")}
         for split in ("test", "train", "validation"):
             for size, values in metrics.get(split, {}).items():
-                figures[f"{split} {size}"] = [values.get(key) for key in MEASURED]
-    return hashlib.sha256(json.dumps([models, figures], sort_keys=True).encode()).hexdigest()
+                metric_values[f"{split} {size}"] = [values.get(key) for key in MEASURED]
+    return hashlib.sha256(json.dumps([models, metric_values], sort_keys=True).encode()).hexdigest()
 
 
 # The folder of a cell: its attempts, and its result.
@@ -288,7 +291,7 @@ class CellFolder:
         return self.path.name
 
     def write_spec(self, spec: Mapping[str, Any]) -> None:
-        """Write the hashed values of the key, if they are missing or damaged.
+        """Write spec.json, the values whose hash is the key, if it is missing or damaged.
 
         Raises OutputError if the file has other values.
         """
@@ -304,7 +307,7 @@ class CellFolder:
             raise OutputError(f"{file}: belongs to another cell, or was changed; remove {self.path} to run it again")
 
     def manifest(self) -> dict[str, Any] | None:
-        """Return the manifest of the result, unchecked, or None if nothing was published."""
+        """Return the manifest of the result without verifying hashes; None if nothing was published."""
         with suppress(DataError):
             values = read_json(self.result / MANIFEST)
             if isinstance(values, dict) and isinstance(values.get("files"), dict) and values.get("bits"):
@@ -312,7 +315,7 @@ class CellFolder:
         return None
 
     def verified_manifest(self) -> dict[str, Any] | None:
-        """Return the manifest of the result after verifying the hashes of its files, or None without a result.
+        """Verify the hashes of the result's files, and return its manifest; None without an intact result.
 
         A damaged result is moved back to the attempts, so that the cell continues from its checkpoint.
         """
@@ -329,8 +332,8 @@ class CellFolder:
     def attempts(self) -> list[CellAttempt]:
         """Return the existing attempts."""
         paths = (self.path / ATTEMPTS).glob("*")
-        named = [path for path in paths if NAME.fullmatch(path.name)]
-        return [CellAttempt(path) for path in named if path.is_dir() and not path.is_symlink()]
+        attempt_paths = [path for path in paths if NAME.fullmatch(path.name)]
+        return [CellAttempt(path) for path in attempt_paths if path.is_dir() and not path.is_symlink()]
 
     def begin(self, worker: str, since: float) -> CellAttempt:
         """Start a new attempt, which continues from the newest readable checkpoint.  Raises OutputError."""
@@ -343,19 +346,22 @@ class CellFolder:
         return attempt
 
     def failures(self, since: float) -> list[CellAttempt]:
-        """Return failed attempts of callers that started at a time or later, without a newer readable checkpoint."""
+        """Return the failed attempts since which there is no newer readable checkpoint.
+
+        since: attempts of callers that started earlier are ignored; by the clock of the store.
+        """
         attempts = self.attempts()
         newest = next((rank for rank, *_ in readable_checkpoints(attempts)), (False, 0))
         return [item for item in attempts if item.has_failed and item.since >= since and item.start_rank >= newest]
 
     def publish(self, attempt: CellAttempt) -> dict[str, Any]:
-        """Rename an attempt to the result, with a manifest; return the manifest of the result.
+        """Write the manifest of an attempt, rename the attempt to the result, and return the result's manifest.
 
-        If another attempt was first, their bits are compared.  Raises BitsMismatch if they differ, and LeaseLost if the
-        attempt was removed because its process was frozen too long.
+        If another attempt was published first, the bits of both are compared.  Raises BitsMismatch if they differ, and
+        LeaseLost if the attempt was removed because its process was frozen for too long.
         """
         attempt.require_lease()
-        ours = attempt.manifest()
+        new = attempt.manifest()
         with raising_output_error(attempt.path):
             sync_below(attempt.path)
         with suppress(OSError):
@@ -364,18 +370,18 @@ class CellFolder:
             with suppress(OSError):
                 (self.result / LEASE).unlink()
                 (self.path / FAILED).unlink(missing_ok=True)
-            return ours
+            return new
         os.listdir(self.path)  # refreshes the NFS cache of the folder
-        theirs = self.manifest()
-        if theirs is None:
+        published = self.manifest()
+        if published is None:
             raise OutputError(f"{self.result}: cannot be written; check the permissions and the free space")
-        if theirs["bits"] != ours["bits"]:
+        if published["bits"] != new["bits"]:
             raise BitsMismatch(
                 f"{self.path}: the same cell gave different bits on two devices of one bits class: {self.result} on "
-                f"{theirs.get('device')}, {attempt.path} on {ours.get('device')}; one of them computes wrongly: "
+                f"{published.get('device')}, {attempt.path} on {new.get('device')}; one of them computes wrongly: "
                 "`clsplat doctor` shows which"
             )
-        return theirs
+        return published
 
     def give_up(self, exit_code: int, message: str) -> None:
         """Write failed.json: the exit code and the message of the last failure."""
@@ -384,16 +390,16 @@ class CellFolder:
         write_text(self.path / FAILED, text + "\n")
 
     def failure(self) -> dict[str, Any] | None:
-        """Return the content of failed.json, or None."""
+        """Return the content of failed.json; None if it is missing or damaged."""
         with suppress(DataError):
             values = read_json(self.path / FAILED)
             return values if isinstance(values, dict) else None
         return None
 
     def collect(self, now: float) -> None:
-        """Remove the attempts of a published cell whose lease had no heartbeat for STALE_AFTER_S seconds.
+        """Remove the attempts of a published cell that had no heartbeat for STALE_AFTER_S seconds.
 
-        now: by the clock of the store.  Other attempts remain, because their processes may be running.
+        now: the current time by the clock of the store.  Other attempts remain, because their processes may be running.
         """
         if self.manifest() is None:
             return
@@ -402,11 +408,11 @@ class CellFolder:
                 shutil.rmtree(attempt.path, ignore_errors=True)
 
 
-# A store may be untrusted: links, which may point outside of it, are rejected, and damaged values are ignored.
+# A store may be untrusted.  Links, which may point outside of it, are rejected, and damaged values are ignored.
 
 
 def without_links(root: Path, *names: str) -> Path:
-    """Return a path below a folder.  Raises DataError if a part of it is a symbolic link."""
+    """Return a path below a folder.  Raises DataError if a component of it is a symbolic link."""
     path = root
     for name in names:
         path /= name
@@ -416,7 +422,7 @@ def without_links(root: Path, *names: str) -> Path:
 
 
 def finite_number(value: Any) -> float | None:
-    """Return a value of a record if it is a finite number, or None."""
+    """Return a value from a record as a float; None if it is not a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e18:
         return None
     return float(value)
@@ -447,11 +453,11 @@ class Store:
         return without_links(self.root, PREPARED)
 
     def undistorted_folder(self, scene: str, code: str) -> Path:
-        """Return the folder of a scene's undistorted photos.  Both arguments are fingerprints, as in a cell's key."""
+        """Return the folder of a scene's undistorted photos.  scene, code: the fingerprints in the spec of a cell."""
         return without_links(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
 
     def folder(self, key: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist.  Raises DataError if it is, or has, a symbolic link."""
+        """Return the folder of a cell, which need not exist.  Raises DataError if it is or contains a symbolic link."""
         for name in (ATTEMPTS, RESULT):
             without_links(self.root, CELLS, key, name)
         return CellFolder(self.root / CELLS / key)
@@ -462,7 +468,7 @@ class Store:
         return [self.folder(name) for name in names if is_key(name)]
 
     def now(self) -> float:
-        """Return the time of the store's file system, s, which is the same for all machines."""
+        """Return the current time of the store's file system, s, which is the same for all machines."""
         clock = without_links(self.root, EVENTS, f".{self._process_name}.clock")
         with raising_output_error(clock):
             make_folder(clock.parent)
@@ -470,7 +476,7 @@ class Store:
             return clock.stat().st_mtime
 
     def log_event(self, event: str, **values: Any) -> None:
-        """Append an event to the file of this process."""
+        """Append an event, with the current time, to the event file of this process."""
         path = without_links(self.root, EVENTS, f"{self._process_name}.jsonl")
         with raising_output_error(path):
             make_folder(path.parent)
@@ -478,7 +484,7 @@ class Store:
                 file.write(json.dumps({"time": round(time.time(), 3), "event": event, **values}) + "\n")
 
     def events(self) -> list[dict[str, Any]]:
-        """Return the events of all processes, in order of time; incomplete lines are skipped."""
+        """Return the events of all processes in chronological order; incomplete lines are skipped."""
         events: list[dict[str, Any]] = []
         for path in (self.root / EVENTS).glob("*.jsonl"):
             for line in read_file(path).decode(errors="replace").splitlines() if path.is_file() else ():
@@ -490,9 +496,10 @@ class Store:
         return sorted(events, key=lambda event: float(event["time"]))
 
     def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
-        """Record the cells of a matrix by name, for `clsplat status`.
+        """Record the keys of the cells of a matrix, by cell name, for `clsplat status`.
 
-        text: distinguishes matrices with the same name, such as the text of the file.  Other recorded cells remain.
+        text: distinguishes matrices with the same name, for example the text of the pipeline file.  Cells that were
+        recorded earlier remain.
         """
         folder = without_links(self.root, SWEEPS)
         file = folder / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
@@ -500,7 +507,7 @@ class Store:
         write_text(file, json.dumps({"name": name, "cells": cells}, indent=1) + "\n")
 
     def sweeps(self, files: Sequence[Path] | None = None) -> list[tuple[str, dict[str, str]]]:
-        """Return the name of each matrix, and the keys of its cells by name; invalid keys are left out."""
+        """Return the name of each matrix, and the keys of its cells by cell name; invalid keys are omitted."""
         sweeps = []
         for path in sorted((self.root / SWEEPS).glob("*.json")) if files is None else files:
             with suppress(DataError, KeyError, TypeError, AttributeError):
@@ -510,15 +517,18 @@ class Store:
         return sweeps
 
     def add(self, cell: CellRun) -> CellFolder:
-        """Return the folder of a cell, with its spec.json.  Raises OutputError if that belongs to another cell."""
+        """Create and return the folder of a cell, with its spec.json.
+
+        Raises OutputError if the existing spec.json belongs to another cell.
+        """
         folder = self.folder(cell.key)
         folder.write_spec(cell.spec)
         return folder
 
     def cancel(self, cell: str | None = None) -> str:
-        """Request that all running cells stop, or one of them, by name or key; return "all" or the key.
+        """Request that all running cells stop, or only one of them; return "all" or the key of the cell.
 
-        Raises ConfigError if there is no such cell.
+        cell: its name or key.  Raises ConfigError if there is no such cell.
         """
         name = ALL if cell is None else self.find_key(cell)
         self.stop(name)
@@ -526,7 +536,7 @@ class Store:
         return name
 
     def stop(self, name: str) -> None:
-        """Request that everything that started under a name stops."""
+        """Request that all running cells with a key or sweep name stop, or all cells for the name "all"."""
         flag = without_links(self.root, CANCEL, name)
         with raising_output_error(flag):
             make_folder(flag.parent)
@@ -534,7 +544,10 @@ class Store:
             os.utime(flag)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether work under one of these names that started at `since`, by the clock of `now`, has to stop."""
+        """Return whether there is a request to stop cells under one of these names that started at `since`.
+
+        since: by the clock of `now`.
+        """
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):
                 if (self.root / CANCEL / name).stat().st_mtime >= since:
@@ -542,14 +555,14 @@ class Store:
         return False
 
     def find_key(self, cell: str) -> str:
-        """Return the key of a cell, given its name in a sweep, its key, or the start of its key.
+        """Return the key of a cell, given its name in a sweep, its key, or the first digits of its key.
 
-        If several cells have the name, an unpublished one is chosen.
+        If several cells have the name, unpublished cells take precedence.  Raises ConfigError unless one cell matches.
         """
-        named = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
-        named = {key for key in named if not self.folder(key).result.is_dir()} or named
-        named = named or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
-        if len(named) != 1:
-            advice = f"{len(named)} cells match; give a key" if named else "`clsplat status` lists the cells"
+        keys = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
+        keys = {key for key in keys if not self.folder(key).result.is_dir()} or keys
+        keys = keys or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
+        if len(keys) != 1:
+            advice = f"{len(keys)} cells match; give a key" if keys else "`clsplat status` lists the cells"
             raise ConfigError(f"{self.root}: no cell '{cell}'; {advice}")
-        return named.pop()
+        return keys.pop()

@@ -1,4 +1,4 @@
-"""Run a cell in attempts until it is published, has failed, or is stopped; all engines call this."""
+"""Run a cell in one or more attempts until it is published, has failed, or is stopped; used by all engines."""
 
 import logging
 import os
@@ -28,10 +28,10 @@ FINAL = (ConfigError.exit_code, DataError.exit_code, MemoryLimitError.exit_code)
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a cell ended."""
+    """The outcome of running a cell."""
 
     state: Literal["published", "failed", "stopped", "different"]
-    bits: str = ""  # of the result
+    bits: str = ""  # hash of the result's bits
     exit_code: int = 0
     message: str = ""
 
@@ -40,19 +40,19 @@ class Outcome:
 class CellOptions:
     """Options for running a cell."""
 
-    since: float  # when the caller started, by the clock of the store
-    retries: int = 3  # failures without a newer checkpoint
+    since: float  # start time of the caller, by the clock of the store
+    retries: int = 3  # maximum number of failures without a newer checkpoint
     worker: str = "inline"
-    sweep: str = ""  # name under which the caller's cells can be stopped
-    cores: Sequence[int] = ()  # to pin the run to; empty: the cores of the caller
+    sweep: str = ""  # a name that requests to stop can use for all cells of the caller
+    cores: Sequence[int] = ()  # cores that the run is pinned to; empty: the cores of the caller
 
 
 def run_cell(
     cell: CellRun, store: Store, command: Command, options: CellOptions, is_stopped: Callable[[], bool] = lambda: False
 ) -> Outcome:
-    """Run a cell, unless it is published; return how it ended, instead of raising a ClsplatError.
+    """Run a cell, unless it is published already; return its outcome.  Failures are returned instead of raised.
 
-    is_stopped: whether the caller has to stop; requests in the store stop the cell too.
+    is_stopped: returns whether the caller has to stop.  Requests to stop in the store also stop the cell.
     """
     try:
         return _run_cell(cell, store, command, options, is_stopped)
@@ -110,13 +110,13 @@ def _run_cell(
 def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
     """Write the pipeline file of an attempt, and links to the shared output of `prepare` and undistorted photos.
 
-    Where links are not possible, each cell makes these files itself.  Raises OutputError.
+    Where links are not possible, each cell creates these files itself.  Raises OutputError.
     """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
-    shared = {UNDISTORTED: store.undistorted_folder(cell.spec["scene"], cell.spec["code"])}
+    shared_folders = {UNDISTORTED: store.undistorted_folder(cell.spec["scene"], cell.spec["code"])}
     if cell.spec["pipeline"].get("prepare"):
-        shared[PREPARED] = store.prepared
-    for name, target in shared.items():
+        shared_folders[PREPARED] = store.prepared
+    for name, target in shared_folders.items():
         make_folder(target)
         link = folder.path / ATTEMPTS / name
         if link.is_symlink() and not link.samefile(target):
@@ -127,7 +127,7 @@ def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: C
 
 
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
-    """Raise DataError if the photos or other files differ from those hashed for the cell's key."""
+    """Raise DataError if the photos or other input files differ from the files that were hashed for the cell's key."""
     cell.require_files()
     for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():

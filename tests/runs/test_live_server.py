@@ -145,7 +145,7 @@ def asked(queue: RequestQueue, *wanted: PreviewRequest) -> list[threading.Thread
     threads = [threading.Thread(target=queue.wait_for, args=(request, 10)) for request in wanted]
     for number, thread in enumerate(threads, 1):
         thread.start()
-        while sum(request in queue._waiting for request in wanted) < number:
+        while sum(request in queue._requests for request in wanted) < number:
             time.sleep(0.001)
     return threads
 

@@ -1,4 +1,4 @@
-"""Run the live preview in the training thread: render requested images between steps, and pause the training."""
+"""Run the live preview in the training thread: render requested images between steps, and pause on request."""
 
 import logging
 import secrets
@@ -20,16 +20,16 @@ from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
 OPEN_TIMEOUT = 5.0  # s without a request until a page counts as closed, and the memory of previews is freed
-PAUSE_TIMEOUT = 120.0  # s without a request until a pause ends; background tabs send one per minute
-FAREWELL = 1.5  # s that a finished run waits until the page has received its end
-TOKEN = 16  # bytes
+PAUSE_TIMEOUT = 120.0  # s without a request until a pause ends; background tabs send one request per minute
+FAREWELL = 1.5  # s that a finished run waits for the page to receive the end of the run
+TOKEN = 16  # number of random bytes
 
 
 class Live:
-    """Serves a page while runs train, one after another; a context manager that stops the server at its end."""
+    """A page that shows runs while they train, one after another; a context manager that stops the server on exit."""
 
     def __init__(self, port: int = 0) -> None:
-        """port: on the loopback address; 0: the first free default port.  Raises ConfigError if it is in use."""
+        """port: a port of the loopback address; 0: the first free default port.  Raises ConfigError if it is in use."""
         self.state = LiveState()
         self._preview: Preview | None = None
         self._server = Server(port, secrets.token_urlsafe(TOKEN), Handlers(self.state))
@@ -46,7 +46,7 @@ class Live:
 
     @property
     def text(self) -> str:
-        """The address of the page, and the command for access from another machine."""
+        """A message with the address of the page, and the command for access from another machine."""
         port = self._server.port
         return (
             f"live preview: {self.address}\n"
@@ -54,13 +54,13 @@ class Live:
         )
 
     def close(self) -> None:
-        """Stop the server, after an open page has received the end of the run."""
+        """Stop the server.  If a page is open, wait for a moment until it has received the end of the run."""
         state = self.state
         state.pause(False)
         state.ended = True
         try:
-            end = time.monotonic() + FAREWELL
-            while state.idle_seconds() < OPEN_TIMEOUT and not state.is_end_sent and time.monotonic() < end:
+            deadline = time.monotonic() + FAREWELL
+            while state.idle_seconds() < OPEN_TIMEOUT and not state.is_end_sent and time.monotonic() < deadline:
                 self._leave()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
         finally:
@@ -73,7 +73,7 @@ class Live:
 
     @contextmanager
     def showing(self, run: Run) -> Iterator[None]:
-        """Show the model and the reports of a run during the block."""
+        """Show the model and the progress reports of a run during the block."""
         self._enter(run)
         try:
             yield
@@ -82,7 +82,7 @@ class Live:
             self._leave()
 
     def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """Return a function that calls `show`, and shows the report on the page."""
+        """Return a function that calls `show` with each progress report, and also shows the report on the page."""
 
         def show_both(progress: Progress) -> None:
             show(progress)
@@ -93,30 +93,30 @@ class Live:
 
     def _enter(self, run: Run) -> None:
         state, scene = self.state, run.scene.downscaled(run.downscale)
-        number = state.shown.number + 1 if state.shown else 1
-        title, test = f"{run.name} · {run.scene_name}", scene.split("test")
+        run_number = state.shown.number + 1 if state.shown else 1
+        title, test_views = f"{run.name} · {run.scene_name}", scene.split("test")
         if scene.origin.any():
             title += f" · origin {position_text(scene.origin)}"
         points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
-        viewpoint = Viewpoint.from_points(points, scene.views, (test or scene.views)[0])
-        data = scene_data(number, title, scene.views, {view.name for view in test}, viewpoint)
+        viewpoint = Viewpoint.from_points(points, scene.views, (test_views or scene.views)[0])
+        page_data = scene_data(run_number, title, scene.views, {view.name for view in test_views}, viewpoint)
         photographs = run.photographs
         background = BACKGROUNDS[photographs.background_name]
         pictures = Pictures(scene.views, background, photographs.undistorted, state.budget)
         state.step, state.error = 0, ""
-        state.shown = ShownRun(number, title, scene.views, data, pictures, Curves([]))
+        state.shown = ShownRun(run_number, title, scene.views, page_data, pictures, Curves([]))
         self._preview = Preview(run)
         run.on_step = lambda: self._on_step(run)
         state.budget.skip()
 
     def _leave(self) -> None:
-        """Release the run, because its model may be large, and answer waiting requests without an image."""
+        """Release the run, because its model may be large, and answer pending requests without an image."""
         self.state.step, self._preview = 0, None
         while request := self.state.requests.first():
             self.state.requests.deliver(request, None)
 
     def _on_step(self, run: Run) -> None:
-        """Render requested previews, if there is time; wait while the page pauses the training."""
+        """Render a requested preview if the time budget allows it, and wait while the page pauses the training."""
         state, preview = self.state, self._preview
         if preview is None or not (run.has_model and run.is_consistent):
             return
@@ -129,24 +129,24 @@ class Live:
             self._pause(run, preview)
 
     def _draw(self, run: Run, preview: Preview, is_paused: bool = False) -> None:
-        """Render the first request, if the time budget allows it, or in any case while the training is paused."""
+        """Render the first request.  Do nothing if the time budget does not allow it, unless the training is paused."""
         request = self.state.requests.first()
         if request is None:
             return
         reserve = RESERVE if request.pace == "again" else 0.0
         if not is_paused and self.state.budget.credit < preview.cost(request.pace) + reserve:
             return
-        started = time.perf_counter()
+        start_time = time.perf_counter()
         run.device.finish()
-        # on a GPU, the wait for its queue counts as well, because training waits too
+        # on a GPU, the wait for the queue counts too, because the training also waits
         if run.device.info.kind == "CPU":
-            started = time.perf_counter()
+            start_time = time.perf_counter()
         self._deliver(request, preview)
         if not is_paused:
-            self.state.budget.spend(time.perf_counter() - started)
+            self.state.budget.spend(time.perf_counter() - start_time)
 
     def _deliver(self, request: PreviewRequest, preview: Preview) -> None:
-        """Render a request; failures are shown on the page, and the training continues."""
+        """Render a request.  The page shows failures, and the training continues."""
         try:
             self.state.requests.deliver(request, preview.draw(request))
             self.state.error = ""
@@ -155,7 +155,7 @@ class Live:
             self.state.error = str(error)
 
     def _pause(self, run: Run, preview: Preview) -> None:
-        """Wait until the page resumes the training, no page has been open for a while, or the run should stop."""
+        """Wait until the page resumes the training, no page is open any more, or the run is interrupted."""
         state = self.state
         LOG.info("paused at step %d from the live page", run.step)
         with run.status.stage("paused"):

@@ -1,4 +1,4 @@
-"""Render previews of the model in training, in separate memory; the run is not changed."""
+"""Render previews of the model during training, in separate device memory, without changing the run."""
 
 import logging
 import os
@@ -30,7 +30,7 @@ from clsplat.viewer.page import LARGEST, THUMBNAIL
 # The queue of preview requests.
 
 MAX_WAITING = 4  # requests
-Pace = Literal["moving", "still", "again"]  # the camera moves, has just stopped, or does not move
+Pace = Literal["moving", "still", "again"]  # the camera moves, has just stopped, or has stopped some time ago
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class EncodedPicture:
 class PreviewRequest:
     """A request of a page for a preview from its camera."""
 
-    page: int  # identifies the page
+    page: int  # ID of the page
     view: View
     pace: Pace
     done: threading.Event = field(default_factory=threading.Event)
@@ -53,25 +53,25 @@ class PreviewRequest:
 
 
 class RequestQueue:
-    """A short queue from the threads of the server to the training thread."""
+    """A short queue of requests from the threads of the server to the training thread."""
 
     def __init__(self) -> None:
-        self._waiting: deque[PreviewRequest] = deque()
+        self._requests: deque[PreviewRequest] = deque()
         self._changed = threading.Condition()
 
     def wait_for(self, request: PreviewRequest, seconds: float) -> bool:
-        """Wait for a preview; the request replaces an earlier one of the same page.
+        """Add a request, which replaces an earlier one of the same page, and wait for its preview.
 
-        Returns False if the queue is full.  After a timeout, the request has no picture.
+        Returns False if the queue is full.  After a timeout, `request.picture` is None.
         """
         with self._changed:
-            replaced = next((other for other in self._waiting if other.page == request.page), None)
-            if replaced is None and len(self._waiting) >= MAX_WAITING:
+            earlier = next((other for other in self._requests if other.page == request.page), None)
+            if earlier is None and len(self._requests) >= MAX_WAITING:
                 return False
-            if replaced is not None:
-                self._waiting.remove(replaced)
-                replaced.done.set()
-            self._waiting.append(request)
+            if earlier is not None:
+                self._requests.remove(earlier)
+                earlier.done.set()
+            self._requests.append(request)
             self._changed.notify_all()
         request.done.wait(seconds)
         self._drop(request)
@@ -79,24 +79,24 @@ class RequestQueue:
 
     def _drop(self, request: PreviewRequest) -> None:
         with self._changed:
-            if request in self._waiting:
-                self._waiting.remove(request)
+            if request in self._requests:
+                self._requests.remove(request)
 
     def first(self) -> PreviewRequest | None:
-        """Return the request that has waited longest, with moving cameras first; None if there is none."""
+        """Return the oldest request, or None.  Repeated requests of cameras that do not move come last."""
         with self._changed:
-            return min(self._waiting, key=lambda request: request.pace == "again", default=None)
+            return min(self._requests, key=lambda request: request.pace == "again", default=None)
 
     def deliver(self, request: PreviewRequest, picture: EncodedPicture | None) -> None:
-        """Give a waiting thread its picture; None if there is none."""
+        """Remove a request from the queue, and pass its picture, or None, to the thread that waits for it."""
         self._drop(request)
         request.picture = picture
         request.done.set()
 
     def wait(self, seconds: float) -> None:
-        """Wait for a request, at most this many seconds, or until `wake` is called."""
+        """Wait until there is a request or `wake` is called, but at most for a number of seconds."""
         with self._changed:
-            if not self._waiting:
+            if not self._requests:
                 self._changed.wait(seconds)
 
     def wake(self) -> None:
@@ -104,15 +104,15 @@ class RequestQueue:
             self._changed.notify_all()
 
     def __bool__(self) -> bool:
-        return bool(self._waiting)
+        return bool(self._requests)
 
 
 LOG = logging.getLogger("clsplat")
 SIDES = (400, 280, 200, 140)  # px, the longer side
-TARGET_TIMES: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview; determine its size
+TARGET_TIMES: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview; determines its size
 GUESS = 0.03  # s per preview, before the first measurement
 QUALITY = 85  # of the JPEG
-MAX_PAIRS = 1 << 23  # in memory at a time, about 100 MB; frames with more are rendered in bands
+MAX_PAIRS = 1 << 23  # pairs in memory at a time, about 100 MB; frames with more pairs are rendered in bands
 MAX_MEMORY = 0.95  # fraction of the device's memory that may be used
 
 
@@ -122,7 +122,7 @@ class Preview:
     def __init__(self, run: Run) -> None:
         self.run = run
         self._rasterizer: Rasterizer | None = None
-        self._costs: dict[int, float] = {}  # s, of the last preview of each size
+        self._costs: dict[int, float] = {}  # time of the last preview, s, by image side
 
     def cost(self, pace: Pace) -> float:
         """Return the estimated time of the next preview, s."""
@@ -131,12 +131,12 @@ class Preview:
     def draw(self, request: PreviewRequest) -> EncodedPicture:
         """Render a preview.  Raises MemoryLimitError if the training leaves no device memory."""
         side, rasterizer = self._side(request.pace), self._open_rasterizer()
-        started = time.perf_counter()
+        start_time = time.perf_counter()
         view = downscaled_view(request.view, side)
         camera = upload_camera(self.run.device, view)
         image = render_view(self.run.painter(rasterizer), camera)
         jpeg = encode_jpeg(image, QUALITY)
-        self._costs[side] = time.perf_counter() - started
+        self._costs[side] = time.perf_counter() - start_time
         return EncodedPicture(jpeg, self.run.step)
 
     def release(self) -> None:
@@ -156,31 +156,34 @@ class Preview:
         return self._rasterizer
 
     def _side(self, pace: Pace) -> int:
-        """Return the largest image side, px, whose preview is fast enough."""
+        """Return the largest image side, px, whose preview is fast enough; the smallest side if none is."""
         return next((side for side in SIDES if self._estimate(side) <= TARGET_TIMES[pace]), SIDES[-1])
 
     def _estimate(self, side: int) -> float:
-        """Return the time of the last preview of a size, s, or an estimate from other sizes by area."""
+        """Return the time of the last preview with this image side, s.
+
+        If there was none, estimate the time from previews of other sizes, in proportion to their area.
+        """
         if side in self._costs:
             return self._costs[side]
-        return max((cost * min(1.0, (side / measured) ** 2) for measured, cost in self._costs.items()), default=GUESS)
+        return max((cost * min(1.0, (side / size) ** 2) for size, cost in self._costs.items()), default=GUESS)
 
 
 def downscaled_view(view: View, side: int) -> View:
-    """Return the view, downscaled to a longer side of at most `side` px."""
+    """Return the view, downscaled so that its longer side has at most `side` px."""
     camera = view.camera
     factor = max(camera.width, camera.height) / side
     return view if factor <= 1 else replace(view, camera=camera.downscaled(factor))
 
 
-# A fraction of the time, saved up to a limit.
+# The time budget of previews.
 
 
 class Credit:
     """A time budget that grows by a fraction of the elapsed time, up to a limit."""
 
     def __init__(self, rate: float, limit: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """rate: credit per second; limit: maximum credit, which limits bursts after a pause."""
+        """rate: credit per second.  limit: maximum credit, which bounds the time spent at once after a pause."""
         self.rate, self.limit, self.spent = rate, limit, 0.0
         self._clock, self._credit, self._updated = clock, 0.0, clock()
         self._lock = threading.Lock()
@@ -192,7 +195,7 @@ class Credit:
             return self._update()
 
     def spend(self, amount: float) -> None:
-        """Subtract a spent time, s, from the credit."""
+        """Subtract an amount of time, s, from the credit."""
         with self._lock:
             self._credit = self._update() - amount
             self.spent += amount
@@ -209,7 +212,7 @@ class Credit:
         return self._credit
 
 
-# The photos of a run as JPEG, read when a page requests them; the browser caches them.
+# The photos of a run as JPEG.  They are read when a page requests them, and the browser caches them.
 
 Kind = Literal["thumbnail", "photograph"]
 JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
@@ -218,7 +221,7 @@ PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
 
 class Pictures:
-    """Reads photos, one at a time; their CPU time is charged to the budget of previews."""
+    """Reads photos as JPEG, one at a time; the CPU time is subtracted from the budget of previews."""
 
     def __init__(
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
@@ -227,7 +230,7 @@ class Pictures:
         self._lock = threading.Lock()
 
     def get(self, kind: Kind, index: int) -> bytes | None:
-        """Return a photo as JPEG; None if the budget does not allow it in time.  Raises DataError."""
+        """Return a photo as JPEG, or None if the budget does not allow it within PHOTO_TIMEOUT.  Raises DataError."""
         if not self._lock.acquire(timeout=PHOTO_TIMEOUT):
             return None
         try:
@@ -236,35 +239,35 @@ class Pictures:
             self._lock.release()
 
     def _wait_for_credit(self) -> bool:
-        end = time.monotonic() + PHOTO_TIMEOUT
+        deadline = time.monotonic() + PHOTO_TIMEOUT
         while self._budget.credit <= 0:
-            if time.monotonic() > end:
+            if time.monotonic() > deadline:
                 return False
             time.sleep(0.05)
         return True
 
     def _read(self, kind: Kind, index: int) -> bytes:
-        started = time.thread_time()
+        start_time = time.thread_time()
         pixels = load_photograph(self.views[index], self._background, self._undistorted)[:, :, :3]
         data = encode_jpeg(shrink(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
-        self._budget.spend((time.thread_time() - started) / (os.cpu_count() or 1))
+        self._budget.spend((time.thread_time() - start_time) / (os.cpu_count() or 1))
         return data
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Encode an RGB image, [height, width, 3], as JPEG."""
+    """Encode an RGB image, (height, width, 3), as JPEG.  quality: from 0 to 100."""
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()
 
 
-# The reports of a run, as points of curves.
+# The progress reports of a run, as points of curves.
 
 MAX_POINTS = 600  # beyond this, every second point is dropped
 Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussians
 
 
 class Curves:
-    """The loss, PSNR, and number of Gaussians of one run, in order of steps."""
+    """The loss, PSNR, and number of Gaussians of a run, in the order of steps."""
 
     def __init__(self, points: list[Point]) -> None:
         self._points = points
@@ -285,14 +288,14 @@ class Curves:
 
 # The state shared by the training thread and the threads of the server.
 
-RATE = 0.025  # fraction of the time for previews; waiting for the device and responding cost about as much again
+RATE = 0.025  # fraction of the time for previews; waiting for the device and sending responses double the cost
 MAX_CREDIT = 1.0  # s, saved for moving cameras
-RESERVE = 0.3  # s of credit that repeated previews of still cameras leave
+RESERVE = 0.3  # s of credit that repeated previews of still cameras must leave
 
 
 @dataclass(frozen=True)
 class ShownRun:
-    """The run that pages show; each run of a matrix has a new number."""
+    """The run that the pages show; the runs of a matrix have consecutive numbers."""
 
     number: int
     title: str
@@ -304,25 +307,25 @@ class ShownRun:
 
 @dataclass
 class LiveState:
-    """The state of a live preview; each field has a single writer, which replaces it atomically."""
+    """The shared state of a live preview; each field is written by a single thread, which replaces it atomically."""
 
     requests: RequestQueue = field(default_factory=RequestQueue)
     budget: Credit = field(default_factory=lambda: Credit(RATE, MAX_CREDIT))
     status: StatusFile | None = None
     shown: ShownRun | None = None
-    step: int = 0  # of the model that can be rendered; 0 if there is none
+    step: int = 0  # training step of the model that can be rendered; 0 if there is none
     paused: bool = False
     ended: bool = False
-    is_end_sent: bool = False  # whether a page has received the end
+    is_end_sent: bool = False  # whether a page has received the end of the run
     error: str = ""  # why there are no previews
     last_request: float = float("-inf")  # s, monotonic clock
 
     def note_request(self) -> None:
-        """Record a request of a page."""
+        """Record the time of a page's request."""
         self.last_request = time.monotonic()
 
     def idle_seconds(self) -> float:
-        """Return the time since the last request, s."""
+        """Return the time since the last request of a page, s."""
         return time.monotonic() - self.last_request
 
     def pause(self, paused: bool) -> None:

@@ -1,4 +1,4 @@
-"""Serve requests on the loopback address, in threads."""
+"""Serve the page of the live preview and its data on the loopback address, in threads."""
 
 import hmac
 import json
@@ -27,12 +27,12 @@ from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.page import camera_data, join_scripts, style, viewpoint_data
 
-# Requests: only GET, addressed to this machine by name, under a secret path.
+# Requests: only GET, with a host name of this machine, and a secret in the path.
 
 MAX_FIELDS = 8  # of a query
-# other names are those of foreign pages that resolve to this machine (DNS rebinding)
+# other host names belong to foreign pages that resolve to this machine (DNS rebinding)
 NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
-HEADERS = {  # defaults of all responses
+HEADERS = {  # default headers of all responses
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",  # the address contains the secret
     "X-Content-Type-Options": "nosniff",
@@ -44,7 +44,7 @@ HEADERS = {  # defaults of all responses
 
 @dataclass(frozen=True)
 class Response:
-    """A response: status, body, content type, and headers."""
+    """An HTTP response: status, body, content type, and additional headers."""
 
     status: int
     body: bytes = b""
@@ -57,7 +57,7 @@ class Response:
 
 
 class RequestError(Exception):
-    """Raised to reject a request; carries the response."""
+    """Raised to reject a request; its `response` is sent to the client."""
 
     def __init__(self, status: int, reason: str) -> None:
         super().__init__(reason)
@@ -66,13 +66,13 @@ class RequestError(Exception):
 
 @dataclass(frozen=True)
 class Request:
-    """A request: the path after the secret, and the fields of the query."""
+    """A request: its path without the secret, and the fields of its query."""
 
     path: str
     query: dict[str, str]
 
     def number(self, name: str, minimum: int, maximum: int) -> int:
-        """Return a field as an integer in a range.  Raises RequestError."""
+        """Return a field of the query as an integer.  Raises RequestError if it is missing or out of range."""
         text = self.query.get(name, "")
         if not (text.isascii() and text.isdecimal() and len(text) <= 12 and minimum <= int(text) <= maximum):
             raise RequestError(400, f"{name}: expected a whole number from {minimum} to {maximum}")
@@ -80,7 +80,7 @@ class Request:
 
 
 def parse_request(target: str, host: str, token: str) -> Request:
-    """Parse a request and check its host and secret.  Raises RequestError with status 400, 403, or 404."""
+    """Parse a request, and check its host and its secret.  Raises RequestError with status 400, 403, or 404."""
     if host_name(host.strip().lower()) not in NAMES:
         raise RequestError(403, "this page accepts only requests to 127.0.0.1 and localhost")
     try:
@@ -104,8 +104,8 @@ LOG = logging.getLogger("clsplat")
 LOOPBACK = "127.0.0.1"
 PORT, PORTS = 8710, 20  # the first default port, and the number of ports to try
 IDLE = 15.0  # s until an idle connection is closed
-RATE, BURST = 30.0, 120.0  # responses per second, and in a burst, because a page starts with many small images
-POLL = 0.1  # s between checks whether the server should stop
+RATE, BURST = 30.0, 120.0  # responses per second, and in an initial burst, because a page first loads many small images
+POLL = 0.1  # s between two checks whether the server has to stop
 
 
 class Server(socketserver.ThreadingTCPServer):
@@ -117,7 +117,7 @@ class Server(socketserver.ThreadingTCPServer):
     allow_reuse_address = os.name == "posix"  # on Windows it would let two programs share a port
 
     def __init__(self, port: int, token: str, handle: Callable[[Request], Response]) -> None:
-        """port: 0 tries PORT and the following ones.  Raises ConfigError if all are in use."""
+        """port: 0 selects the first free port from PORT on.  Raises ConfigError if no port can be used."""
         self.token, self.handle, self.ended, self._rate = token, handle, False, Credit(RATE, BURST)
         self._rate.spend(-BURST)
         for self.port in [port] if port else range(PORT, PORT + PORTS):
@@ -135,13 +135,13 @@ class Server(socketserver.ThreadingTCPServer):
         threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True).start()
 
     def stop(self) -> None:
-        """Stop serving; open connections end after their current response."""
+        """Stop the server; open connections are closed after their current response."""
         self.ended = True
         self.shutdown()
         self.server_close()
 
     def pace(self) -> None:
-        """Wait until the next response is allowed."""
+        """Wait until the rate limit allows the next response."""
         while self._rate.credit < 1:
             sleep(1 / RATE)
         self._rate.spend(1)
@@ -151,7 +151,7 @@ class Server(socketserver.ThreadingTCPServer):
 
 
 class _Connection(BaseHTTPRequestHandler):
-    """A connection, which serves one request after another."""
+    """A connection of a client, which sends one request after another."""
 
     server: Server
     protocol_version = "HTTP/1.1"
@@ -193,7 +193,7 @@ SCRIPTS = ("curves", "link", "live")
 
 
 def page() -> bytes:
-    """Return the HTML of the page, which requests all data."""
+    """Return the HTML of the page, which requests its data from the server."""
     scripts = [(FOLDER / f"{name}.js").read_text("utf-8") for name in SCRIPTS]
     text = render(
         "live.html.j2",
@@ -212,21 +212,21 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], v
         split = "test" if view.name in test else "train"
         return {"name": view.name, "split": split, **pictures, **camera_data(view)}
 
-    first = next((i for i, view in enumerate(views) if view is viewpoint.start), -1)
+    first_index = next((i for i, view in enumerate(views) if view is viewpoint.start), -1)
     entries = [view_data(i, view) for i, view in enumerate(views)]
-    return {"number": number, "title": title, **viewpoint_data(viewpoint), "views": entries, "first": first}
+    return {"number": number, "title": title, **viewpoint_data(viewpoint), "views": entries, "first": first_index}
 
 
-# The handlers: the page, the scene, the state, pictures, and the two buttons.
+# The handlers: the page, the scene, the state, images, and the two buttons.
 
-WAIT = 4.0  # s until a page that waits for a preview repeats its request
-MAX_NUMBER = 1e9  # of a camera
+WAIT = 4.0  # s that a request waits for a preview; then the page repeats the request
+MAX_NUMBER = 1e9  # largest absolute value in a camera
 MAX_SIDE, MAX_ASPECT = 16384, 8.0  # of a requested preview
 STATUS_KEYS = {"state", "stage", "progress", "step", "steps", "gaussians", "seconds_left", "message", "device", "host"}
 
 
 class Handlers:
-    """Handles requests, from any thread."""
+    """Handles requests; can be called from any thread."""
 
     def __init__(self, live: LiveState) -> None:
         self.live = live
@@ -243,7 +243,7 @@ class Handlers:
         }
 
     def __call__(self, request: Request) -> Response:
-        """Return the response.  Raises RequestError."""
+        """Return the response to a request.  Raises RequestError."""
         if (route := self._routes.get(request.path)) is None:
             raise RequestError(404, "not found")
         self.live.note_request()
@@ -251,7 +251,7 @@ class Handlers:
 
     def _state(self, request: Request) -> Response:
         live, shown = self.live, self.live.shown
-        ended = live.ended  # read first, so that a page that learns of the end gets the final state
+        ended = live.ended  # read first, so that a page that receives the end also receives the final state
         status = live.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if live.status else {}
         state: dict[str, Any] = {**status, "scene": shown.number if shown else 0, "drawn": live.step}
         state |= {"paused": live.paused, "ended": ended, "fault": live.error}
@@ -264,9 +264,9 @@ class Handlers:
         return Response.json(self._require_scene().scene)
 
     def _frame(self, request: Request) -> Response:
-        """Return a preview of a `view`, or from a `camera` as camera.js writes it, at a `time` if given.
+        """Return a preview of the model from a `view` of the scene, or from a `camera` in the format of camera.js.
 
-        The status is 204 if the preview is not ready yet.
+        With a `camera`, the query may contain a timestamp, `time`.  The status is 204 if the preview is not ready yet.
         """
         live, shown = self.live, self._require_scene()
         pace = request.query.get("pace", "")
@@ -288,7 +288,7 @@ class Handlers:
     def _picture(self, request: Request, kind: Kind) -> Response:
         shown = self._require_scene()
         index = request.number("view", 0, len(shown.views) - 1)
-        if request.query.get("scene") != str(shown.number):  # of an earlier run of a matrix
+        if request.query.get("scene") != str(shown.number):  # from an earlier run of a matrix
             raise RequestError(404, "not found")
         try:
             data = shown.pictures.get(kind, index)
@@ -310,7 +310,7 @@ class Handlers:
 
 
 def parse_timestamp(text: str) -> float:
-    """Parse a timestamp.  Raises RequestError."""
+    """Parse a timestamp in [0, 1].  Raises RequestError."""
     try:
         value = float(text)
     except ValueError:
@@ -321,12 +321,13 @@ def parse_timestamp(text: str) -> float:
 
 
 def parse_camera(text: str) -> View:
-    """Parse a view as camera.js writes it: eye; quaternion x, y, z, w; fx, fy, cx, cy, width, height.
+    """Parse a view in the format of camera.js.  Raises RequestError.
 
-    Raises RequestError.
+    The format is "eye;quaternion;lens", each with comma-separated numbers: the position x, y, z; the rotation as a
+    quaternion x, y, z, w; and fx, fy, cx, cy, width, height in px.
     """
     try:
-        eye, rotation, lens = ([float(value) for value in part.split(",")] for part in text.split(";"))
+        eye, rotation, lens = ([float(value) for value in component.split(",")] for component in text.split(";"))
     except ValueError:
         raise RequestError(400, "camera: expected eye;quaternion;lens") from None
     if (len(eye), len(rotation), len(lens)) != (3, 4, 6) or not all(
@@ -338,8 +339,8 @@ def parse_camera(text: str) -> View:
     if not (math.hypot(*rotation) > 1e-6 and min(fx, fy) > 1e-3 and sides[0] >= 1 and sides[1] <= MAX_SIDE):
         raise RequestError(400, "camera: expected a rotation, positive focal lengths, and a size")
     if sides[1] > MAX_ASPECT * sides[0]:
-        raise RequestError(400, f"camera: expected a picture with an aspect ratio of at most {MAX_ASPECT:.0f}")
-    x, y, z, w = (part / math.hypot(*rotation) for part in rotation)
+        raise RequestError(400, f"camera: expected an image with an aspect ratio of at most {MAX_ASPECT:.0f}")
+    x, y, z, w = (component / math.hypot(*rotation) for component in rotation)
     matrix = rotation_matrix(w, x, y, z)
     pose = np.column_stack([matrix, -matrix @ np.array(eye)])
     return View("live", Camera(round(width), round(height), fx, fy, cx, cy), pose)

@@ -1,7 +1,7 @@
 """Group runs into variants and rows.
 
-Runs with the same settings form a variant, whatever their scene and seed.  The runs of a variant on one scene form a
-row: their mean, and the standard deviation over seeds.
+Runs with the same settings, except for scene and seed, form a variant.  The runs of a variant on one scene form a table
+row, which shows their mean, and the standard deviation over seeds.
 """
 
 import json
@@ -22,33 +22,33 @@ from clsplat.scene.scene import scene_name
 from clsplat.training.settings_diff import differences
 from clsplat.viewer.charts import COLORS
 
-# The settings in which resolved pipelines differ.
+# The differences between the settings of resolved pipelines.
 
 
 def flatten(settings: dict[str, Any]) -> dict[str, str]:
-    """Return the settings as a flat dictionary, key path to value as text, in the order of the file.
+    """Flatten settings to a dictionary from key path to value as text, in the order of the file.
 
-    A stage appears by its name and a strategy by its type, so that pipelines with different stages can be compared:
-    `optimize.densify.clone.gradient_above`.  The second item with the same name gets `#2`.
+    Key paths contain the names of stages and the types of strategies, as in `optimize.densify.clone.gradient_above`, so
+    that pipelines with different stages can be compared.  The second item with the same name is marked with `#2`.
     """
-    flattened: dict[str, str] = {}
+    flat_settings: dict[str, str] = {}
     for key, value in settings.items():
-        _add(flattened, "" if key == "stages" else str(key), value)
-    return flattened
+        _add(flat_settings, "" if key == "stages" else str(key), value)
+    return flat_settings
 
 
 def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the key paths at which any of several flat settings differs from the first."""
-    first, *others = settings
-    return list(dict.fromkeys(difference.key_path for other in others for difference in differences(first, other)))
+    """Return the key paths whose values differ between flat settings."""
+    reference, *others = settings
+    return list(dict.fromkeys(difference.key_path for other in others for difference in differences(reference, other)))
 
 
-def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
+def _add(flat_settings: dict[str, str], key_path: str, value: Any) -> None:
     if isinstance(value, dict):
         for key, inner in value.items():
-            _add(flattened, _join(key_path, str(key)), inner)
+            _add(flat_settings, _join(key_path, str(key)), inner)
         if not value:
-            flattened[key_path] = "yes"
+            flat_settings[key_path] = "yes"
     elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
         names: dict[str, int] = {}
         for item in value:
@@ -56,13 +56,13 @@ def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
             names[name] = names.get(name, 0) + 1
             label = name if names[name] == 1 else f"{name}#{names[name]}"
             parent = key_path.removesuffix("during").removesuffix("rules").removesuffix("losses").rstrip(".")
-            _add(flattened, _join(parent, label), inner)
+            _add(flat_settings, _join(parent, label), inner)
     else:
-        flattened[key_path] = value if isinstance(value, str) else json.dumps(value)
+        flat_settings[key_path] = value if isinstance(value, str) else json.dumps(value)
 
 
 def _split_item(item: Any) -> tuple[str, Any]:
-    """Return the name of a list item, and its settings without the name."""
+    """Return the name of a list item, and the item's settings without the name."""
     if isinstance(item, dict) and "type" in item:
         return str(item["type"]), {key: value for key, value in item.items() if key != "type"}
 
@@ -75,45 +75,45 @@ def _join(key_path: str, name: str) -> str:
     return f"{key_path}.{name}" if key_path else name
 
 
-MAX_DIFFERENCES = 3  # in the name of a variant
-MAX_FOLDERS = 3  # that a variant lists
-MAX_VALUE = 40  # characters of a value in a name
+MAX_DIFFERENCES = 3  # number of settings in the name of a variant
+MAX_FOLDERS = 3  # number of folders that a variant lists
+MAX_VALUE = 40  # number of characters of a value in a name
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings that runs share, with a letter and a color that identify them on the page."""
+    """Settings that several runs share, with the letter and the color that identify them on the page."""
 
     letter: str
     name: str
     color: str
-    settings: dict[str, str]  # by key path, without scene and seed, with the device
+    settings: dict[str, str]  # flat settings, without scene and seed, but with the device
     folders: str  # names of the folders of its runs
 
 
 @dataclass(frozen=True)
 class VariantRow:
-    """The runs of one variant on one scene, by seed."""
+    """The runs of one variant on one scene, in the order of their seeds."""
 
     variant: Variant
     runs: list[RunFolder]
 
     @property
     def downscale(self) -> str:
-        """The divisor of the image size in training; for several sizes, of the largest."""
+        """The divisor of the image size in training; with several sizes, the divisor of the largest."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
-        """Return the image-size divisors at which every run was measured."""
-        measured: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
-        return set.intersection(*measured)
+        """Return the divisors of the image size at which all runs were evaluated."""
+        downscale_sets: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
+        return set.intersection(*downscale_sets)
 
     def figures(self, split: str, downscale: str, metric: str) -> list[float]:
-        """Return a metric of the runs, or an empty list if a run lacks it."""
+        """Return the value of a metric for each run; empty if a run does not have it."""
         averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
         values = [average.figure(metric) if average else None for average in averages]
-        present = [value for value in values if value is not None]
-        return present if len(present) == len(values) else []
+        available_values = [value for value in values if value is not None]
+        return available_values if len(available_values) == len(values) else []
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class RunComparison:
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> "RunComparison":
-        """Read run folders; a matrix folder is replaced by its finished cells.
+        """Read run folders.  For a matrix folder, read its finished cells.
 
         Raises DataError if a folder is missing, unfinished, or damaged, and ConfigError if there is no folder, a folder
         is given twice, or a pipeline.yaml cannot be read.
@@ -132,36 +132,36 @@ class RunComparison:
         if not paths:
             raise ConfigError("no runs to compare; give the folder of at least one run")
         runs = [RunFolder.read(folder) for path in paths for folder in _cells(path)]
-        seen: set[Path] = set()
+        resolved_paths: set[Path] = set()
         for run in runs:
-            if run.path.resolve() in seen:
+            if run.path.resolve() in resolved_paths:
                 raise ConfigError(f"{run.path}: the run is given twice; give each run once")
-            seen.add(run.path.resolve())
+            resolved_paths.add(run.path.resolve())
         return cls(runs)
 
     @cached_property
     def variants(self) -> list[Variant]:
         """The variants, in the order of the runs."""
-        by_run = [_settings(run) for run in self.runs]
-        distinct: list[dict[str, str]] = []
-        for settings in by_run:
-            if settings not in distinct:
-                distinct.append(settings)
+        settings_by_run = [_settings(run) for run in self.runs]
+        distinct_settings: list[dict[str, str]] = []
+        for settings in settings_by_run:
+            if settings not in distinct_settings:
+                distinct_settings.append(settings)
         variants = []
-        for i, settings in enumerate(distinct):
-            runs = [run for run, values in zip(self.runs, by_run, strict=True) if values == settings]
+        for i, settings in enumerate(distinct_settings):
+            runs = [run for run, values in zip(self.runs, settings_by_run, strict=True) if values == settings]
             color = COLORS[i % len(COLORS)]
-            variants.append(Variant(_letter(i), _name(settings, distinct), color, settings, _folders(runs)))
+            variants.append(Variant(_letter(i), _name(settings, distinct_settings), color, settings, _folders(runs)))
         return variants
 
     @cached_property
     def scenes(self) -> dict[str, list[VariantRow]]:
         """The rows of each scene, by scene name, in the order of the runs."""
-        grouped: dict[str, list[RunFolder]] = {}
+        runs_by_scene: dict[str, list[RunFolder]] = {}
         for run in self.runs:
-            grouped.setdefault(run.scene.model_dump_json(), []).append(run)
-        names = _scene_names([runs[0] for runs in grouped.values()])
-        return {name: list(self._rows(runs)) for name, runs in zip(names, grouped.values(), strict=True)}
+            runs_by_scene.setdefault(run.scene.model_dump_json(), []).append(run)
+        names = _scene_names([runs[0] for runs in runs_by_scene.values()])
+        return {name: list(self._rows(runs)) for name, runs in zip(names, runs_by_scene.values(), strict=True)}
 
     def variant(self, run: RunFolder) -> Variant:
         """Return the variant of a run."""
@@ -169,12 +169,12 @@ class RunComparison:
 
     def _rows(self, runs: Sequence[RunFolder]) -> Iterator[VariantRow]:
         for variant in self.variants:
-            if selected := [run for run in runs if self.variant(run) is variant]:
-                yield VariantRow(variant, sorted(selected, key=lambda run: run.metrics.seed))
+            if variant_runs := [run for run in runs if self.variant(run) is variant]:
+                yield VariantRow(variant, sorted(variant_runs, key=lambda run: run.metrics.seed))
 
 
 def _cells(path: Path) -> list[Path]:
-    """Return the folders of finished cells for a matrix folder, or the folder itself."""
+    """Return the folders of the finished cells of a matrix folder; for another folder, the folder itself."""
     if not (path / PIPELINE).is_file() or "matrix" not in read_settings(path):
         return [path]
     cells = sorted(file.parent for file in path.glob("*/metrics.json"))
@@ -184,52 +184,55 @@ def _cells(path: Path) -> list[Path]:
 
 
 def _settings(run: RunFolder) -> dict[str, str]:
-    """Return the settings that identify a variant.
+    """Return the flat settings that identify the variant of a run.
 
-    Settings that `adapt` derived from the photos are left out: they differ between scenes, not between variants.
+    Settings that `adapt` derived from the photos are omitted, because they differ between scenes, not between variants.
     """
     settings = {key: value for key, value in run.settings.items() if key not in ("scene", "seed", "adapt")}
     adapt = run.settings.get("adapt") or {}
-    decided = [decision["key"] for decision in adapt.get("decisions") or ()]
-    chosen = {
-        path: value for path, value in flatten(settings).items() if not any(_is_below(path, key) for key in decided)
+    adapted_keys = [decision["key"] for decision in adapt.get("decisions") or ()]
+    variant_settings = {
+        path: value
+        for path, value in flatten(settings).items()
+        if not any(_is_below(path, key) for key in adapted_keys)
     }
-    return {**chosen, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
+    return {**variant_settings, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
 
 
 def _is_below(key_path: str, key: str) -> bool:
-    """Return whether a flat key path is, or is below, a key in the notation of `--set`.
+    """Return whether a flat key path is equal to, or below, a key in the notation of `--set`.
 
-    `optimize.during.0.per_pixel` is `optimize.densify.per_pixel`: `--set` counts the stages, flat paths name them.
+    `--set` numbers the stages, and flat paths name them: `optimize.during.0.per_pixel` is equal to
+    `optimize.densify.per_pixel`.
     """
-    parts = iter(key_path.split("."))
-    return all(part in parts for part in key.split(".") if part != "during" and not part.isdigit())
+    names = iter(key_path.split("."))
+    return all(name in names for name in key.split(".") if name != "during" and not name.isdigit())
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """Return the name of a variant: the pipeline's name, and the settings that most of its variants do not share."""
+    """Return the name of a variant: the name of its pipeline, and the settings that most variants do not share."""
     siblings = [other for other in distinct if other.get("name") == settings.get("name")]
-    words: list[str] = []
+    descriptions: list[str] = []
     for key_path in differing_keys(siblings):
-        text, *others = (_describe_setting(key_path, variant, siblings) for variant in (settings, *siblings))
-        if 2 * others.count(text) <= len(siblings) and text not in words:
-            words.append(text)
-    more = [f"and {len(words) - MAX_DIFFERENCES} more"] if len(words) > MAX_DIFFERENCES else []
-    return ", ".join([settings.get("name", "unnamed"), *words[:MAX_DIFFERENCES], *more])
+        description, *others = (_describe_setting(key_path, variant, siblings) for variant in (settings, *siblings))
+        if 2 * others.count(description) <= len(siblings) and description not in descriptions:
+            descriptions.append(description)
+    more = [f"and {len(descriptions) - MAX_DIFFERENCES} more"] if len(descriptions) > MAX_DIFFERENCES else []
+    return ", ".join([settings.get("name", "unnamed"), *descriptions[:MAX_DIFFERENCES], *more])
 
 
 def _describe_setting(key_path: str, settings: dict[str, str], siblings: Sequence[dict[str, str]]) -> str:
-    """Describe a setting, such as "init opacity 0.3", or "with prune large" and "without prune large"."""
+    """Describe a setting as text, such as "init opacity 0.3", "with prune large", or "without prune large"."""
     parts = key_path.split(".")
     for depth in range(1, len(parts) + 1):
         prefix = ".".join(parts[:depth])
-        below = [{path: v for path, v in values.items() if f"{path}.".startswith(f"{prefix}.")} for values in siblings]
-        if not all(below):  # a stage, rule or key that only some variants have
-            words = " ".join(parts[:depth][-2:]).replace("_", " ")
+        trees = [{path: v for path, v in values.items() if f"{path}.".startswith(f"{prefix}.")} for values in siblings]
+        if not all(trees):  # a stage, rule, or key that only some variants have
+            label = " ".join(parts[:depth][-2:]).replace("_", " ")
             if not any(f"{path}.".startswith(f"{prefix}.") for path in settings):
-                return f"without {words}"
-            if all(values == next(filter(None, below)) for values in below if values):
-                return f"with {words}"
+                return f"without {label}"
+            if all(values == next(filter(None, trees)) for values in trees if values):
+                return f"with {label}"
             break
     return f"{' '.join(parts[-2:]).replace('_', ' ')} {shorten(settings.get(key_path, 'unset'), MAX_VALUE)}"
 
@@ -241,7 +244,10 @@ def _folders(runs: Sequence[RunFolder]) -> str:
 
 
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
-    """Return a name per scene: its folder and image size, and all scene settings if two names would be equal."""
+    """Return a name for the scene of each run: its folder and image size.
+
+    If two names would be equal, they also contain all scene settings.
+    """
     names = []
     for run in runs:
         size = f" at 1/{run.scene.downscale:g}" if run.scene.downscale != 1 else ""
@@ -256,21 +262,21 @@ def _letter(index: int) -> str:
     return (_letter(index // 26 - 1) if index >= 26 else "") + chr(ord("A") + index % 26)
 
 
-# Published results to show next to measured ones: tables, each with its source and protocol.
+# Published results to show next to the metrics of runs: tables, each with its source and protocol.
 
 Text = Annotated[str, Field(min_length=1, max_length=2000)]
 
 
 class PublishedTable(BaseModel):
-    """A table of a publication."""
+    """A table of results from a publication."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     title: Text
-    source: Text  # the publication, and how the values were taken from it
-    protocol: Text  # data, sizes, steps
+    source: Text  # the publication, and how the values were extracted from it
+    protocol: Text  # dataset, image sizes, steps
     columns: Annotated[list[Text], Field(min_length=1)]
-    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # by method: a value per column, or null
+    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # by method: one value or null per column
 
     @model_validator(mode="after")
     def _check_rows(self) -> "PublishedTable":
@@ -283,7 +289,7 @@ class PublishedTable(BaseModel):
 
     @property
     def shown(self) -> dict[str, list[str]]:
-        """The values of each method as text, with the same number of digits."""
+        """The values of each method as text, all with the same number of decimals."""
         values = [value for row in self.rows.values() for value in row if value is not None]
         digits = max(len(f"{value:.10g}".partition(".")[2]) for value in values)
         return {
@@ -292,7 +298,7 @@ class PublishedTable(BaseModel):
 
 
 class Published(BaseModel):
-    """The contents of a file of published tables."""
+    """The content of a file with published tables."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -300,7 +306,7 @@ class Published(BaseModel):
 
 
 def read_published(path: Path) -> list[PublishedTable]:
-    """Read published tables from a YAML file.  Raises ConfigError, with the line, for invalid content."""
+    """Read published tables from a YAML file.  Raises ConfigError, which names the line, if the content is invalid."""
     document = read_yaml(path)
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected the key 'tables'")

@@ -1,4 +1,4 @@
-"""Find crops where runs differ most, in the views that all of them rendered."""
+"""Find the crops in which the renders of runs differ most."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,69 +15,69 @@ from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import View, load_image
 from clsplat.stages.render import image_path
 
-MIN_SIDE, MAX_SIDE = 48, 192  # px; a crop is a third of the image within these limits
-MAX_CROPS = 4  # per scene, each from another view
+MIN_SIDE, MAX_SIDE = 48, 192  # px; a crop's side is a third of the shorter image side, within these limits
+MAX_CROPS = 4  # per scene, each from a different view
 OVERVIEW_WIDTH = 340  # px
 
 
 @dataclass(frozen=True)
 class ImageCrop:
-    """A square crop of one view."""
+    """A square crop of a view, from its photo and from the render of each run."""
 
-    view: str
-    whole_photograph: Image
-    whole_renders: list[Image]  # by run
+    view: str  # name
+    full_photograph: Image
+    full_renders: list[Image]  # one per run
     x: int
     y: int
     side: int
-    difference: float  # mean over the square, in 8-bit levels
+    difference: float  # mean over the crop, in 8-bit levels
 
     @property
     def photograph(self) -> Image:
-        """The crop of the photo."""
-        return self._cut(self.whole_photograph)
+        """The crop from the photo."""
+        return self._cut(self.full_photograph)
 
     @property
     def renders(self) -> list[Image]:
-        """The crop of each run's render."""
-        return [self._cut(image) for image in self.whole_renders]
+        """The crop from each run's render."""
+        return [self._cut(image) for image in self.full_renders]
 
     @property
     def psnrs(self) -> list[float]:
-        """PSNR of the crop, dB, by run."""
+        """The PSNR of the crop, dB, for each run."""
         return [psnr(render, self.photograph) for render in self.renders]
 
     @property
     def frame(self) -> dict[str, float]:
-        """The left, top, width, and height of the square, in percent of the image."""
-        height, width = self.whole_photograph.shape[:2]
-        parts = {
+        """The left, top, width, and height of the crop, in percent of the image size."""
+        height, width = self.full_photograph.shape[:2]
+        fractions = {
             "left": self.x / width,
             "top": self.y / height,
             "width": self.side / width,
             "height": self.side / height,
         }
-        return {name: round(100 * part, 2) for name, part in parts.items()}
+        return {name: round(100 * fraction, 2) for name, fraction in fractions.items()}
 
     @property
     def overview(self) -> Image:
-        """The whole photo, OVERVIEW_WIDTH wide."""
-        height, width = self.whole_photograph.shape[:2]
+        """The full photo, resized to a width of OVERVIEW_WIDTH."""
+        height, width = self.full_photograph.shape[:2]
         size = (OVERVIEW_WIDTH, max(1, round(OVERVIEW_WIDTH * height / width)))
-        return cv2.resize(self.whole_photograph, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        return cv2.resize(self.full_photograph, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
     def _cut(self, image: Image) -> Image:
         return np.ascontiguousarray(image[self.y : self.y + self.side, self.x : self.x + self.side])
 
 
 def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) -> list[ImageCrop]:
-    """Return the crops where the renders of a scene differ most, from views that all runs rendered.
+    """Return the crops in which the renders of a scene differ most, from views that all runs rendered.
 
     Raises DataError if a render or a photo is damaged.
     """
-    rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
-    crops: list[ImageCrop] = []  # at most MAX_CROPS and one more view are in memory
-    for view in rendered:
+    rendered_views = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
+    crops: list[ImageCrop] = []  # images of at most MAX_CROPS + 1 views are in memory
+    for view in rendered_views:
         renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # undistorted
         crops.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
         crops = sorted(crops, key=lambda crop: -crop.difference)[:MAX_CROPS]
@@ -89,12 +89,12 @@ def _file(run: RunFolder, view: View) -> Path:
 
 
 def _crop(view: str, photograph: Image, renders: list[Image]) -> ImageCrop:
-    """Return the crop in which renders differ most from each other, or a single render from the photo."""
+    """Return the crop in which the renders differ most from each other.  Compare a single render with the photo."""
     images = np.stack(renders if len(renders) > 1 else [*renders, photograph])
     difference = (images.max(axis=0) - images.min(axis=0)).mean(axis=2, dtype=np.float32)
     height, width = photograph.shape[:2]
     side = min(height, width, max(MIN_SIDE, min(MAX_SIDE, min(height, width) // 3)))
     means = cv2.boxFilter(difference, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
-    inside = means[: height - side + 1, : width - side + 1]
-    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
-    return ImageCrop(view, photograph, renders, int(x), int(y), side, float(inside.max()))
+    valid_means = means[: height - side + 1, : width - side + 1]
+    y, x = np.unravel_index(int(valid_means.argmax()), valid_means.shape)
+    return ImageCrop(view, photograph, renders, int(x), int(y), side, float(valid_means.max()))

@@ -1,4 +1,4 @@
-"""Write runs side by side as a page that opens offline: metrics, curves, crops, differing settings."""
+"""Write an offline page that compares runs side by side: metrics, curves, crops, and differing settings."""
 
 import logging
 import os
@@ -23,7 +23,7 @@ from clsplat.viewer.charts import COLORS, Line, curve
 
 # The tables: metrics and costs, means over scenes, differing settings.
 
-METRICS = {  # by name: heading, digits, and the function that selects the best
+METRICS = {  # by name: heading, number of decimals, and the function that selects the best value
     "psnr": ("PSNR ↑", 2, max),
     "psnr_color": ("PSNR in the photos' colors ↑", 2, max),
     "psnr_affine": ("PSNR, colors fitted ↑", 2, max),
@@ -37,12 +37,12 @@ METRICS = {  # by name: heading, digits, and the function that selects the best
     "lpips": ("LPIPS ↓", 4, min),
 }
 CONDITIONS = {"lpips_input": "input range of LPIPS", "lpips_model": "LPIPS network"}
-MAX_SEEDS = 3  # more are only counted
+MAX_SEEDS = 3  # of more seeds, only the number is shown
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A mean as text, with the standard deviation if there are several runs."""
+    """A mean as text, with the standard deviation if there is more than one run."""
 
     text: str
     deviation: str = ""
@@ -51,7 +51,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: one value per row."""
+    """A column of a table, with one cell per row."""
 
     heading: str
     cells: list[TableCell]
@@ -71,12 +71,12 @@ class MetricTable:
 
     variants: list[Variant]
     groups: list[Group]
-    seeds: list[str] = field(default_factory=list)  # by row; empty to hide the column
+    seeds: list[str] = field(default_factory=list)  # one text per row; if empty, there is no column of seeds
 
 
 def main_table(rows: Sequence[VariantRow]) -> MetricTable:
-    """Return the test metrics at the training size, and the costs."""
-    costs = [
+    """Return the table of test metrics at the training size, and of costs such as time and memory."""
+    cost_columns = [
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
@@ -84,7 +84,7 @@ def main_table(rows: Sequence[VariantRow]) -> MetricTable:
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
-    return _table(rows, [*_training_size(rows), Group("", costs)])
+    return _table(rows, [*_training_size(rows), Group("", cost_columns)])
 
 
 def _train_seconds(row: VariantRow) -> float:
@@ -92,14 +92,14 @@ def _train_seconds(row: VariantRow) -> float:
 
 
 def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """Return a column of a cost that some runs record, or an empty list if no run does."""
-    costs = [[cost(run.metrics) for run in row.runs] for row in rows]
-    values = [[value for value in row if value is not None] for row in costs]
+    """Return a list with the column of a cost that only some runs record; empty if none of the runs recorded it."""
+    optional_values = [[cost(run.metrics) for run in row.runs] for row in rows]
+    values = [[value for value in row if value is not None] for row in optional_values]
     return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
 def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
-    """Return the metrics of all other sizes and views, one table per split, so that each fits on the page."""
+    """Return the tables of metrics at other sizes and of other views: one per split, so that each fits on the page."""
     by_split: dict[str, list[Group]] = {}
     for split, downscale in _measured_sizes(rows):
         if (split, downscale) != ("test", rows[0].downscale):
@@ -108,63 +108,66 @@ def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
 
 
 def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """Return the image-size divisors at which any row was measured, largest images first."""
+    """Return the divisors of the image size at which any row was evaluated, from the largest images to the smallest."""
     divisors = {downscale for row in rows for downscale in row.downscales(split)}
     return sorted(divisors, key=lambda text: (float(text), text))
 
 
 def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
-    """Return means over scenes, for variants that ran on all scenes; None if no metric was measured on all."""
+    """Return the table of means over scenes, for the variants with runs on all scenes.
+
+    Returns None if there is no metric that was measured on all scenes.
+    """
     scenes = list(comparison.scenes.values())
     rows_by_variant = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
-    complete = [rows for rows in rows_by_variant if len(rows) == len(scenes)]
+    groups = [rows for rows in rows_by_variant if len(rows) == len(scenes)]
     columns = []
-    for name, (heading, digits, best) in METRICS.items():
+    for name, (heading, digits, choose_best) in METRICS.items():
         means = [
-            [fmean(values) for row in rows if (values := row.figures("test", row.downscale, name))] for rows in complete
+            [fmean(values) for row in rows if (values := row.figures("test", row.downscale, name))] for rows in groups
         ]
         if means and all(len(values) == len(scenes) for values in means):
-            columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, best)))
-    return MetricTable([rows[0].variant for rows in complete], [Group("", columns)]) if columns else None
+            columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, choose_best)))
+    return MetricTable([rows[0].variant for rows in groups], [Group("", columns)]) if columns else None
 
 
 def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
-    """Return the values of the settings that differ between variants, by key path, in the order of variants."""
+    """Return the settings that differ between variants: by key path, the value of each variant."""
     key_paths = differing_keys([variant.settings for variant in variants])
     return {key_path: [variant.settings.get(key_path, "–") for variant in variants] for key_path in key_paths}
 
 
 def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
-    """Yield sentences about measuring conditions that differ between runs, so that their metrics are not comparable."""
+    """Yield a sentence for each condition of the measurement that differs, which makes metrics incomparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
-    averages = [average for split in splits for average in split.values()]
+    averages = [mean for split in splits for mean in split.values()]
     for key, name in CONDITIONS.items():
-        values = {str(value) for average in averages if (value := getattr(average, key, None)) is not None}
+        values = {str(value) for mean in averages if (value := getattr(mean, key, None)) is not None}
         if len(values) > 1:
             yield f"The {name} differs between runs ({', '.join(sorted(values))})."
     for split, downscale in _measured_sizes(rows):
-        measured = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
-        counts = {mean.color_views for mean in measured if mean is not None and mean.figure("psnr_color") is not None}
+        means = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
+        counts = {mean.color_views for mean in means if mean is not None and mean.figure("psnr_color") is not None}
         if len(counts) > 1:
             name = f"number of {_title(rows, split, downscale)} with a PSNR in the photos' colors"
             yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
 
 
 def _measured_sizes(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
-    """Return the splits and size divisors at which any row was measured."""
+    """Return the pairs of split and image-size divisor at which any row was evaluated."""
     return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 
 
 def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
-    """Return the test metrics at the training size, if they were measured."""
+    """Return a list with the group of test metrics at the training size; empty if they were not measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 
 
 def _group(rows: Sequence[VariantRow], split: str, downscale: str) -> Group:
     columns = [
-        Column(heading, _cells([row.figures(split, downscale, name) for row in rows], digits, best))
-        for name, (heading, digits, best) in METRICS.items()
+        Column(heading, _cells([row.figures(split, downscale, name) for row in rows], digits, choose_best))
+        for name, (heading, digits, choose_best) in METRICS.items()
         if any(row.figures(split, downscale, name) for row in rows)
     ]
     return Group(_title(rows, split, downscale), columns)
@@ -184,31 +187,37 @@ def _seeds(row: VariantRow) -> str:
     return ", ".join(seeds) if len(seeds) <= MAX_SEEDS else f"{len(seeds)} seeds"
 
 
-def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[TableCell]:
-    """Return a cell with the mean of each list of values; the best of the rounded means is marked."""
+def _cells(values: Sequence[list[float]], digits: int, choose: Callable[..., float] | None = None) -> list[TableCell]:
+    """Return a cell with the mean of each list of values.  The best of the rounded means is marked.
+
+    digits: number of decimals.  choose: returns the best of several means; None: mark no cell.
+    """
     means = [round(fmean(row), digits) if row else None for row in values]
-    present = [mean for mean in means if mean is not None]
-    top = best(present) if best and len(present) > 1 else None
-    return [_cell(row, mean, digits, mean == top) for row, mean in zip(values, means, strict=True)]
+    available_means = [mean for mean in means if mean is not None]
+    best_mean = choose(available_means) if choose and len(available_means) > 1 else None
+    return [_cell(row, mean, digits, mean == best_mean) for row, mean in zip(values, means, strict=True)]
 
 
-def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> TableCell:
+def _cell(values: list[float], mean: float | None, digits: int, is_best: bool) -> TableCell:
     if mean is None:
         return TableCell("–")
     deviation = stdev(values) if len(values) > 1 else 0.0
-    return TableCell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", best)
+    return TableCell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", is_best)
 
 
 # The charts: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
 
-MAX_LINES = len(COLORS)  # of a chart; with more runs, there is one line per variant
+MAX_LINES = len(COLORS)  # of a chart; if there are more runs, each line is the mean of a variant
 
 
 def curves(rows: Sequence[VariantRow]) -> list[Markup]:
-    """Draw PSNR and Gaussians over steps, then over sizes: one line per run, or per variant if there are many runs."""
+    """Draw charts of PSNR and Gaussians over steps, and of metrics over image sizes, as SVG.
+
+    Charts over steps have a line per run, or per variant if there are more than MAX_LINES runs.
+    """
     downscale = rows[0].runs[0].scene.downscale
     are_many = sum(len(row.runs) for row in rows) > MAX_LINES
-    means = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
+    suffix = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
 
     def lines(get_points: Callable[[RunFolder], Points]) -> list[Line]:
         if are_many:
@@ -232,25 +241,25 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         points = run.points("train", "psnr")
         return list(zip([step for step, _ in points], moving_average([psnr for _, psnr in points]), strict=True))
 
-    drawings = [
-        curve(f"test PSNR over steps, dB{means}", lines(test_points)),
+    charts = [
+        curve(f"test PSNR over steps, dB{suffix}", lines(test_points)),
         curve(
-            f"test PSNR over CPU seconds of training, dB{means}",
+            f"test PSNR over CPU seconds of training, dB{suffix}",
             lines(lambda run: run.over_cpu_seconds(test_points(run))),
         ),
-        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(training_points)),
-        curve(f"Gaussians over steps{means}", lines(lambda run: run.points("train", "gaussians"))),
+        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{suffix}", lines(training_points)),
+        curve(f"Gaussians over steps{suffix}", lines(lambda run: run.points("train", "gaussians"))),
     ]
-    return safe_charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
+    return safe_charts(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
 def _mean(lines: Sequence[Points]) -> Points:
-    """Return the pointwise mean of lines, up to the end of the shortest."""
+    """Return the pointwise mean of several lines, up to the end of the shortest line."""
     return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
 
 
 def _names(row: VariantRow) -> list[str]:
-    """Return names for the lines of a row with several runs: their seeds, or their folders if seeds repeat."""
+    """Return the names of the lines of a row with several runs: their seeds, or their folders if seeds repeat."""
     runs = row.runs
     if len(runs) == 1:
         return [""]
@@ -264,23 +273,23 @@ def _names(row: VariantRow) -> list[str]:
 
 
 def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """Draw PSNR and SSIM over image sizes, one line per variant."""
+    """Draw charts of PSNR and SSIM over image sizes, with one line per variant, as SVG."""
     sizes = downscales(rows, split)
     if len(sizes) < 2:
         return []
     ticks = {float(i): "full size" if size == "1" else f"1/{size}" for i, size in enumerate(sizes)}
-    drawings = []
+    charts = []
     for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
         lines = []
         for row in rows:
             points = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
             lines.append(Line([(i, fmean(values)) for i, values in points if values], color=row.variant.color))
-        drawings.append(curve(title, lines, ticks=ticks))
-    return drawings
+        charts.append(curve(title, lines, ticks=ticks))
+    return charts
 
 
 LOG = logging.getLogger("clsplat")
-MAX_NAMES = 4  # pipelines in the title
+MAX_NAMES = 4  # number of pipelines in the title
 
 
 def write_comparison(
@@ -290,7 +299,10 @@ def write_comparison(
     remarks: Sequence[str] = (),
     published: Sequence[PublishedTable] = (),
 ) -> int:
-    """Write the page for run folders; return the number of runs.  Raises the errors of `RunComparison.read`."""
+    """Write a page that compares run folders; return the number of runs.
+
+    remarks: sentences to show at the top.  Raises the errors of `RunComparison.read`.
+    """
     comparison = RunComparison.read(paths)
     warnings = [warning for run in comparison.runs for warning in run.missing_plugins]
     for warning in warnings:
@@ -306,9 +318,10 @@ def comparison_page(
     folder: Path,
     published: Sequence[PublishedTable] = (),
 ) -> str:
-    """Return the HTML of the page, with links relative to `folder` and `remarks` at the top.
+    """Return the HTML of the page.
 
-    title: by default the names of the pipelines.
+    title: "" for the names of the pipelines.  remarks: sentences to show at the top.  folder: the folder of the page,
+    to which links are relative.
     """
     runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
     names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
@@ -330,7 +343,7 @@ def comparison_page(
 
 
 def _links(run: RunFolder, folder: Path) -> dict[str, str]:
-    """Return the links to a run's pages, relative to a folder."""
+    """Return the links to the report and the viewer page of a run, relative to a folder."""
     files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
     return {
         stage: quote(Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
@@ -340,7 +353,7 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 
 
 def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
-    """Return the template values for the section of a scene."""
+    """Return the values of the template for the section of a scene."""
     crops, no_crops = _crops(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
@@ -359,15 +372,15 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
 
 
 def _sizes(scene: SceneSettings) -> list[str]:
-    """Return an explanation of image sizes, unless all training images had full size."""
-    first, *more = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
-    if first == "full size" and not more:
+    """Return an explanation of image sizes as a list; empty if all training images had full size."""
+    first, *others = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
+    if first == "full size" and not others:
         return []
-    return [f"sizes are relative to the original photos; trained at {', '.join([first, *more])}"]
+    return [f"sizes are relative to the original photos; trained at {', '.join([first, *others])}"]
 
 
 def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
-    """Return crops of each row's first run, and if there are none, the reason, such as missing photos."""
+    """Return the crops of the first run of each row.  If there are none, also return the reason, else ""."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
@@ -381,7 +394,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
 
 
 def _figure(crop: ImageCrop) -> dict[str, Any]:
-    """Return the template values of a crop, with images as data URLs; crops are PNG, because it is lossless."""
+    """Return the values of the template for a crop.  Images are data URLs; the crops are PNG, which is lossless."""
     return dict(
         view=crop.view,
         overview=data_url(crop.overview),
