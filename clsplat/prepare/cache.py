@@ -47,7 +47,7 @@ class PlannedStep:
     origin: str  # folder of the photographs, which is the input of the first step
     inputs: str  # hash of its inputs
     folder: Path
-    why: str  # reason to run the step; "" when its result exists already
+    reason: str  # why the step must run; "" if its result exists
 
     @property
     def key(self) -> str:
@@ -56,7 +56,7 @@ class PlannedStep:
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
-    """Return the steps for the photographs in `source`, with the reason to run each; results are kept below `root`.
+    """Plan the steps for the photographs in `source`: the folder of each result below `root`, and the reason to run it.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -68,8 +68,8 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
         planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _reason(step, inputs, folder, source)))
         inputs = key
     # A step whose result is missing need not run when the result of a later step exists.
-    done = max((i for i, step in enumerate(planned) if not step.why), default=-1)
-    return [replace(step, why="") if i < done else step for i, step in enumerate(planned)]
+    last_result = max((i for i, step in enumerate(planned) if not step.reason), default=-1)
+    return [replace(step, reason="") if i < last_result else step for i, step in enumerate(planned)]
 
 
 def prepare(
@@ -83,55 +83,56 @@ def prepare(
     Raises OutputError when another process is making one of the results, and any error of a step.
     """
     count = Count("steps of the preparation", len(planned), is_even=False)
-    if reused := [planned_step.step.stage for planned_step in planned if not planned_step.why]:
-        LOG.info("reusing the results of %s in %s", ", ".join(reused), root)
-    for number, planned_step in enumerate(planned):
+    if reused_names := [planned_step.step.stage for planned_step in planned if not planned_step.reason]:
+        LOG.info("reusing the results of %s in %s", ", ".join(reused_names), root)
+    for i, planned_step in enumerate(planned):
         with counts_as_debug():  # each step logs its own progress
-            count.reach(number)
-        with _lock_result(planned_step) if planned_step.why else nullcontext():
-            if planned_step.why and _fault(planned_step.folder):  # another process may have made it meanwhile
+            count.reach(i)
+        with _lock_result(planned_step) if planned_step.reason else nullcontext():
+            if planned_step.reason and _fault(planned_step.folder):  # another process may have made it meanwhile
                 with stage(planned_step.step.stage):
                     _run_step(planned_step, source, root)
             else:
-                for text in planned_step.step.warnings(read_record(planned_step.folder)):
-                    LOG.warning("%s", text)
+                for warning in planned_step.step.warnings(read_record(planned_step.folder)):
+                    LOG.warning("%s", warning)
         source = planned_step.folder
     return source
 
 
 @contextmanager
 def _lock_result(planned_step: PlannedStep) -> Iterator[None]:
-    """Lock a result, so that only one process continues an interrupted call."""
+    """Lock the result of a step for the block, so that only one process computes it."""
     with raising_output_error(planned_step.folder.parent):
         make_folder(planned_step.folder.parent)
     with lock.lock_folder(planned_step.folder, planned_step.folder.with_name(f".{planned_step.folder.name}.lock")):
         yield
 
 
-def fingerprint(folder: Path, excluded: Path) -> str:
-    """Return a hash of the names and contents of the files below a folder, except hidden ones and those in `excluded`.
+def fingerprint(folder: Path, excluded_folder: Path) -> str:
+    """Return a hash of the names and contents of the files below a folder.
 
+    Hidden files and folders, and files in `excluded_folder`, are not part of it.
     Raises DataError when the folder does not exist, or when a file in it cannot be read.
     """
     require_folder(folder)
-    parts = []
+    entries = []
     for base, folders, files in os.walk(folder):
         subfolders = {name: (Path(base) / name).resolve() for name in folders if name[0] != "."}
-        folders[:] = sorted(name for name, path in subfolders.items() if path != excluded.resolve())
+        folders[:] = sorted(name for name, path in subfolders.items() if path != excluded_folder.resolve())
         for name in sorted(files):
             path = Path(base) / name
             if name[0] != "." and path.is_file():
-                parts.append([path.relative_to(folder).as_posix(), sha256(path)])
-    return _digest(parts)
+                entries.append([path.relative_to(folder).as_posix(), sha256(path)])
+    return _digest(entries)
 
 
 def make_note(planned: Sequence[PlannedStep]) -> dict[str, str]:
-    """Return the note for a run folder: the hash of the prepared photographs, and their folder."""
+    """Return the note that a run folder keeps: the hash of the prepared photographs, and their folder."""
     return {"inputs": planned[-1].key, "folder": str(planned[-1].folder)}
 
 
 def read_note(out: Path) -> dict[str, str] | None:
-    """Return the note of a run folder, or None."""
+    """Return the note of a run folder.  None if it is missing or damaged."""
     try:
         summary = read_json(out / PREPARE_SUMMARY)
         return {"inputs": str(summary["inputs"]), "folder": str(summary["folder"])}
@@ -142,11 +143,11 @@ def read_note(out: Path) -> dict[str, str] | None:
 def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
     """Make a result in a hidden folder, and rename the folder when it is complete and synced to the disk.
 
-    A step that can resume continues from what an interrupted call with the same inputs and settings left there.
+    A resumable step continues from the files that an interrupted call with the same inputs and settings left there.
     """
     temporary = planned_step.folder.with_name(f".{planned_step.folder.name}")
-    if planned_step.why != NO_RESULT:
-        LOG.info("%s runs again: %s", planned_step.step.stage, planned_step.why)
+    if planned_step.reason != NO_RESULT:
+        LOG.info("%s runs again: %s", planned_step.step.stage, planned_step.reason)
     start = time.perf_counter()
     try:
         if planned_step.step.resumes:
@@ -154,7 +155,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
         else:
             shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True, exist_ok=True)
-        summary = planned_step.step.make(source.resolve(), temporary, root.parent)
+        figures = planned_step.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = planned_step.step.model_dump(mode="json")
         record = {
@@ -162,7 +163,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
             "inputs": planned_step.inputs,
             "settings": settings,
             "seconds": seconds,
-            **summary,
+            **figures,
         }
         sync_below(temporary)
         write_text(temporary / RECORD, json.dumps({**record, "files": _sizes(temporary)}, indent=1) + "\n")
@@ -180,11 +181,11 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
         ):  # name the user's folder, not a result
             raise DataError(str(error).replace(str(source.resolve() / IMAGES), planned_step.origin)) from error
         raise
-    LOG.info("%s (%.0f s)", planned_step.step.summary(summary), seconds)
+    LOG.info("%s (%.0f s)", planned_step.step.summary(figures), seconds)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the record of a result; empty when it is missing or damaged."""
+    """Return the record in the folder of a result.  Empty if it is missing or damaged."""
     try:
         record = read_json(folder / RECORD)
     except DataError:
@@ -194,9 +195,9 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """Return the size of each file below a folder in bytes, by relative path, except for the record.
+    """Return the sizes of the files below a folder in bytes, by relative path, without the record.
 
-    Links, such as those to photographs, are followed.
+    Links, such as links to photographs, are followed.
     """
     files = (Path(base, name) for base, _, names in os.walk(folder, followlinks=True) for name in names)
     sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
@@ -204,7 +205,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _fault(folder: Path) -> str:
-    """Return what is wrong with a result; "" when its record exists and every listed file has the recorded size."""
+    """Return the fault of a result, or "" if its record exists and every listed file has the recorded size."""
     record = read_record(folder)
     if not record:
         return f"{RECORD} is missing or damaged"
@@ -219,15 +220,15 @@ def _fault(folder: Path) -> str:
 
 
 def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return the reason to run a step, as the difference from the newest result; "" when the result exists."""
+    """Return the reason to run a step: a damaged result, or the difference from the newest one.  "" if it exists."""
     if folder.exists():
         fault = _fault(folder)
         return fault and f"{fault}; the result is recomputed"
     results = []
-    for other in folder.parent.glob(f"{step.stage}-*"):
-        record = read_record(other)
+    for path in folder.parent.glob(f"{step.stage}-*"):
+        record = read_record(path)
         if record.get("origin") == str(source.resolve()):
-            results.append((other.stat().st_mtime, record))
+            results.append((path.stat().st_mtime, record))
     if not results:
         return NO_RESULT
     newest = max(results, key=lambda pair: pair[0])[1]
@@ -245,7 +246,7 @@ INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that ar
 
 
 def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return the figures of each step by name, without steps whose results were removed."""
+    """Return the figures of the steps, by the name of the step.  Steps whose results were removed are left out."""
     records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}
@@ -254,7 +255,7 @@ def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
     }
 
 
-# Make a COLMAP folder from photographs without a pipeline, for the command `clsplat data photos`.
+# Make a COLMAP folder from photographs without a pipeline, as `clsplat data photos` does.
 
 STEPS = ".steps"  # folder in the scene for results, from which an interrupted call continues
 
@@ -267,7 +268,9 @@ def place_photographs(
     matching: Matching = "auto",
     mapper: Mapper = "incremental",
 ) -> int:
-    """Find the cameras of the photographs in `source`, write a COLMAP folder `out`, and return the number of images.
+    """Find the cameras of the photographs in `source`, and write a COLMAP folder `out`.
+
+    Returns the number of registered images.
 
     Raises DataError when `out` contains other images or a model, OutputError when another process uses it, and the
     errors of the steps.

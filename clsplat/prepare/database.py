@@ -12,7 +12,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.signals import stopping_on_signals
 
 DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"
-MATCHING = "matching.json"  # settings of the matching, for further attempts to place photographs
+MATCHING = "matching.json"  # settings of match_features, which further attempts to place photographs reuse
 COUNT_PAIRS = """
 import sqlite3, sys
 with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:
@@ -21,7 +21,7 @@ with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:
 
 
 def require_pycolmap() -> ModuleType:
-    """Import pycolmap and return it.  Raises ConfigError when it is not installed.
+    """Import and return pycolmap.  Raises ConfigError when it is not installed.
 
     Importing pycolmap installs a SIGTERM handler that dumps and exits, and reports any exception as a broken install.
     Therefore signals wait until the import has finished, and then get their handlers back.
@@ -40,56 +40,56 @@ def require_pycolmap() -> ModuleType:
 
 @contextmanager
 def open_database(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
-    """Open COLMAP's database for the block; create it if necessary."""
-    rows = pycolmap.Database.open(str(database))
+    """Open a COLMAP database for the block, and create it if it does not exist."""
+    db = pycolmap.Database.open(str(database))
     try:
-        yield rows
+        yield db
     finally:
-        rows.close()
+        db.close()
 
 
 def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
-    """Return the names of the images, sorted; empty when there is no database."""
+    """Return the sorted names of the images in a database.  Empty if the file does not exist."""
     if not database.exists():
         return []
-    with open_database(pycolmap, database) as rows:
-        return sorted(image.name for image in rows.read_all_images())
+    with open_database(pycolmap, database) as db:
+        return sorted(image.name for image in db.read_all_images())
 
 
-def images_without_features(rows: Any) -> dict[int, str]:
-    """Return the names of the images without features in an open database, by number, sorted by name."""
+def images_without_features(db: Any) -> dict[int, str]:
+    """Return the names of the images without features in an open database, by image ID, in order of their names."""
     return {
         image.image_id: image.name
-        for image in sorted(rows.read_all_images(), key=lambda image: image.name)
-        if not (rows.exists_keypoints(image.image_id) and rows.exists_descriptors(image.image_id))
+        for image in sorted(db.read_all_images(), key=lambda image: image.name)
+        if not (db.exists_keypoints(image.image_id) and db.exists_descriptors(image.image_id))
     }
 
 
 def clear_features(pycolmap: ModuleType, database: Path) -> None:
-    """Remove features and matches, but not cameras and images."""
-    with open_database(pycolmap, database) as rows:
-        for clear in ("two_view_geometries", "matches", "descriptors", "keypoints"):
-            getattr(rows, f"clear_{clear}")()
+    """Remove the features and matches from a database, and keep its cameras and images."""
+    with open_database(pycolmap, database) as db:
+        for table in ("two_view_geometries", "matches", "descriptors", "keypoints"):
+            getattr(db, f"clear_{table}")()
 
 
 def feature_counts(pycolmap: ModuleType, database: Path) -> dict[str, int]:
-    """Return the number of features of each image."""
-    with open_database(pycolmap, database) as rows:
-        return {image.name: rows.num_keypoints_for_image(image.image_id) for image in rows.read_all_images()}
+    """Return the number of features of each image in a database, by the name of the image."""
+    with open_database(pycolmap, database) as db:
+        return {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
 
 
 def verified_pairs(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
-    """Return the number of geometrically verified matches of each pair that has any."""
-    with open_database(pycolmap, database) as rows:
-        names = {image.image_id: image.name for image in rows.read_all_images()}
-        pairs, counts = rows.read_two_view_geometry_num_inliers()
-    numbers = map(pycolmap.pair_id_to_image_pair, pairs)
-    return {(names[a], names[b]): count for (a, b), count in zip(numbers, counts, strict=True) if count}
+    """Return the number of verified matches of each pair of images in a database, without pairs that have none."""
+    with open_database(pycolmap, database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+        pairs, counts = db.read_two_view_geometry_num_inliers()
+    id_pairs = map(pycolmap.pair_id_to_image_pair, pairs)
+    return {(names[a], names[b]): count for (a, b), count in zip(id_pairs, counts, strict=True) if count}
 
 
 @contextmanager
 def raising_data_error(path: Path, action: str) -> Iterator[None]:
-    """Convert an error of pycolmap in the block to a DataError with a message of one sentence."""
+    """Convert errors of pycolmap in the block to a DataError that names the path and the action that failed."""
     try:
         yield
     except (ValueError, RuntimeError) as error:
@@ -97,20 +97,20 @@ def raising_data_error(path: Path, action: str) -> Iterator[None]:
 
 
 def count_matched_pairs(database: Path) -> int:
-    """Return the number of pairs that pycolmap has matched so far; 0 when it cannot be read at the moment.
+    """Return the number of pairs that pycolmap has matched so far, or 0 if the database cannot be read at the moment.
 
     A child process reads it: a second SQLite library in pycolmap's process would release the locks of the first
     (https://www.sqlite.org/howtocorrupt.html, 2.2.1), and matches would be lost.
     """
-    address = f"{database.resolve().as_uri()}?mode=ro"
+    uri = f"{database.resolve().as_uri()}?mode=ro"
     try:
-        command = [sys.executable, "-I", "-S", "-c", COUNT_PAIRS, address]
+        command = [sys.executable, "-I", "-S", "-c", COUNT_PAIRS, uri]
         return int(subprocess.check_output(command, stderr=subprocess.DEVNULL))
     except (OSError, subprocess.CalledProcessError):
         return 0
 
 
 def remove_database(database: Path) -> None:
-    """Remove a database and its journal."""
+    """Remove a database and its journal files."""
     for file in database.parent.glob(f"{database.name}*"):
         file.unlink()

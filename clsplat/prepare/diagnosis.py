@@ -17,13 +17,13 @@ from clsplat.scene.quality import is_blurred, measure_sharpness
 
 FEW_FEATURES = 300  # per photograph: a plain wall has tens, a garden thousands
 MIN_TEXTURED = 1000  # features of a photograph with enough texture
-FEW_MATCHES = 30  # matches with the points of a model; with fewer, COLMAP does not place a photograph
-MAX_COMPARED = 15  # placed photographs with whose sharpness the others are compared
+FEW_MATCHES = 30  # matches with the points of a model; COLMAP does not place a photograph that has fewer
+MAX_COMPARED = 15  # number of placed photographs whose median sharpness is the typical one
 
 
 @dataclass
 class MatchGraph:
-    """The photographs, their numbers of features, and the pairs that match."""
+    """A graph of photographs: the number of features of each photograph, and the pairs that match."""
 
     images: Path
     features: dict[str, int]
@@ -37,27 +37,27 @@ class MatchGraph:
 
     @cached_property
     def matches(self) -> dict[str, dict[str, int]]:
-        """The number of verified matches of each photograph with each other one."""
+        """The number of verified matches of each photograph with each of the others."""
         matches: dict[str, dict[str, int]] = {name: {} for name in self.features}
         for (a, b), count in self.pairs.items():
             matches[a][b] = matches[b][a] = count
         return matches
 
     def groups(self, min_matches: int) -> list[list[str]]:
-        """Return the groups connected by pairs with at least `min_matches`, each sorted, the largest first."""
+        """Return the groups connected by pairs with at least `min_matches` matches, each sorted, the largest first."""
         return connected_groups(self.features, [pair for pair, count in self.pairs.items() if count >= min_matches])
 
     def has_unrelated_photographs(self) -> bool:
-        """Return whether most photographs match no others despite many features, so that denser ones would not help.
+        """Return whether most photographs match no other photograph, although they have many features.
 
-        Photographs of one scene have at least some matches, even if too few to place a camera; photographs of plain
-        surfaces have too few features, and denser ones may help.
+        Denser features do not help then: photographs of one scene have at least some matches, even if too few to place
+        a camera.  Photographs of plain surfaces have few features, and denser features may help.
         """
         is_textured = median(self.features.values()) >= MIN_TEXTURED
         return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
 
     def measure_sharpness(self, name: str) -> NDArray[np.float64]:
-        """Return both sharpness values of a photograph, measured once."""
+        """Return both sharpness values of a photograph, [2], which are measured once and cached."""
         if name not in self.sharpness:
             self.sharpness[name] = measure_sharpness(self.images / name)
         return self.sharpness[name]
@@ -75,7 +75,7 @@ def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> 
 
 
 def diagnose(graph: MatchGraph) -> str:
-    """Return the likely reason why no photographs could be placed, with a remedy."""
+    """Return the likely reason why no photograph could be placed, and a remedy."""
     count = round(median(graph.features.values()))
     if count < FEW_FEATURES:
         problem = f"half of them have {f'at most {count}' if count else 'no'} features"
@@ -92,18 +92,21 @@ def diagnose(graph: MatchGraph) -> str:
 
 
 def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
-    """Describe which photographs match each other and which do not match any."""
-    single = [name for group in groups if len(group) == 1 for name in group]
-    count = len(groups) - len(single)
+    """Describe which photographs match each other, and which match no other."""
+    singles = [name for group in groups if len(group) == 1 for name in group]
+    count = len(groups) - len(singles)
     if not count:
         return f"no two of them overlap enough: {max(graph.pairs.values())} matches at most"
-    others = f", and {len(single)} without a good match ({first_few(single)})" if single else ""
+    suffix = f", and {len(singles)} without a good match ({first_few(singles)})" if singles else ""
     largest = f"{len(groups[0])} ({first_few(groups[0])})"
-    return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest of {largest}{others}"
+    return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest of {largest}{suffix}"
 
 
 def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
-    """Return the likely reason why each photograph is not in the first of the models."""
+    """Return the photographs that are not in the first model, by name, with the likely reason.
+
+    models: the names of the photographs in each model, the largest model first.
+    """
     placed = models[0]
     sample = sorted(placed)[:: max(1, len(placed) // MAX_COMPARED)]
     typical_sharpness = np.median([graph.measure_sharpness(name) for name in sample], axis=0)
@@ -120,16 +123,16 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
 
 def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpness: NDArray[np.float64]) -> str:
     matches = graph.matches[name]
-    placed = {other: count for other, count in matches.items() if other in placed_names}
+    counts = {other: count for other, count in matches.items() if other in placed_names}
     if graph.features[name] < FEW_FEATURES:
         return f"only {pluralize(graph.features[name], 'feature')}: blurred, dark, or a plain surface"
-    is_soft = is_blurred(graph.measure_sharpness(name), typical_sharpness)
-    note = "; it may be blurred" if is_soft else ""
+    is_unsharp = is_blurred(graph.measure_sharpness(name), typical_sharpness)
+    note = "; it may be blurred" if is_unsharp else ""
     if not matches:  # only a guess: a photograph without fine detail measures like a blurred one
         return f"matches no other photograph{note}"
     best = max(matches, key=lambda other: (matches[other], other))
-    if not placed:
+    if not counts:
         return f"matches only {best}, which is not placed either"
-    if max(placed.values()) < FEW_MATCHES:
-        return f"few matches, at most {max(placed.values())}, with {max(placed, key=lambda o: (placed[o], o))}{note}"
-    return "blurred" if is_soft else f"{matches[best]} matches with {best}, but too few on points of the model"
+    if max(counts.values()) < FEW_MATCHES:
+        return f"few matches, at most {max(counts.values())}, with {max(counts, key=lambda o: (counts[o], o))}{note}"
+    return "blurred" if is_unsharp else f"{matches[best]} matches with {best}, but too few on points of the model"

@@ -1,6 +1,6 @@
 """Find SIFT features of photographs (Lowe 2004) with OpenCV, and store them in COLMAP's database.
 
-The database has the images in order of their names, so that the same photographs give the same rows.  The features of
+Images are stored in order of their names, so the same photographs always produce the same database.  The features of
 each photograph are written in one transaction, so a killed call can be resumed with the next photograph.
 """
 
@@ -34,17 +34,17 @@ LOG = logging.getLogger("clsplat")
 CameraModel = Literal[
     "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"
 ]
-LAYERS, MAX_EDGE, BLUR = 3, 10.0, 1.6  # Lowe 2004: scales of an octave, ratio of curvatures, px
+LAYERS, MAX_EDGE, BLUR = 3, 10.0, 1.6  # Lowe 2004: scales per octave, ratio of principal curvatures, sigma in px
 LEVELS = 512  # scale of RootSIFT values, as COLMAP stores them; values above 255 are clipped
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Find at most `count` features in an image of `long_side` px; `contrast` is a fraction of the gray range."""
+    """Settings of the feature detector."""
 
-    long_side: int = 1600
-    count: int = 12288
-    contrast: float = 0.02  # COLMAP's; Lowe 2004 has 0.04
+    long_side: int = 1600  # px; larger images are reduced
+    count: int = 12288  # maximum number of features per image
+    contrast: float = 0.02  # threshold, as a fraction of the gray range; the default of COLMAP, and 0.04 in Lowe 2004
 
 
 def find_features(
@@ -53,18 +53,19 @@ def find_features(
     options: FeatureOptions = FeatureOptions(),
     camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
-    excluded: Path | None = None,
+    excluded_folder: Path | None = None,
 ) -> dict[str, Any]:
-    """Find features; return the number of photographs and cameras, and why some photographs cannot be read.
+    """Find the features of the photographs in a folder, and write a COLMAP database in the folder `out`.
 
+    Returns the numbers of photographs and cameras, and the photographs that cannot be read, by name, with the reason.
     Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of the
     same size share a camera if EXIF has the same lens for them, or none.  Raises DataError when fewer than three
     photographs can be read.
     """
     pycolmap = require_pycolmap()
-    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, excluded))
+    names, read_errors = gather(photographs, out / IMAGES, list_photographs(photographs, excluded_folder))
     groups = group_photos(out / IMAGES, names, cameras)
-    figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
+    figures = {"photographs": len(names), "cameras": len(groups), "damaged": read_errors}
     log_warnings(figures)
     if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
         LOG.warning(
@@ -88,25 +89,28 @@ def _is_panorama(photograph: Path) -> bool:
 
 
 def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
-    """Find features of the photographs in a database that do not have any yet.  Raises DataError."""
+    """Find the features of the photographs in a database that have no features yet.
+
+    Raises DataError when a photograph cannot be read, or when pycolmap fails.
+    """
     pycolmap = require_pycolmap()
-    with raising_data_error(images, "find features"), open_database(pycolmap, database) as rows:
-        missing = images_without_features(rows)
-        for number, name in counted(missing.items(), "photographs with features", len(missing)):
+    with raising_data_error(images, "find features"), open_database(pycolmap, database) as db:
+        names_by_id = images_without_features(db)
+        for image_id, name in counted(names_by_id.items(), "photographs with features", len(names_by_id)):
             pixels, (scale_x, scale_y) = read_gray(images / name, options.long_side)
             keypoints, descriptors = sift(pixels, options)
             keypoints[:, :3] *= scale_x, scale_y, (scale_x + scale_y) / 2
-            with pycolmap.DatabaseTransaction(rows):
-                rows.write_keypoints(number, keypoints)
-                kind = pycolmap.FeatureExtractorType.SIFT
-                rows.write_descriptors(number, pycolmap.FeatureDescriptors(data=descriptors, type=kind))
+            with pycolmap.DatabaseTransaction(db):
+                db.write_keypoints(image_id, keypoints)
+                feature_type = pycolmap.FeatureExtractorType.SIFT
+                db.write_descriptors(image_id, pycolmap.FeatureDescriptors(data=descriptors, type=feature_type))
 
 
 def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the features with the highest contrast as COLMAP stores them: x, y, scale in px and angle, [M, 4], and
-    the descriptors, [M, 128].
+    """Return the keypoints, [M, 4], and descriptors, [M, 128], of the features with the highest contrast.
 
-    Pixel (0, 0) has its center at (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
+    Keypoints are x, y and scale in px, and the angle in radians, as COLMAP stores them: pixel (0, 0) has its center at
+    (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
     """
     detector = cv2.SIFT.create(
         nfeatures=options.count,
@@ -116,34 +120,34 @@ def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np
         sigma=BLUR,
         enable_precise_upscale=True,
     )
-    points, raw = detector.detectAndCompute(pixels, None)
+    points, raw_descriptors = detector.detectAndCompute(pixels, None)
     if not points:
         return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
     best = np.argsort([-point.response for point in points], kind="stable")[: options.count]
     keypoints = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size / 2, np.deg2rad(p.angle)) for p in points]
-    fractions = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1.0e-6)
+    fractions = raw_descriptors / np.maximum(raw_descriptors.sum(axis=1, keepdims=True), 1.0e-6)
     descriptors = np.clip(np.rint(LEVELS * np.sqrt(fractions)), 0, 255).astype(np.uint8)
     return np.array(keypoints, np.float32)[best], descriptors[best]
 
 
 def _register(pycolmap: ModuleType, out: Path, groups: Sequence[Sequence[str]], camera_model: CameraModel) -> None:
-    """Write the images into a new database, with one camera per group and its focal length from EXIF."""
+    """Write the images to a new database, with one camera per group, whose focal length is from EXIF."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
-    camera_of: Mapping[str, int] = {name: number for number, group in enumerate(groups, 1) for name in group}
-    with open_database(pycolmap, out / DATABASE) as rows, pycolmap.DatabaseTransaction(rows):
-        for number, group in enumerate(groups, 1):
+    camera_ids: Mapping[str, int] = {name: i for i, group in enumerate(groups, 1) for name in group}
+    with open_database(pycolmap, out / DATABASE) as db, pycolmap.DatabaseTransaction(db):
+        for camera_id, group in enumerate(groups, 1):
             camera = pycolmap.infer_camera_from_image(out / IMAGES / group[0], reader)
-            camera.camera_id = number
-            rows.write_camera(camera, use_camera_id=True)
+            camera.camera_id = camera_id
+            db.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig()
-            rig.rig_id = number
+            rig.rig_id = camera_id
             rig.add_ref_sensor(camera.sensor_id)
-            rows.write_rig(rig, use_rig_id=True)
-        for number, name in enumerate(sorted(camera_of), 1):
-            image = pycolmap.Image(name=name, camera_id=camera_of[name], image_id=number)
-            rows.write_image(image, use_image_id=True)
+            db.write_rig(rig, use_rig_id=True)
+        for image_id, name in enumerate(sorted(camera_ids), 1):
+            image = pycolmap.Image(name=name, camera_id=camera_ids[name], image_id=image_id)
+            db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame()
-            frame.frame_id, frame.rig_id = number, camera_of[name]
+            frame.frame_id, frame.rig_id = image_id, camera_ids[name]
             frame.add_data_id(image.data_id)
-            rows.write_frame(frame, use_frame_id=True)
+            db.write_frame(frame, use_frame_id=True)

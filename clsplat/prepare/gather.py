@@ -1,4 +1,4 @@
-"""Find the photographs in a folder and link them into another; describe what is left out."""
+"""Find the photographs in a folder, link them into another folder, and describe the photographs that are left out."""
 
 import logging
 import os
@@ -40,31 +40,31 @@ CONVERTERS = {  # photographs that OpenCV cannot read, and commands that convert
     "raw": ({".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}, "darktable-cli d.nef d.jpg"),
     "other": ({".gif", ".jxl", ".jp2", ".exr", ".hdr", ".psd", ".tga"}, "magick d.gif d.jpg"),
 }
-BRANDS = {  # at byte 8, after `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV1 Image File Format
+BRANDS = {  # at byte 8 of a file, after `ftyp`, in HEIF (ISO/IEC 23008-12) and the AV1 Image File Format
     "HEIC": {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"},
     "AVIF": {b"avif", b"avis"},
 }
 UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTERS.values() for suffix in suffixes}
-OTHER_FORMAT = "contains {} data"  # why a photograph cannot be read
+OTHER_FORMAT = "contains {} data"  # reason why a photograph cannot be read
 MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
-CHECKED_SIDE = 64  # px: linked photographs are decoded only to check them
+CHECKED_SIDE = 64  # px; photographs that are linked are decoded at this size, only to check them
 
 
-def list_photographs(folder: Path, excluded: Path | None = None) -> list[str]:
-    """Return the names of the photographs below a folder, sorted, except hidden ones and those below `excluded`.
+def list_photographs(folder: Path, excluded_folder: Path | None = None) -> list[str]:
+    """Return the sorted names of the photographs below a folder, without hidden ones and those in `excluded_folder`.
 
-    Raises DataError when there are too few.
+    Logs a warning about files in other formats.  Raises DataError when there are too few photographs.
     """
-    names, unreadable = _photo_names(folder, excluded)
-    for text in (*_how_to_convert(unreadable), unread_cameras(folder)):
-        if text:
-            LOG.warning("%s: %s", folder, text)
-    require_photographs(folder, excluded)
+    names, unreadable_names = _photo_names(folder, excluded_folder)
+    for warning in (*_conversion_hints(unreadable_names), unread_cameras(folder)):
+        if warning:
+            LOG.warning("%s: %s", folder, warning)
+    require_photographs(folder, excluded_folder)
     return names
 
 
 def require_folder(folder: Path) -> None:
-    """Raise DataError unless `folder` is a folder; for a video, name the command that extracts photographs."""
+    """Raise DataError unless `folder` is a folder.  For a video, the error names the command to extract photographs."""
     if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
         raise DataError(
             f"{folder}: is a video; run `clsplat data video {shell_quote(folder)} FOLDER` to extract photographs"
@@ -74,78 +74,79 @@ def require_folder(folder: Path) -> None:
         raise DataError(f"{folder}: {fault}; expected a folder of photographs")
 
 
-def require_photographs(folder: Path, excluded: Path | None = None) -> None:
-    """Raise DataError when there are too few photographs below a folder."""
-    names, unreadable = _photo_names(folder, excluded)
+def require_photographs(folder: Path, excluded_folder: Path | None = None) -> None:
+    """Raise DataError when there are fewer than MIN_PHOTOGRAPHS photographs below a folder."""
+    names, unreadable_names = _photo_names(folder, excluded_folder)
     if len(names) < MIN_PHOTOGRAPHS:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
-        hints = "".join(f"; {text}" for text in _how_to_convert(unreadable))
+        hints = "".join(f"; {text}" for text in _conversion_hints(unreadable_names))
         raise DataError(
             f"{folder}: has {pluralize(len(names), 'photograph')}; "
             f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){hints}"
         )
 
 
-def _how_to_convert(unreadable: list[str]) -> list[str]:
-    """Return a sentence for each kind of photo that cannot be read."""
-    texts = []
+def _conversion_hints(unreadable_names: list[str]) -> list[str]:
+    """Return a sentence for each format that cannot be read, with a command to convert its files."""
+    hints = []
     for kind, (suffixes, command) in CONVERTERS.items():
-        if names := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
+        if names := [name for name in unreadable_names if Path(name).suffix.lower() in suffixes]:
             unreadable_files = f"{pluralize(len(names), f'{kind} file')} cannot be read ({first_few(names)})"
-            texts.append(f"{unreadable_files}: convert to JPEG, for example with {command}")
-    return texts
+            hints.append(f"{unreadable_files}: convert to JPEG, for example with {command}")
+    return hints
 
 
-def _photo_names(folder: Path, excluded: Path | None) -> tuple[list[str], list[str]]:
-    """Return the sorted names of the readable photos, and the names of photos in other formats."""
+def _photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str], list[str]]:
+    """Return the sorted names of the photographs below a folder, and the names of photographs in other formats."""
     require_folder(folder)
     names: list[str] = []
-    unreadable: list[str] = []
+    unreadable_names: list[str] = []
     for base, folders, files in os.walk(folder):
-        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != excluded)
+        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != excluded_folder)
         for file in files:
             suffix = Path(file).suffix.lower()
             if file[0] != "." and suffix in IMAGE_SUFFIXES | UNREADABLE_SUFFIXES:
                 name = (Path(base) / file).relative_to(folder).as_posix()
-                (names if suffix in IMAGE_SUFFIXES else unreadable).append(name)
-    return sorted(names), unreadable
+                (names if suffix in IMAGE_SUFFIXES else unreadable_names).append(name)
+    return sorted(names), unreadable_names
 
 
 def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str], dict[str, str]]:
     """Link photographs into the folder `images`, or copy them upright; keep files that an interrupted call left there.
 
-    Return the names of the readable photographs, and why the others cannot be read.
+    Returns the names of the readable photographs, and the others by name, with the reason why they cannot be read.
+    Raises DataError when too few can be read, or when all are blank.
     """
-    readable, damaged, count = [], dict[str, str](), Count("photographs read", len(names))
-    blank = 0
-    for number, name in enumerate(names, 1):
-        count.reach(number)
+    readable_names, read_errors, count = [], dict[str, str](), Count("photographs read", len(names))
+    blank_count = 0
+    for i, name in enumerate(names, 1):
+        count.reach(i)
         if _is_gathered(photographs / name, images / name):
-            readable.append(name)
+            readable_names.append(name)
             continue
         try:
-            blank += _gather_one(photographs / name, images / name)
+            blank_count += _gather_photo(photographs / name, images / name)
         except DataError as error:
-            damaged[name] = failure_reason(photographs / name, error)
+            read_errors[name] = failure_reason(photographs / name, error)
             continue
-        readable.append(name)
+        readable_names.append(name)
     # written separately, since a copy of a PNG has no EXIF data
-    write_exposures(images, {name: read_exif_exposure(photographs / name) for name in readable})
+    write_exposures(images, {name: read_exif_exposure(photographs / name) for name in readable_names})
     if times := read_times(photographs):
-        write_times(images, {name: times[name] for name in readable if name in times})
-    if readable and blank == len(readable):
+        write_times(images, {name: times[name] for name in readable_names if name in times})
+    if readable_names and blank_count == len(readable_names):
         raise DataError(f"{photographs}: no photograph shows anything; export or take them again")
-    if len(readable) < MIN_PHOTOGRAPHS:
-        faults = first_few([f"{name} ({reason})" for name, reason in damaged.items()])
+    if len(readable_names) < MIN_PHOTOGRAPHS:
+        faults = first_few([f"{name} ({reason})" for name, reason in read_errors.items()])
         raise DataError(
-            f"{photographs}: only {len(readable)} of {len(names)} photographs can be read: {faults}; "
-            f"{remedy_for(damaged)}"
+            f"{photographs}: only {len(readable_names)} of {len(names)} photographs can be read: {faults}; "
+            f"{remedy_for(read_errors)}"
         )
-    return readable, damaged
+    return readable_names, read_errors
 
 
 def failure_reason(photograph: Path, error: DataError) -> str:
-    """Return why a photograph cannot be read, in a few words: its actual format, or the message of `error`."""
+    """Return the reason why a photograph cannot be read: its actual format, or the message of `error`."""
     with suppress(OSError), open_regular(photograph) as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
@@ -154,18 +155,18 @@ def failure_reason(photograph: Path, error: DataError) -> str:
     return str(error).removeprefix(f"{photograph}: ").partition(";")[0]
 
 
-def remedy_for(damaged: Mapping[str, str]) -> str:
-    """Return how to make damaged photographs readable.  damaged: reasons by name, as `gather` returns them."""
+def remedy_for(read_errors: Mapping[str, str]) -> str:
+    """Return a remedy for photographs that cannot be read.  read_errors: reasons by name, as `gather` returns them."""
     remedies = {f"the file is {content}": remedy for _, content, remedy in STARTS}
     for kind in BRANDS:
         remedies[OTHER_FORMAT.format(kind)] = f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}"
-    texts = [remedy for reason, remedy in remedies.items() if reason in damaged.values()]
-    if set(damaged.values()) - remedies.keys():
-        texts.append("export the others again" if texts else "export them again")
-    return "; ".join(texts)
+    sentences = [remedy for reason, remedy in remedies.items() if reason in read_errors.values()]
+    if set(read_errors.values()) - remedies.keys():
+        sentences.append("export the others again" if sentences else "export them again")
+    return "; ".join(sentences)
 
 
-def _gather_one(source: Path, target: Path) -> bool:
+def _gather_photo(source: Path, target: Path) -> bool:
     """Link a photograph, or write it upright with its EXIF data; return whether the image is blank.
 
     Raises DataError when it cannot be read.
@@ -176,8 +177,8 @@ def _gather_one(source: Path, target: Path) -> bool:
         is_upright = header.orientation == 1
         pixels = read_gray(source, CHECKED_SIDE)[0] if is_upright else decode_image(data, source, upright=True)
     else:
-        stored, pixels = decode_image(data, source), decode_image(data, source, upright=True)
-        is_upright = stored.shape[:2] == pixels.shape[:2] and bool((stored[:, :, :3] == pixels[:, :, :3]).all())
+        raw, pixels = decode_image(data, source), decode_image(data, source, upright=True)
+        is_upright = raw.shape[:2] == pixels.shape[:2] and bool((raw[:, :, :3] == pixels[:, :, :3]).all())
     if is_upright:
         link(source, target)
     else:
@@ -188,9 +189,9 @@ def _gather_one(source: Path, target: Path) -> bool:
 
 
 def link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not supported; keep an existing one.
+    """Link a file or folder, or copy it where links are not supported.  Keep an existing link or copy.
 
-    The link is relative, so it stays valid when both are moved together.
+    The link is relative, so it stays valid when source and target are moved together.
     """
     if _is_gathered(source, target):
         return
@@ -209,53 +210,53 @@ def link(source: Path, target: Path) -> None:
 
 
 def _is_gathered(source: Path, target: Path) -> bool:
-    """Return whether the target is a complete copy of the source or a link to it."""
+    """Return whether the target is a complete copy of the source, or a link to it."""
     return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())
 
 
 def log_warnings(figures: Mapping[str, Any]) -> None:
-    """Log warnings about the photographs that a step left out."""
-    for text in warnings_for(figures):
-        LOG.warning("%s", text)
+    """Log the warnings about photographs that a step left out.  figures: the result of the step."""
+    for warning in warnings_for(figures):
+        LOG.warning("%s", warning)
 
 
 def warnings_for(figures: Mapping[str, Any]) -> list[str]:
-    """Return warnings about the photographs that a step left out, from the figures that it returned."""
-    texts = []
-    if damaged := figures.get("damaged"):
-        names = [f"{name} ({reason})" for name, reason in damaged.items()]
+    """Return the warnings about photographs that a step left out.  figures: the result of the step."""
+    warnings = []
+    if errors := figures.get("damaged"):
+        names = [f"{name} ({reason})" for name, reason in errors.items()]
         count = figures["photographs"] + len(names)
-        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy_for(damaged)}")
-    if missing := figures.get("not_registered"):
+        warnings.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy_for(errors)}")
+    if missing_names := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
-        examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
+        examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing_names])
         alternative = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
-        texts.append(
-            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed and are not "
-            f"used: {examples}; to place them, add photographs from viewpoints in between{alternative}"
+        warnings.append(
+            f"{len(missing_names)} of {figures['registered'] + len(missing_names)} photographs could not be placed and "
+            f"are not used: {examples}; to place them, add photographs from viewpoints in between{alternative}"
         )
     if sizes := figures.get("other_models"):
         counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photograph")])
-        texts.append(
+        warnings.append(
             f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}: add "
             "photographs that connect them"
         )
-    return texts
+    return warnings
 
 
 def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return how many photographs were placed, their mean reprojection error, and which are left out; "" if unknown.
+    """Return a sentence: the number of placed photographs, their mean reprojection error, and the ones left out.
 
-    figures: of each step, as `step_facts` returns them.
+    figures: the figures of the steps, as `step_facts` returns them.  The sentence is "" if they are incomplete.
     """
     cameras = figures.get("map_cameras", {})
     try:
-        damaged = [f"{name} ({reason})" for name, reason in figures.get("find_features", {}).get("damaged", {}).items()]
+        faults = [f"{name} ({reason})" for name, reason in figures.get("find_features", {}).get("damaged", {}).items()]
         reasons = cameras.get("reasons", {})
-        missing = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
-        placed, unused = int(cameras["registered"]), [*damaged, *missing]
+        unplaced = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
+        count, unused_photos = int(cameras["registered"]), [*faults, *unplaced]
         error = float(cameras["error_px"])
-        text = f"{placed} of {placed + len(unused)} photographs placed, reprojection error {error:.2f} px"
+        text = f"{count} of {count + len(unused_photos)} photographs placed, reprojection error {error:.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
-    return text + (f"; left out: {first_few(unused)}" if unused else "")
+    return text + (f"; left out: {first_few(unused_photos)}" if unused_photos else "")

@@ -1,7 +1,7 @@
 """Find cameras and points from matches with pycolmap, in several attempts until all photographs are placed.
 
-When an attempt leaves photographs out, another one follows.  The model with the most photographs is kept, the first of
-equal ones.
+Another attempt follows if some photographs are not placed.  The model with the most photographs is kept, and the
+earliest among equal ones.
 """
 
 import logging
@@ -34,7 +34,7 @@ from clsplat.prepare.rotation_only import no_depth_reason
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # fraction of the photographs: when this many are placed, no attempt with denser features follows
+ENOUGH = 0.9  # fraction of placed photographs from which no attempt with denser features follows
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
@@ -51,16 +51,16 @@ LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter o
 
 @dataclass(frozen=True)
 class Attempt:
-    """Settings of an attempt to find cameras; `label` describes it in the log."""
+    """Settings of an attempt to find cameras."""
 
-    label: str
+    label: str  # describes the attempt in the log
     mapper: Mapper = "incremental"
     loose: bool = False  # accept fewer matches and smaller angles
     wider: bool = False  # match unplaced photographs with more others, unless all pairs were matched
     dense: bool = False  # find more features, and match the same pairs
 
     def database(self, source: Path, out: Path) -> Path:
-        """Return the path of the database with its features and matches."""
+        """Return the path of the database with the features and matches of the attempt."""
         return out / DENSE if self.dense else out / WIDER if self.wider else source / DATABASE
 
 
@@ -81,10 +81,10 @@ def map_cameras(
     attempts: int = MAX_ATTEMPTS,
     min_track_length: int = 3,
 ) -> dict[str, Any]:
-    """Place cameras and points in at most `attempts` attempts, write the largest model to sparse/0, and return figures.
+    """Place cameras and points in at most `attempts` attempts, and write the largest model to sparse/0.
 
-    `mapper: global` is faster for many photographs; more than one thread is faster but not bit-identical.
-    min_track_length: the number of photographs in which a point must be seen, 2 or 3.
+    Returns figures for the log.  `mapper: global` is faster for many photographs; more than one thread is faster but
+    not bit-identical.  min_track_length: the number of photographs in which a point must be visible, 2 or 3.
     Raises DataError, with the likely reason, when no attempt places three photographs.
     """
     pycolmap = require_pycolmap()
@@ -93,10 +93,10 @@ def map_cameras(
     graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
     if reason := no_depth_reason(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {reason}")
-    models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    models, best, extra_pairs, tries = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
-        placed = models[0].num_reg_images() if models else 0
-        if count == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
+        placed_count = models[0].num_reg_images() if models else 0
+        if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
             break
         if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
@@ -104,8 +104,8 @@ def map_cameras(
             if attempt.wider and not (extra_pairs := expand_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
                 continue
             if attempt is not first:
-                LOG.info("placed %d of %d photographs; trying again with %s", placed, len(names), attempt.label)
-            count += 1
+                LOG.info("placed %d of %d photographs; trying again with %s", placed_count, len(names), attempt.label)
+            tries += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.wider:
                 graph = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
@@ -116,7 +116,7 @@ def map_cameras(
             if not attempt.wider:
                 break
             extra_pairs, candidates = [], []
-        if candidates and candidates[0].num_reg_images() > placed:
+        if candidates and candidates[0].num_reg_images() > placed_count:
             models, best = candidates, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(graph)}")
@@ -141,15 +141,18 @@ def _remove_hidden(folder: Path) -> None:
 
 
 def _run_attempt(
-    source: Path, out: Path, attempt: Attempt, threads: int, earlier: Sequence[Any], pairs: Sequence[tuple[str, str]]
+    source: Path, out: Path, attempt: Attempt, threads: int, previous: Sequence[Any], pairs: Sequence[tuple[str, str]]
 ) -> list[Any]:
-    """Return the models of an attempt, the largest first; with the same features, it extends the earlier model."""
+    """Run an attempt and return its models, the largest first.
+
+    An attempt with looser settings and the same features extends the first of the previous models.
+    """
     pycolmap = require_pycolmap()
-    database, work = _fill_database(source, out, attempt, pairs), out / ".models"
+    database, work_folder = _fill_database(source, out, attempt, pairs), out / ".models"
     if not verified_pairs(pycolmap, database):
         return []
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir()
+    shutil.rmtree(work_folder, ignore_errors=True)
+    work_folder.mkdir()
     is_global = attempt.mapper == "global"
     options = pycolmap.GlobalPipelineOptions() if is_global else pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
@@ -159,27 +162,27 @@ def _run_attempt(
         options.mapper.mergedict(LOOSE)
     pycolmap.set_random_seed(0)
     with raising_data_error(source / IMAGES, "place the cameras"):
-        function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
+        run_mapper = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
         count = Count("photographs placed", len(image_names(pycolmap, database)))
 
         def on_placed() -> None:
             count.reach(min(max(2, count.done) + 1, count.total))
 
         arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_placed}
-        if attempt.loose and not attempt.dense and earlier:
+        if attempt.loose and not attempt.dense and previous:
             (out / ".before").mkdir(exist_ok=True)
-            earlier[0].write(str(out / ".before"))
+            previous[0].write(str(out / ".before"))
             arguments["input_path"] = str(out / ".before")
-            count.reach(earlier[0].num_reg_images())
-        results = function(str(database), str(out / IMAGES), str(work), options=options, **arguments).values()
+            count.reach(previous[0].num_reg_images())
+        results = run_mapper(str(database), str(out / IMAGES), str(work_folder), options=options, **arguments).values()
     models = [model for model in results if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
     return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tuple[str, str]]) -> Path:
-    """Fill the database of an attempt with features and matches, or continue one; return its path.
+    """Write the features and matches of an attempt to its database, or continue an interrupted call; return its path.
 
-    The pairs depend only on the first database and the earlier model, so they are the same after a killed call.
+    The pairs depend only on the first database and the previous model, so they are the same after a killed call.
     """
     database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():
@@ -197,17 +200,17 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tu
 
 
 def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Write the first model; return its figures, and the sizes of the others."""
+    """Write the first model to sparse/0; return its figures, and the sizes of the other models."""
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed, new_counts, counted = _names(best), list[int](), set[str]()
+    placed_names, new_counts, counted_names = _names(best), list[int](), set[str]()
     for model in models:
-        new_counts.append(len(_names(model) - counted))
-        counted |= _names(model)
+        new_counts.append(len(_names(model) - counted_names))
+        counted_names |= _names(model)
     return {
-        "registered": len(placed),
-        "not_registered": [name for name in names if name not in placed],
+        "registered": len(placed_names),
+        "not_registered": [name for name in names if name not in placed_names],
         "other_models": [count for count in new_counts[1:] if count],  # photographs that are in no larger model
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
@@ -215,13 +218,13 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
 
 
 def _names(*models: Any) -> set[str]:
-    return {model.images[number].name for model in models for number in model.reg_image_ids()}
+    return {model.images[image_id].name for model in models for image_id in model.reg_image_ids()}
 
 
 def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
-    """Triangulate the points of a model again, with points seen in only two photographs; keep its cameras.
+    """Triangulate the points of a model again, including points visible in only two photographs; keep its cameras.
 
-    database: features and matches of the model.  out: folder with the images.
+    database: contains the features and matches of the model.  out: contains the folder of the images.
     """
     pycolmap = require_pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
@@ -230,11 +233,11 @@ def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.min_angle = options.mapper.filter_min_tri_angle = PAIR_ANGLE
     pycolmap.set_random_seed(0)
-    with tempfile.TemporaryDirectory(dir=out) as work, raising_data_error(out / IMAGES, "triangulate the points"):
-        refined = pycolmap.triangulate_points(
-            model, str(database), str(out / IMAGES), work, clear_points=True, options=options
+    with tempfile.TemporaryDirectory(dir=out) as folder, raising_data_error(out / IMAGES, "triangulate the points"):
+        new_model = pycolmap.triangulate_points(
+            model, str(database), str(out / IMAGES), folder, clear_points=True, options=options
         )
-    inaccurate = [i for i, p in refined.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
-    for number in inaccurate:
-        refined.delete_point3D(number)
-    return refined
+    inaccurate_ids = [i for i, p in new_model.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
+    for point_id in inaccurate_ids:
+        new_model.delete_point3D(point_id)
+    return new_model

@@ -1,4 +1,4 @@
-"""Match features between photographs, and verify the matches, with pycolmap in its database."""
+"""Match features between photographs and verify the matches, with pycolmap."""
 
 import json
 import logging
@@ -35,15 +35,15 @@ from clsplat.prepare.gather import link
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
-MAX_EXHAUSTIVE = 200  # photographs up to which `auto` matches all pairs: the time grows with the square
-WORDS = 1024  # in the vocabulary learned from the photographs (Sivic and Zisserman 2003)
+MAX_EXHAUSTIVE = 200  # number of photographs up to which `auto` matches all pairs; the time is quadratic
+WORDS = 1024  # visual words in the vocabulary learned from the photographs (Sivic and Zisserman 2003)
 SAMPLES = 40  # descriptors per word for k-means
 ROUNDS = 10  # iterations of k-means
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Selection of the pairs to match, and the number of threads; see match_features."""
+    """Settings of match_features: how it selects the pairs to match, and its number of threads."""
 
     matching: Matching = "auto"
     neighbors: int = 10
@@ -51,18 +51,18 @@ class Pairing:
 
     @classmethod
     def read(cls, folder: Path) -> "Pairing":
-        """Read the pairing that match_features used for a folder.  Raises DataError when it is missing."""
+        """Read the settings that match_features wrote to a folder.  Raises DataError when they are missing."""
         return cls(**read_json(folder / MATCHING, "how photographs were matched"))
 
 
 def match_features(
     source: Path, out: Path, matching: Matching = "auto", neighbors: int = 10, threads: int = 1
 ) -> dict[str, Any]:
-    """Match features between photographs: of all pairs, or of each with its next `neighbors` by name or similarity.
+    """Match all pairs of photographs, or each photograph with the `neighbors` next ones by name or by similarity.
 
-    `auto` matches all pairs of up to 200 photographs, and otherwise each photograph with the most similar ones.  More
-    than one thread is faster but not bit-identical: in about one of a hundred calls of pycolmap 4.2, two pairs get
-    different matches.
+    `auto` matches all pairs of up to 200 photographs; for more, each photograph with the most similar ones.  Returns
+    the matching that was used, and the number of pairs that match.  More than one thread is faster but not
+    bit-identical: in about one of a hundred calls of pycolmap 4.2, two pairs get different matches.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -73,100 +73,100 @@ def match_features(
         partial.replace(database)
     pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
-    chosen = match_database(database, pairing)
-    return {"matching": chosen, "pairs": len(verified_pairs(pycolmap, database))}
+    method = match_database(database, pairing)
+    return {"matching": method, "pairs": len(verified_pairs(pycolmap, database))}
 
 
 def max_pair_count(photographs: int, matching: Matching, neighbors: int) -> int:
-    """Return the largest number of pairs that match_features matches."""
+    """Return an upper bound of the number of pairs that match_features matches for a number of photographs."""
     all_pairs = photographs * (photographs - 1) // 2
     is_exhaustive = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
     return all_pairs if is_exhaustive else min(all_pairs, 2 * neighbors * photographs)
 
 
 def match_database(database: Path, pairing: Pairing) -> Matching:
-    """Match the pairs of a database that are not matched yet, as match_features does; return the matching used.
+    """Match the pairs of a database that are not matched yet, as match_features does.
 
-    Raises DataError when pycolmap fails.
+    Returns the matching that was used: never `auto`.  Raises DataError when pycolmap fails.
     """
     pycolmap = require_pycolmap()
     count, matching, neighbors = len(image_names(pycolmap, database)), pairing.matching, pairing.neighbors
-    chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
-    common = _options(pycolmap, pairing.threads)
+    method = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
+    common_options = _options(pycolmap, pairing.threads)
     with raising_data_error(database, "match photographs"):
-        if chosen == "sequential":
+        if method == "sequential":
             options = pycolmap.SequentialPairingOptions()
             options.overlap, options.quadratic_overlap = neighbors, True
             LOG.info("matching %d photographs, each with the next %d by name", count, neighbors)
             steps = {*range(1, neighbors + 1), *(1 << power for power in range(neighbors))}
             with _count_pairs(database, sum(max(0, count - step) for step in steps)):
-                pycolmap.match_sequential(str(database), pairing_options=options, **common)
-        elif chosen == "vocabulary":
+                pycolmap.match_sequential(str(database), pairing_options=options, **common_options)
+        elif method == "vocabulary":
             LOG.info("matching %d photographs, each with the %d most similar", count, 2 * neighbors)
             pairs = _find_similar_pairs(pycolmap, database, 2 * neighbors)
             with _count_pairs(database, len(pairs)):
-                _match_listed(database, pairs, common)
+                _match_listed(database, pairs, common_options)
         else:
             LOG.info("matching all pairs of %d photographs", count)
             with _count_pairs(database, count * (count - 1) // 2):
-                pycolmap.match_exhaustive(str(database), **common)
-    return chosen
+                pycolmap.match_exhaustive(str(database), **common_options)
+    return method
 
 
 def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) -> None:
-    """Match those of the given pairs that are not matched yet.  Raises DataError when pycolmap fails."""
+    """Match pairs of images by name, skipping pairs that are already matched.  Raises DataError if pycolmap fails."""
     pycolmap = require_pycolmap()
-    with open_database(pycolmap, database) as rows:
-        numbers = {image.name: image.image_id for image in rows.read_all_images()}
-        missing = [(a, b) for a, b in pairs if not rows.exists_two_view_geometry(numbers[a], numbers[b])]
-        done = rows.num_matched_image_pairs()
-    if not missing:
+    with open_database(pycolmap, database) as db:
+        image_ids = {image.name: image.image_id for image in db.read_all_images()}
+        new_pairs = [(a, b) for a, b in pairs if not db.exists_two_view_geometry(image_ids[a], image_ids[b])]
+        matched_count = db.num_matched_image_pairs()
+    if not new_pairs:
         return
-    LOG.info("matching %s of photographs that are not placed yet", pluralize(len(missing), "more pair"))
-    with raising_data_error(database, "match photographs"), _count_pairs(database, done + len(missing)):
-        _match_listed(database, missing, _options(pycolmap, threads))
+    LOG.info("matching %s of photographs that are not placed yet", pluralize(len(new_pairs), "more pair"))
+    with raising_data_error(database, "match photographs"), _count_pairs(database, matched_count + len(new_pairs)):
+        _match_listed(database, new_pairs, _options(pycolmap, threads))
 
 
 def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
     """Return pairs with at least one `unplaced` photograph that `match_database` has not matched.
 
-    They at most double the number of matched pairs: when there are more candidates, each unplaced photograph is paired
-    only with the most similar ones, at least one.
+    They at most double the number of matched pairs: if there are more candidates, each unplaced photograph is paired
+    only with the most similar photographs, at least one.
     """
     pycolmap = require_pycolmap()
-    with open_database(pycolmap, database) as rows:
-        images = sorted(rows.read_all_images(), key=lambda image: image.name)
-        max_pairs = rows.num_matched_image_pairs()
+    with open_database(pycolmap, database) as db:
+        images = sorted(db.read_all_images(), key=lambda image: image.name)
+        max_pairs = db.num_matched_image_pairs()
         if max_pairs == len(images) * (len(images) - 1) // 2:
             return []
-        if invalid := [image.name for image in images if _has_space(image.name)]:
+        if bad_names := [image.name for image in images if _has_space(image.name)]:
             LOG.warning(
-                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", invalid[0]
+                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", bad_names[0]
             )
             images = [image for image in images if not _has_space(image.name)]
         targets = [image.name in unplaced for image in images]
         candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
-            if (targets[i] or targets[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
+            if (targets[i] or targets[j]) and not db.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(candidates) > max_pairs:
-            similarities = similarity(_descriptors(rows, images))
+            similarities = similarity(_descriptors(db, images))
             candidates = _closest(candidates, similarities, targets, max(1, max_pairs // sum(targets)))
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 
 def _closest(
-    pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], unplaced: Sequence[bool], count: int
+    pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], is_unplaced: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
-    """Return the pairs of each unplaced photograph with the `count` photographs most similar to it."""
-    counts, chosen = [0] * len(unplaced), []
+    """Return the pairs of each unplaced photograph with the `count` most similar photographs."""
+    counts, closest = [0] * len(is_unplaced), []
     for i, j in sorted(pairs, key=lambda pair: -similarities[pair]):
-        if any(unplaced[k] and counts[k] < count for k in (i, j)):
-            chosen.append((i, j))
+        if any(is_unplaced[k] and counts[k] < count for k in (i, j)):
+            closest.append((i, j))
             counts[i] += 1
             counts[j] += 1
-    return sorted(chosen)
+    return sorted(closest)
 
 
 def _options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
@@ -185,18 +185,18 @@ def _match_listed(database: Path, pairs: Sequence[tuple[str, str]], options: dic
 
 
 def _find_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
-    with open_database(pycolmap, database) as rows:
-        images = sorted(rows.read_all_images(), key=lambda image: image.name)
-        tables = _descriptors(rows, images)
-    if invalid := [image.name for image in images if _has_space(image.name)]:
+    with open_database(pycolmap, database) as db:
+        images = sorted(db.read_all_images(), key=lambda image: image.name)
+        descriptors = _descriptors(db, images)
+    if bad_names := [image.name for image in images if _has_space(image.name)]:
         raise DataError(
-            f"'{invalid[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
+            f"'{bad_names[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
-    return [(images[i].name, images[j].name) for i, j in similar_pairs(tables, neighbors)]
+    return [(images[i].name, images[j].name) for i, j in similar_pairs(descriptors, neighbors)]
 
 
-def _descriptors(rows: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
-    return [np.asarray(rows.read_descriptors(image.image_id).data, np.float32) for image in images]
+def _descriptors(db: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
+    return [np.asarray(db.read_descriptors(image.image_id).data, np.float32) for image in images]
 
 
 def _has_space(name: str) -> bool:
@@ -205,47 +205,51 @@ def _has_space(name: str) -> bool:
 
 @contextmanager
 def _count_pairs(database: Path, pairs: int) -> Iterator[None]:
-    """Count the pairs that pycolmap matches in the block."""
+    """Report the number of pairs that pycolmap has matched in the block as progress."""
     count = Count("pairs matched", pairs)
     with polled(count, lambda: count_matched_pairs(database)):
         yield
     count.reach(pairs)
 
 
-def similar_pairs(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones."""
-    similarities = similarity(tables)
+def similar_pairs(descriptors: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
+    """Return the pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones.
+
+    descriptors: the descriptors of each photograph, [M, 128].
+    """
+    similarities = similarity(descriptors)
     np.fill_diagonal(similarities, -1)
-    nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
+    nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(neighbors, len(descriptors) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
 
 
-def similarity(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
-    """Return the similarity of photographs, [N, N], from 0 to 1.
+def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Return the similarities between N photographs, [N, N], from 0 to 1.
 
-    tables: descriptors [M, 128] of each photograph.  Words are the cells of k-means over a sample of the descriptors
-    (Sivic and Zisserman 2003), and the similarity is the cosine of TF-IDF vectors.  It is 0 without descriptors.
+    descriptors: the descriptors of each photograph, [M, 128].  Visual words are the clusters of k-means over a sample
+    of the descriptors (Sivic and Zisserman 2003), and the similarity is the cosine of the TF-IDF vectors of two
+    photographs.  It is 0 for a photograph without descriptors.
     """
     rng = np.random.default_rng(0)
     sample = np.concatenate(
-        [table[rng.permutation(len(table))[: SAMPLES * WORDS // len(tables) + 1]] for table in tables]
+        [matrix[rng.permutation(len(matrix))[: SAMPLES * WORDS // len(descriptors) + 1]] for matrix in descriptors]
     )
     if not len(sample):
-        return np.zeros((len(tables), len(tables)))
-    counts = np.zeros((len(tables), WORDS))
+        return np.zeros((len(descriptors), len(descriptors)))
+    counts = np.zeros((len(descriptors), WORDS))
     words = _words(sample)
-    for row, table in enumerate(tables):
-        if len(table):
-            distance = (words**2).sum(axis=1) - 2 * table @ words.T
+    for row, matrix in enumerate(descriptors):
+        if len(matrix):
+            distance = (words**2).sum(axis=1) - 2 * matrix @ words.T
             counts[row] += np.bincount(distance.argmin(axis=1), minlength=WORDS)
-    rarity = np.log(len(tables) / np.maximum((counts > 0).sum(axis=0), 1))
+    rarity = np.log(len(descriptors) / np.maximum((counts > 0).sum(axis=0), 1))
     vectors = counts * rarity
     vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return np.asarray(vectors @ vectors.T)
 
 
 def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the centers of k-means, [at most WORDS, 128]."""
+    """Return the visual words, [at most WORDS, 128]: the centers of k-means over a sample of descriptors, [M, 128]."""
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)
     count, labels = min(WORDS, len(sample)), np.empty(0, np.int32)

@@ -19,7 +19,7 @@ KEYS: dict[Cameras, Key] = {  # photographs of the same size share a camera if t
 
 
 def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
-    """Return the photographs in groups that share a camera, in order of their first names.
+    """Return groups of photographs that share a camera, each sorted, in order of their first names.
 
     Raises DataError when a photograph cannot be read.
     """
@@ -31,11 +31,12 @@ def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[l
 
 
 def shared_camera_note(images: Path, groups: Sequence[Sequence[str]]) -> str:
-    """Return a sentence about photographs that share a camera because EXIF lacks their lens; "" when there are none."""
-    unknown = [group for group in groups if len(group) > 1 and read_exif_optics(images / group[0]) is None]
-    if not unknown:
+    """Return a sentence about photographs that share a camera because EXIF lacks a lens, or "" if there are none."""
+    unknown_groups = [group for group in groups if len(group) > 1 and read_exif_optics(images / group[0]) is None]
+    if not unknown_groups:
         return ""
     return (
-        f"{sum(map(len, unknown))} photographs have no lens data in EXIF, so those of the same size share a camera "
-        f"({pluralize(len(unknown), 'camera')} in total); --set find_features.cameras=per_image calibrates each one"
+        f"{sum(map(len, unknown_groups))} photographs have no lens data in EXIF, so those of the same size share a "
+        f"camera ({pluralize(len(unknown_groups), 'camera')} in total); --set find_features.cameras=per_image "
+        "calibrates each one"
     )

@@ -1,4 +1,4 @@
-"""The steps of `prepare:` in pipeline files.  Each makes an output folder from an input folder, on the host."""
+"""The steps of `prepare:` in pipeline files.  Each step makes an output folder from an input folder, on the host."""
 
 from abc import abstractmethod
 from pathlib import Path
@@ -21,34 +21,38 @@ Positive = Annotated[int, Field(gt=0)]
 
 
 class Step(Settings):
-    """A step that makes a folder from a folder.  Its inputs, settings and `version` identify the result."""
+    """A step that makes an output folder from an input folder.
+
+    Its inputs, settings and `version` identify the result.
+    """
 
     version: ClassVar[int] = 1  # increase it when the result changes
-    resumes: ClassVar[bool] = False  # whether `make` continues from what an interrupted call left in `out`
-    seconds: ClassVar[tuple[float, float] | None] = None  # smallest and largest time per item, a guess for estimates
+    resumes: ClassVar[bool] = False  # whether `make` continues from the files that an interrupted call left in `out`
+    seconds: ClassVar[tuple[float, float] | None] = None  # shortest and longest time per item, to estimate run times
 
     stage: str
     """Name of the step."""
 
-    def check(self, source: Path, excluded: Path) -> None:
+    def check(self, source: Path, excluded_folder: Path) -> None:
         """Raise the errors of `make` that can be detected before running it, without writing anything.
 
         Only the first step is checked, before any step runs.
         """
 
     def is_done_in(self, source: Path) -> bool:
-        """Return whether `source` needs neither this step nor later ones, such as a scene that already has cameras."""
+        """Return whether `source`, such as a scene with cameras, needs neither this step nor the later ones."""
         return False
 
     def pieces(self, photographs: int) -> tuple[int, str]:
-        """Return how many items the step processes for a number of photographs, and the plural name of the items."""
+        """Return the number of items that the step processes for a number of photographs, and their plural name."""
         return photographs, "photographs"
 
     @abstractmethod
-    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
-        """Fill the folder `out` from `source`, without reading below `excluded`; return figures for the log.
+    def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
+        """Write the result for `source` into the folder `out`, and return figures for the log.
 
-        `out` is empty, or, for a step that `resumes`, contains what an interrupted call with the same inputs left.
+        `out` is empty, or, if the step `resumes`, has the files that an interrupted call with the same inputs left.
+        Files in `excluded_folder` are not read.
         """
 
     def summary(self, figures: dict[str, Any]) -> str:
@@ -56,7 +60,7 @@ class Step(Settings):
         return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
-        """Return the warnings that `make` logged with these figures, to repeat them when its result is reused."""
+        """Return the warnings that belong to the figures of `make`, which are repeated when its result is reused."""
         return []
 
 
@@ -81,16 +85,16 @@ class FindFeatures(Step):
     def is_done_in(self, source: Path) -> bool:
         return is_scene(source)
 
-    def check(self, source: Path, excluded: Path) -> None:
+    def check(self, source: Path, excluded_folder: Path) -> None:
         if is_scene(source):
             raise DataError(f"{source}: already contains cameras; give a folder that contains only photographs")
-        require_photographs(source, excluded.resolve())
+        require_photographs(source, excluded_folder.resolve())
         require_pycolmap()
 
-    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
-        self.check(source, excluded)
+    def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
+        self.check(source, excluded_folder)
         options = FeatureOptions(self.long_side, self.features)
-        return find_features(source, out, options, self.camera_model, self.cameras, excluded.resolve())
+        return find_features(source, out, options, self.camera_model, self.cameras, excluded_folder.resolve())
 
     def summary(self, figures: dict[str, Any]) -> str:
         photographs = pluralize(figures["photographs"], "photograph")
@@ -118,7 +122,7 @@ class MatchFeatures(Step):
     def pieces(self, photographs: int) -> tuple[int, str]:
         return max_pair_count(photographs, self.matching, self.neighbors), "pairs"
 
-    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbors, self.threads)
 
     def summary(self, figures: dict[str, Any]) -> str:
@@ -149,7 +153,7 @@ class MapCameras(Step):
     """Number of photographs in which a point must be seen.  COLMAP drops points seen in only two; keeping them gave 2.5
     times as many points on one scene."""
 
-    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
 
     def summary(self, figures: dict[str, Any]) -> str:
@@ -173,7 +177,7 @@ class Undistort(Step):
     undefined_pixels: UndefinedPixels = "crop"
     """What to do with pixels that the photograph does not cover: `crop` the image, or keep it whole and `mask` them."""
 
-    def make(self, source: Path, out: Path, excluded: Path) -> dict[str, Any]:
+    def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
 
     def summary(self, figures: dict[str, Any]) -> str:

@@ -23,11 +23,11 @@ UndefinedPixels = Literal["crop", "mask"]
 def undistort_scene(
     source: Path, out: Path, long_side: int | None = None, undefined_pixels: UndefinedPixels = "crop"
 ) -> int:
-    """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
+    """Write a COLMAP scene of pinhole cameras to the folder `out`, and return the number of its images.
 
     Photographs larger than `long_side` px are reduced.  `undefined_pixels: crop` keeps the largest part of a photograph
-    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call made from the
-    same photographs with the same settings stay unchanged.
+    without undefined pixels; `mask` keeps the entire photograph, and writes masks of its undefined pixels.  Images that
+    an earlier call made from the same photographs with the same settings stay unchanged.
     Raises DataError when the scene cannot be read, or when `out` contains other images.
     """
     scene = read_scene(source, holdout=0)
@@ -35,16 +35,16 @@ def undistort_scene(
     for name in names:
         manifest.require_listed(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
-    for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
+    for i, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         pinhole_view = replace(_downscale(_with_lens(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
-        if manifest.needs_writing(image, _source(pinhole_view), mask):
-            unmasked = load_mask(pinhole_view)
-            if unmasked is not None and not unmasked.all():
-                write_image(mask, np.repeat(np.where(unmasked, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
+        if manifest.needs_writing(image, _source_hash(pinhole_view), mask):
+            is_valid = load_mask(pinhole_view)
+            if is_valid is not None and not is_valid.all():
+                write_image(mask, np.repeat(np.where(is_valid, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, lens=None))
-        count.reach(number)
+        count.reach(i)
     write_exposures(out / "images", dict(zip(names, load_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
@@ -52,8 +52,8 @@ def undistort_scene(
     return len(views)
 
 
-def _source(view: View) -> str:
-    """Return a hash of everything that an undistorted image and its mask depend on."""
+def _source_hash(view: View) -> str:
+    """Return a hash of all inputs of an undistorted image and its mask."""
     files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
     return hash_values(*files, view.lens, view.camera)
 
@@ -66,16 +66,16 @@ def _with_lens(view: View, undefined_pixels: UndefinedPixels) -> View:
 
 
 def _downscale(view: View, long_side: int | None) -> View:
-    """Return the view with no side longer than `long_side` px."""
+    """Return the view at a size whose longer side is at most `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
     return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """Return the names with the suffix .png, which is appended where two names would be equal otherwise."""
+    """Return the names with the suffix .png; where two names would be equal, it is appended to the original suffix."""
     candidates = [Path(name).with_suffix(".png").as_posix() for name in names]
     counts = Counter(candidates)
-    unique = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]
-    if len(set(unique)) < len(unique):
-        raise DataError(f"two images would be called '{Counter(unique).most_common(1)[0][0]}'; rename one")
-    return unique
+    unique_names = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]
+    if len(set(unique_names)) < len(unique_names):
+        raise DataError(f"two images would be called '{Counter(unique_names).most_common(1)[0][0]}'; rename one")
+    return unique_names

@@ -56,9 +56,9 @@ def describe(
     check_run_folder(state, start)
     check_unused(out)
     planned_steps = pipeline.preparation(out)
-    lines = [f"  {step.step.stage:<14} {step.why or 'done'}" for step in planned_steps]
+    lines = [f"  {step.step.stage:<14} {step.reason or 'done'}" for step in planned_steps]
     run, verdict = None, "would run"
-    if any(step.why for step in planned_steps):
+    if any(step.reason for step in planned_steps):
         opened_device, _ = check_start(pipeline, out, device, start)
     else:
         run = open_run(pipeline, out, device, start, read=read)

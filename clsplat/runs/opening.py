@@ -169,9 +169,9 @@ def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
     Raises ConfigError or DataError if the preparation is certain to fail.
     """
     planned_steps = pipeline.preparation(out)
-    if planned_steps and planned_steps[0].why:
+    if planned_steps and planned_steps[0].reason:
         planned_steps[0].step.check(pipeline.settings.scene.folder.resolve(), prepared_folder(out).parent)
-    if any(step.why for step in planned_steps):
+    if any(step.reason for step in planned_steps):
         _check_split(pipeline, planned_steps, out)
     return planned_steps
 

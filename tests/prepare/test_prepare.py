@@ -87,14 +87,14 @@ def test_steps_after_a_change_are_redone(photos, tmp_path):
 
 def test_plan_gives_reasons(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    assert [item.why for item in plan(steps, photos, root)] == ["no result yet"] * 2
+    assert [item.reason for item in plan(steps, photos, root)] == ["no result yet"] * 2
     run_steps(steps, photos, root)
-    assert [item.why for item in plan(steps, photos, root)] == ["", ""]
+    assert [item.reason for item in plan(steps, photos, root)] == ["", ""]
     changed = plan([steps[0], Copy(letter="z")], photos, root)
-    assert [item.why for item in changed] == ["", "letter is z, was b"]
+    assert [item.reason for item in changed] == ["", "letter is z, was b"]
     (photos / "p.txt").write_text("P")
-    assert plan(steps, photos, root)[0].why == "letter is a, was b"  # the newest of that step
-    assert [item.why for item in plan(steps[1:], photos, root)] == ["its input has changed"]
+    assert plan(steps, photos, root)[0].reason == "letter is a, was b"  # the newest of that step
+    assert [item.reason for item in plan(steps[1:], photos, root)] == ["its input has changed"]
 
 
 def test_missing_intermediate_results_are_not_redone(photos, tmp_path):
@@ -141,8 +141,8 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
         (last / damaged).write_text({"no JSON": "{", "a list": "[]"}.get(fault, ""))
     why = {"a file less": "x.txt is missing", "an empty file": "x.txt was changed", "a folder": "x.txt is missing"}
     why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is recomputed"
-    assert [item.why for item in plan(steps, photos, root)] == ["", why]
-    assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
+    assert [item.reason for item in plan(steps, photos, root)] == ["", why]
+    assert plan([steps[0], Copy(letter="z")], photos, root)[1].reason.startswith("letter is z")
     assert run_steps(steps, photos, root) == ("pab", ["b"])
     assert f"copy runs again: {why}" in caplog.messages
     assert run_steps(steps, photos, root) == ("pab", [])
@@ -169,10 +169,13 @@ Settings.subclasses.remove(Linked)
 def test_result_without_its_images_is_redone(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Linked(letter="a"), Linked(letter="b")]
     prepare(plan(steps, photos, root), photos, root)
-    assert [item.why for item in plan(steps, photos, root)] == ["", ""]
+    assert [item.reason for item in plan(steps, photos, root)] == ["", ""]
     shutil.rmtree(plan(steps, photos, root)[0].folder)
     planned = plan(steps, photos, root)
-    assert [item.why for item in planned] == ["letter is a, was b", "images/p.txt is missing; the result is recomputed"]
+    assert [item.reason for item in planned] == [
+        "letter is a, was b",
+        "images/p.txt is missing; the result is recomputed",
+    ]
     assert (prepare(planned, photos, root) / "images" / "p.txt").read_text() == "p"
     assert Linked.calls == ["a", "b", "a"], "the link of the second leads to images again"
 
@@ -185,7 +188,7 @@ def test_results_moved_with_their_photographs_are_complete(tmp_path):
     prepare(plan(steps, photos, root), photos, root)
     (tmp_path / "work").rename(tmp_path / "moved")
     planned = plan(steps, tmp_path / "moved" / "photos", tmp_path / "moved" / "runs" / "prepared")
-    assert [item.why for item in planned] == ["", "", ""]
+    assert [item.reason for item in planned] == ["", "", ""]
     assert (planned[-1].folder / "images" / "p.txt").read_text() == "p"
 
 
@@ -245,7 +248,7 @@ def test_record_left_by_a_killed_call_is_not_part_of_the_result(photos, tmp_path
     left.mkdir(parents=True)
     (left / "record.json").write_text("{}")  # killed between the record and the renaming
     prepare(plan(steps, photos, root), photos, root)
-    assert [item.why for item in plan(steps, photos, root)] == [""]
+    assert [item.reason for item in plan(steps, photos, root)] == [""]
 
 
 def test_partial_results_of_other_photographs_are_discarded(photos, tmp_path, monkeypatch):

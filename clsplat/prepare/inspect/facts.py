@@ -1,4 +1,4 @@
-"""Measure the facts about a dataset that decide whether it trains, and how well."""
+"""Measure the properties of a dataset that decide whether and how well it trains."""
 
 import logging
 import os
@@ -46,9 +46,9 @@ MAX_BRIGHTNESS_RATIO = 2.0  # from one photograph to the next; at most 1.4 in fi
 
 @dataclass(frozen=True)
 class PhotographMeasures:
-    """Measurements of one photograph."""
+    """Measurements of a photograph."""
 
-    sharpness: NDArray[np.float64]  # [2], the two values of sharpness_values
+    sharpness: NDArray[np.float64]  # [2], as sharpness_values returns them
     brightness: NDArray[np.float64]  # [2], mean and median, gray levels
     thumbnail: NDArray[np.float32]  # [THUMBNAIL²], gray levels
     is_blank: bool  # black, of one color, or transparent
@@ -56,20 +56,23 @@ class PhotographMeasures:
 
 @dataclass(frozen=True)
 class ComparisonFacts:
-    """The names of photographs that stand out."""
+    """The names of photographs with visible faults, and of photographs that look the same."""
 
     blurred: list[str]  # much blurrier than the others
-    same: list[list[str]]  # photographs that look the same
+    same: list[list[str]]  # groups of photographs that look the same
     jumps: list[tuple[str, str, float]]  # a photograph, the next one, and the stops between their EXIF exposures
     steps: list[
         tuple[str, str, float]
     ]  # a photograph, the next one, and their brightness ratio, if EXIF lacks exposures
-    unreadable: dict[str, str]  # the reason why they cannot be decoded
+    unreadable: dict[str, str]  # photographs that cannot be decoded, by name, with the reason
     blank: list[str]  # black or of one color
 
 
 def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
-    """Compare the photographs of a dataset's views, or all photographs in its folder if it has no views."""
+    """Compare the photographs of a dataset's views, or all photographs in its folder if it has no views.
+
+    missing: paths of photographs that do not exist.
+    """
     views = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
     if not views:
         return compare_photos({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
@@ -83,16 +86,16 @@ def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
 def compare_photos(
     files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None
 ) -> ComparisonFacts:
-    """Compare photographs by name, skipping unreadable ones.  Without `exposures`, read them from EXIF."""
+    """Compare photographs in order of their names.  exposures: by name, or None to read them from EXIF."""
     names = sorted(files)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "comparing") as pool:
-        results = counted(pool.map(_measure, (files[name] for name in names)), "photographs compared", len(names))
-        measured = dict(zip(names, results, strict=True))
-    photos = {name: result for name, result in measured.items() if not isinstance(result, DataError)}
+        results = counted(pool.map(_measure_photo, (files[name] for name in names)), "photographs compared", len(names))
+        measures = dict(zip(names, results, strict=True))
+    photos = {name: result for name, result in measures.items() if not isinstance(result, DataError)}
     if exposures is None:
         exposures = {name: read_exif_exposure(files[name]) for name in photos}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
-    stops = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
+    stops = [(name, next_name, round(abs(y - x), 2)) for (name, x), (next_name, y) in pairwise(values)]
     median = np.median([photo.sharpness for photo in photos.values()], axis=0) if photos else np.zeros(2)
     return ComparisonFacts(
         blurred=[name for name, photo in photos.items() if is_blurred(photo.sharpness, median) and not photo.is_blank],
@@ -102,14 +105,14 @@ def compare_photos(
             {name: photo.brightness for name, photo in photos.items()}, {name for name, _ in values}
         ),
         unreadable={
-            name: failure_reason(files[name], error) for name, error in measured.items() if isinstance(error, DataError)
+            name: failure_reason(files[name], error) for name, error in measures.items() if isinstance(error, DataError)
         },
         blank=[name for name, photo in photos.items() if photo.is_blank],
     )
 
 
-def _measure(file: Path) -> PhotographMeasures | DataError:
-    """Measure a photograph; if it cannot be read, return the error."""
+def _measure_photo(file: Path) -> PhotographMeasures | DataError:
+    """Return the measurements of a photograph, or the error if it cannot be read."""
     try:
         gray = read_gray(file, SIDE)[0]
     except DataError as error:
@@ -120,20 +123,20 @@ def _measure(file: Path) -> PhotographMeasures | DataError:
 
 
 def _brightness_steps(
-    brightness: Mapping[str, NDArray[np.float64]], exposed: Container[str]
+    brightness: Mapping[str, NDArray[np.float64]], exposed_names: Container[str]
 ) -> list[tuple[str, str, float]]:
-    """Return neighbors whose mean and median both differ by more than MAX_BRIGHTNESS_RATIO.
+    """Return adjacent photographs whose mean and median brightness both differ by a factor above MAX_BRIGHTNESS_RATIO.
 
-    One of the two may differ because of the content alone.  exposed: photographs with known exposures; pairs of them
-    are skipped.
+    Only one of the two may differ if the content differs.  exposed_names: photographs with known exposures; pairs of
+    them are skipped.
     """
     steps = []
-    for (a, x), (b, y) in pairwise(brightness.items()):
+    for (name, x), (next_name, y) in pairwise(brightness.items()):
         ratios = y / x
-        if a in exposed and b in exposed:
+        if name in exposed_names and next_name in exposed_names:
             continue
         if min(ratios) > MAX_BRIGHTNESS_RATIO or max(ratios) < 1 / MAX_BRIGHTNESS_RATIO:
-            steps.append((a, b, round(float(ratios[0]), 2)))
+            steps.append((name, next_name, round(float(ratios[0]), 2)))
     return steps
 
 
@@ -157,31 +160,34 @@ MAX_DISTANCE = 100.0  # camera extents from the median camera center; photograph
 
 @dataclass(frozen=True)
 class PointFacts:
-    """The sparse points.  Fractions are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
+    """Measurements of the sparse points.  Fractions refer to SAMPLE_SIZE points, evenly spaced in the file."""
 
     count: int
     not_finite: int
     distant: int  # beyond MAX_DISTANCE camera extents
     error_mean: float | None  # px
-    error_90: float | None  # px; 90 % of the points have less
+    error_90: float | None  # px, the 90th percentile
     in_two: float | None  # fraction that projects into at least two images, occluded or not
     behind: float | None  # fraction behind all cameras
 
 
 def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
-    """Measure the points of a dataset with points.  extent: extent of the cameras; centers: their centers, [N, 3]."""
+    """Measure the sparse points of a dataset that has points.
+
+    extent: the extent of the cameras in scene units.  centers: the camera centers, [N, 3].
+    """
     assert parts.points is not None
     positions = parts.points.positions
-    finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
-    errors = _errors(parts, np.asarray(finite))
-    finite_positions = positions[finite].astype(np.float64)
+    is_finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
+    errors = _errors(parts, np.asarray(is_finite))
+    finite_positions = positions[is_finite].astype(np.float64)
     distance = np.linalg.norm(finite_positions - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = finite_positions[:: max(1, -(-len(finite_positions) // SAMPLE_SIZE))]
     views = list(parts.scene.views) if parts.scene else parts.views  # with the faces of wide photographs
     in_two, behind = _coverage(sample, views) if len(sample) and views else (None, None)
     return PointFacts(
         count=len(positions),
-        not_finite=int(np.count_nonzero(~finite)),
+        not_finite=int(np.count_nonzero(~is_finite)),
         distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
         error_mean=float(errors.mean()) if len(errors) else None,
         error_90=float(np.quantile(errors, 0.9)) if len(errors) else None,
@@ -190,13 +196,13 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     )
 
 
-def _errors(parts: Parts, finite: NDArray[np.bool_]) -> NDArray[np.floating]:
-    """Return reprojection errors of points, px at the full size: from the observations, otherwise from the file."""
+def _errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
+    """Return the known reprojection errors in px at the full size, computed from observations or read from the file."""
     errors = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
     if errors is not None:
         return errors
     assert parts.points is not None
-    error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
+    error = parts.points.error[is_finite] if len(parts.points.error) else np.empty(0)
     known_errors = error[np.isfinite(error) & (error > 0)]
     return known_errors if len(np.unique(known_errors)) > 1 else np.empty(0)  # equal errors are a placeholder
 
@@ -215,44 +221,44 @@ def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float
     return float((inside >= min(2, len(views))).mean()), float((~is_ahead).mean())
 
 
-MIN_SEEN = 30  # points; COLMAP does not register images with fewer inliers
+MIN_SEEN = 30  # points visible in a view; COLMAP does not register images with fewer inliers
 
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Facts about the views with the same image size, lens and focal length."""
+    """Properties of a camera, and the number of views that share it."""
 
     views: int
     model: str
     width: int
     height: int
     focal: tuple[float, float]  # px
-    distortion: float | None  # px, the largest displacement by the lens along the border; None if it overflows
+    distortion: float | None  # px, the largest displacement by the lens along the border; None if it is not finite
     kept: float  # fraction of the photograph that undistortion keeps
     centered: bool  # whether the principal point is inside the photograph
-    faces: int  # views that a wide photograph is cut into; 0: none
+    faces: int  # number of views that a wide photograph is cut into; 0 for other photographs
 
 
 @dataclass(frozen=True)
 class PhotographFacts:
     """Facts about the image files and masks of the views, by name."""
 
-    unreadable: dict[str, str]  # the reason why they cannot be decoded
-    cut: list[str]  # cannot be decoded because the end of the file is missing
-    misfits: dict[str, str]  # the differing sizes of file and camera
+    unreadable: dict[str, str]  # files that cannot be decoded, with the reason
+    cut: list[str]  # files that cannot be decoded because their end is missing
+    misfits: dict[str, str]  # files whose size differs from the camera's, with both sizes
     on_side: list[str]  # misfits whose width and height are swapped
-    exif_turned: list[str]  # read as stored although EXIF contains a rotation
-    masks: int
-    blank: list[str]  # of training views: black, of one color, or transparent
-    no_content: str  # why training cannot use them: masks exclude all pixels, or all are blank
+    exif_turned: list[str]  # files that are read as stored although EXIF contains a rotation
+    masks: int  # number of views with a mask
+    blank: list[str]  # photographs of training views that are black, of one color, or transparent
+    no_content: str  # reason why training cannot use the files: masks exclude all pixels, or all are blank
 
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """Facts from the headers of photographs without cameras; values are numbers of photographs."""
+    """Facts from the headers of photographs without cameras.  Values are numbers of photographs."""
 
-    sizes: dict[str, int]  # as stored
-    cameras: dict[str, int]  # make, model, and focal length by EXIF
+    sizes: dict[str, int]  # by size as stored
+    cameras: dict[str, int]  # by make, model and focal length in EXIF
     located: int  # photographs with a GPS position
 
 
@@ -269,30 +275,30 @@ class Facts:
     missing: list[str]
     unregistered: list[str]
     folders: int  # number of folders that contain registered images
-    submodels: dict[str, int]  # images of each COLMAP model; the first is used
+    submodels: dict[str, int]  # number of images of each COLMAP model; the first model is used
     cameras: list[CameraFacts]
     photos: PhotographFacts
     comparison: ComparisonFacts
     capture: CaptureFacts | None  # None when there are views
     points: PointFacts | None
-    points_per_view: dict[str, int]  # sparse points that each view shows; empty if unknown
-    extent: float | None  # scene units
-    origin: list[float]  # [3] world coordinates, of a scene far from zero
+    points_per_view: dict[str, int]  # number of sparse points that each view shows; empty if unknown
+    extent: float | None  # of the cameras, in scene units
+    origin: list[float]  # [3] world coordinates; not zero for a scene far from zero
     outlier_cameras: list[str]
     timestamps: int  # distinct times of the views; 0 for static scenes
     moving_cameras: int  # distinct cameras of a dynamic scene; 0 for static scenes
-    same_center: bool  # all cameras have the same center
-    same_pose: list[list[str]]
-    same_but_case: list[list[str]]
+    same_center: bool  # whether all cameras have the same center
+    same_pose: list[list[str]]  # groups of views with equal poses
+    same_but_case: list[list[str]]  # groups of names that differ only in upper and lower case
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
-    hint: str  # similar files that exist instead of missing ones
-    notes: list[str]  # sentences about files that are not where the dataset says
-    faults: list[str]  # why parts of it cannot be read
-    refusal: str  # why training does not start
+    hint: str  # names similar files that exist if files are missing
+    notes: list[str]  # sentences about files with paths other than the dataset contains
+    faults: list[str]  # reasons why parts of the dataset cannot be read
+    refusal: str  # reason why training does not start
 
     @property
     def unplaced(self) -> bool:
-        """Whether the dataset is photographs whose cameras `clsplat run photos` can find."""
+        """Whether the dataset consists of photographs without cameras, which `clsplat run photos` can find."""
         return (
             self.kind == "none"
             and not self.faults
@@ -301,13 +307,13 @@ class Facts:
 
     @property
     def few_points(self) -> list[str]:
-        """The views that show fewer than MIN_SEEN points, the worst first."""
+        """Names of the views that show fewer than MIN_SEEN points, in ascending order of the number of points."""
         counts = self.points_per_view
         return sorted((name for name, count in counts.items() if count < MIN_SEEN), key=counts.__getitem__)
 
 
 def measure_dataset(parts: Parts) -> Facts:
-    """Measure a dataset that was read in parts."""
+    """Return all measurements of a dataset.  parts: as `read_parts` returns them."""
     views, expected = parts.views, parts.expected
     missing = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
     known_files = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
@@ -356,14 +362,14 @@ def measure_dataset(parts: Parts) -> Facts:
 
 
 def distortion(lens: Lens) -> float | None:
-    """Return the largest displacement by the lens along the border, px; None if it overflows."""
+    """Return the largest displacement by the lens along the border, in px.  None if it is not finite."""
     camera, fractions = lens.camera, np.linspace(0, 1, BORDER_POINTS)
     zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
     x = np.concatenate([fractions, fractions, zeros, ones]) * lens.width
     y = np.concatenate([zeros, ones, fractions, fractions]) * lens.height
     with np.errstate(all="ignore"):
-        moved_x, moved_y = lens.distort((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-        displacement = float(np.hypot(moved_x - x, moved_y - y).max())
+        distorted_x, distorted_y = lens.distort((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+        displacement = float(np.hypot(distorted_x - x, distorted_y - y).max())
     return displacement if np.isfinite(displacement) else None
 
 
@@ -372,12 +378,12 @@ def _relative_path(file: Path, parts: Parts) -> str:
 
 
 def _pose(view: View, extent: float | None) -> tuple[float, ...]:
-    """Return the pose of a view in units of the extent, rounded."""
+    """Return the pose of a view, with a translation in units of the extent, rounded so that equal poses are equal."""
     return tuple((view.world_to_camera / [1, 1, 1, extent or 1]).ravel().round(9))
 
 
 def _equal_groups(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
-    """Return the groups of two or more names with equal keys."""
+    """Return groups of two or more names with equal keys."""
     groups = defaultdict(list)
     for name, key in zip(names, keys, strict=True):
         groups[key].append(name)
@@ -385,11 +391,11 @@ def _equal_groups(names: Sequence[str], keys: Iterable[object]) -> list[list[str
 
 
 def _cameras(parts: Parts) -> list[CameraFacts]:
-    grouped: dict[object, list[View]] = defaultdict(list)
+    views_by_camera: dict[object, list[View]] = defaultdict(list)
     for view in parts.views:
-        grouped[(view.lens or view.camera, parts.models.get(view.name))].append(view)
+        views_by_camera[(view.lens or view.camera, parts.models.get(view.name))].append(view)
     cameras = []
-    for views in grouped.values():
+    for views in views_by_camera.values():
         lens, camera = views[0].lens, views[0].camera
         original = lens.camera if lens else camera
         model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
@@ -403,23 +409,23 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
 
 
 def measure_capture(files: Sequence[Path]) -> CaptureFacts:
-    """Read the headers of image files, skipping unreadable ones."""
-    sizes, cameras, located = Counter[str](), Counter[str](), 0
+    """Count the sizes, cameras and GPS positions in the headers of image files, skipping unreadable files."""
+    sizes, cameras, located_count = Counter[str](), Counter[str](), 0
     for file in files:
         with suppress(DataError):
             header, (camera, has_position) = read_header(file), read_exif_camera(file)
             sizes[f"{header.width}x{header.height}"] += 1
             cameras[camera or "unknown"] += 1
-            located += has_position
-    return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located)
+            located_count += has_position
+    return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located_count)
 
 
 def _photographs(parts: Parts, missing: set[Path]) -> PhotographFacts:
     views = parts.views
-    decoded = decode_all(view for view in views if view.image_path not in missing)
+    decoded_files = decode_all(view for view in views if view.image_path not in missing)
     blank, no_content = list[str](), ""
     try:
-        blank = require_content(parts.path, parts.scene.split("train") if parts.scene else views, decoded)
+        blank = require_content(parts.path, parts.scene.split("train") if parts.scene else views, decoded_files)
     except DataError as error:
         no_content = str(error)
     masks = sum(view.mask_path is not None for view in views)
@@ -428,13 +434,13 @@ def _photographs(parts: Parts, missing: set[Path]) -> PhotographFacts:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         files[f"static mask of {view.name}"] = view.static_path
         for name, file in files.items():
-            if file in decoded:
-                _photograph(facts, view, name, file, decoded[file])
+            if file in decoded_files:
+                _add_photograph(facts, view, name, file, decoded_files[file])
     return facts
 
 
-def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
-    """Add a view's photograph or mask to the facts."""
+def _add_photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
+    """Add the faults of a view's photograph or mask to the facts.  name: its name in the facts."""
     camera = view.lens or view.camera
     if file.cut:
         facts.cut.append(name)
@@ -448,13 +454,13 @@ def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file:
         facts.exif_turned.append(name)  # the reader rotates only files whose stored size does not fit
 
 
-# Read a dataset in parts: a damaged part becomes a fault, and the other parts are still read.
+# Read a dataset in parts: a damaged part is recorded as a fault, and the other parts are still read.
 
 LOG = logging.getLogger("clsplat")
 
 
 def read_parts(path: Path) -> Parts:
-    """Read a dataset like read_scene, but each part separately.  Raises DataError if there is no such folder."""
+    """Read a dataset like read_scene, but each part separately.  Raises DataError if the folder does not exist."""
     parts = Parts(path)
     with log_level(logging.ERROR):
         try:
@@ -486,7 +492,7 @@ def read_parts(path: Path) -> Parts:
 
 
 def _list_photographs(parts: Parts) -> None:
-    """List the photographs of a folder without cameras, and the warnings that preparing them would log."""
+    """List the photographs in a folder without cameras, and the warnings that the preparation would log."""
     parts.on_disk = list(image_files(parts.path, deep=True))
     with captured_log(logging.WARNING) as parts.left_out:
         try:
@@ -497,7 +503,7 @@ def _list_photographs(parts: Parts) -> None:
 
 
 def image_files(folder: Path, deep: bool) -> Iterator[Path]:
-    """Yield the image files in a folder, by name; with `deep`, also those in its subfolders."""
+    """Yield the image files in a folder, sorted by name; with `deep`, also the files in its subfolders."""
     for parent, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if not f.startswith(".")) if deep else []
         yield from (Path(parent) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))

@@ -1,4 +1,4 @@
-"""Derive findings from the facts about a dataset: what is wrong for training, and how to fix it."""
+"""Derive findings from the facts about a dataset: faults that affect training, and their remedies."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -32,7 +32,7 @@ LEVELS: tuple[Level, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a dataset and its remedy.  Errors keep training from starting."""
+    """A fault of a dataset and its remedy.  Findings with the level `error` prevent training."""
 
     level: Level
     fault: str
@@ -45,71 +45,79 @@ class Finding:
 
 
 def check_photo_folder(facts: Facts) -> Iterator[Finding]:
-    """Yield findings about a folder of photographs without cameras: how to find them, and which files are left out."""
-    count, damaged = facts.on_disk, facts.comparison.unreadable
+    """Yield findings about a folder of photographs without cameras, and about files in it that are left out."""
+    count, read_errors = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
     contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
-    readable, texts = count - len(damaged), facts.left_out
+    readable, warnings = count - len(read_errors), facts.left_out
     if facts.unplaced:
-        yield from _capture(facts, readable)
+        yield from _check_capture(facts, readable)
     else:
-        remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
+        remedy = f"only {readable} of {count} photographs can be read; {remedy_for(read_errors)}"
         if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
-            remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
+            remedy, warnings = facts.refusal.removeprefix(f"{facts.path}: "), []
         yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
-    for text in texts + warnings_for({"damaged": damaged, "photographs": readable}):
-        yield Finding("warning", text.removeprefix(f"{facts.path}: "))
+    for warning in warnings + warnings_for({"damaged": read_errors, "photographs": readable}):
+        yield Finding("warning", warning.removeprefix(f"{facts.path}: "))
 
 
-def _capture(facts: Facts, readable: int) -> Iterator[Finding]:
-    """Yield findings about photographs whose cameras can be found."""
+def _check_capture(facts: Facts, readable: int) -> Iterator[Finding]:
+    """Yield findings about photographs without cameras.  readable: the number of readable photographs."""
     if readable < MIN_VIEWS:
         fault = f"there {_are(readable, 'photograph', 'only ')}, from which cameras are often not found"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
-        all_blank = len(blank) == readable
-        some = f"{_are(len(blank), 'photograph')} black or of a single color"
-        fault = "no photograph shows anything" if all_blank else some
-        yield Finding("error" if all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
+        is_all_blank = len(blank) == readable
+        blank_text = f"{_are(len(blank), 'photograph')} black or of a single color"
+        fault = "no photograph shows anything" if is_all_blank else blank_text
+        yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
 
 MAX_NAMES = 4  # names in a finding
-MIN_VIEWS = 10  # for training
+MIN_VIEWS = 10  # training views
 MIN_POINTS = 100
 MAX_LEFT_OUT = 0.1  # fraction of the photographs that may lack a pose without a warning
 MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
 POSES_ERROR = 1.0  # px, from which pipelines/photos.yaml optimizes poses
 POSES = "optimize.modules.camera_optimizer={start: 500}"
-MAX_BEHIND, MIN_IN_TWO = 0.1, 0.5  # of points
-MIN_KEPT = 0.6  # of a photograph
+MAX_BEHIND, MIN_IN_TWO = 0.1, 0.5  # fractions of the points
+MIN_KEPT = 0.6  # fraction of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length / image width, 136 to 3 degrees
 
 
 def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
-    parts = (check_photo_folder, _unreadable, _photographs, _comparison, _cameras, _poses, _points)
-    results = [finding for part in parts for finding in part(facts)]
+    checks = (
+        check_photo_folder,
+        _check_unreadable,
+        _check_photographs,
+        _check_comparison,
+        _check_cameras,
+        _check_poses,
+        _check_points,
+    )
+    results = [finding for check in checks for finding in check(facts)]
     if facts.refusal and not facts.unplaced and not any(finding.level == "error" for finding in results):
         results.append(Finding("error", facts.refusal))
     return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
 
 def check_view_count(train: int) -> Iterator[Finding]:
-    """Yield a warning if a scene has few training views."""
+    """Yield a warning if a scene has few training views.  train: the number of training views."""
     if train < MIN_VIEWS:
         fault = f"there {_are(train, 'training view', 'only ')}"
         yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
 
 
-def _unreadable(facts: Facts) -> Iterator[Finding]:
+def _check_unreadable(facts: Facts) -> Iterator[Finding]:
     yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
     if len(facts.faults) > MAX_NAMES:
         more = f"{pluralize(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
         yield Finding("error", more, "fix the first ones and inspect again")
 
 
-def _photographs(facts: Facts) -> Iterator[Finding]:
+def _check_photographs(facts: Facts) -> Iterator[Finding]:
     photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
@@ -159,7 +167,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
 
 
-def _comparison(facts: Facts) -> Iterator[Finding]:
+def _check_comparison(facts: Facts) -> Iterator[Finding]:
     blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
         fault = f"{_are(len(blurred), 'photograph')} blurred ({_join(blurred)})"
@@ -179,7 +187,7 @@ def _comparison(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, remedy)
 
 
-def _cameras(facts: Facts) -> Iterator[Finding]:
+def _check_cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
         remedy = "this is allowed; steps on larger views take longer"
@@ -198,14 +206,14 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
             )
 
 
-def _poses(facts: Facts) -> Iterator[Finding]:
+def _check_poses(facts: Facts) -> Iterator[Finding]:
     used, *unused = facts.submodels or {"": 0}
     if unused:
         parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in unused)
-        large = any(facts.submodels[name] > MAX_LEFT_OUT * facts.submodels[used] for name in unused)
+        is_large = any(facts.submodels[name] > MAX_LEFT_OUT * facts.submodels[used] for name in unused)
         fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
         remedy = f"not used: {parts}; colmap model_merger may merge models that share images"
-        yield Finding("warning" if large else "note", fault, remedy)
+        yield Finding("warning" if is_large else "note", fault, remedy)
     if facts.train is not None:
         yield from check_view_count(facts.train)
     if facts.test == 0:
@@ -230,7 +238,7 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "the poses are unreliable; check the renders, or remove these images")
 
 
-def _points(facts: Facts) -> Iterator[Finding]:
+def _check_points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
@@ -247,7 +255,7 @@ def _points(facts: Facts) -> Iterator[Finding]:
         fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
         yield Finding("note", fault, "they are usually sky or wrong matches, and become very large Gaussians")
     if not facts.refusal:
-        yield from _coverage(points)
+        yield from _check_coverage(points)
     if points.error_mean is not None and points.error_mean >= POSES_ERROR:
         fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
         remedy = (
@@ -257,7 +265,7 @@ def _points(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
 
 
-def _coverage(points: PointFacts) -> Iterator[Finding]:
+def _check_coverage(points: PointFacts) -> Iterator[Finding]:
     axes = "the poses do not match these points, or their axes are flipped; export both again together"
     if points.behind is not None and points.behind > MAX_BEHIND:
         yield Finding("warning", f"{100 * points.behind:.0f} % of the points are behind all cameras", axes)
@@ -266,7 +274,7 @@ def _coverage(points: PointFacts) -> Iterator[Finding]:
 
 
 def _are(count: int, word: str, prefix: str = "") -> str:
-    """Return a count with its verb: `3 views are`, or with a prefix: `are only 3 views`."""
+    """Return a count with a noun and its verb: `3 views are`, or with a prefix: `are only 3 views`."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {prefix}{pluralize(count, word)}" if prefix else f"{pluralize(count, word)} {verb}"
 
@@ -277,7 +285,7 @@ def _join(names: Sequence[str], limit: int = MAX_NAMES) -> str:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The parts of a dataset, the facts about them, and the findings."""
+    """The parts of a dataset, the facts about it, and the findings."""
 
     parts: Parts
     facts: Facts
@@ -285,7 +293,7 @@ class Inspection:
 
     @classmethod
     def from_folder(cls, path: Path) -> "Inspection":
-        """Inspect the dataset in a folder.  Raises DataError only if there is no such folder."""
+        """Inspect the dataset in a folder.  Raises DataError only if the folder does not exist."""
         parts = read_parts(path)
         facts = measure_dataset(parts)
         return cls(parts, facts, findings(facts))
@@ -297,7 +305,7 @@ class Inspection:
 
     @property
     def next_step(self) -> str | None:
-        """How to get cameras for photographs without cameras; None for other datasets and unusable photographs."""
+        """How to find the cameras of photographs.  None for datasets with cameras and for unusable photographs."""
         facts = self.facts
         if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
             return None
@@ -307,13 +315,13 @@ class Inspection:
 
     @property
     def verdict(self) -> str:
-        """The findings in one sentence: the first error or warning, and the number of others."""
+        """The findings in one sentence: the first error or warning, and the number of further ones."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
         findings, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
         more = f" (and {pluralize(len(findings) - 1, f'more {kind}')})" if len(findings) > 1 else ""
         if self.next_step:
-            but = f", and {findings[0]}{more}" if findings else ""
-            return f"cameras are not known yet{but}; next: {self.next_step}"
+            problem = f", and {findings[0]}{more}" if findings else ""
+            return f"cameras are not known yet{problem}; next: {self.next_step}"
         return f"{start}{findings[0]}{more}" if findings else "ready to train"
 
     def data(self) -> dict[str, Any]:
@@ -328,13 +336,13 @@ class Inspection:
 
 # Format the facts as short lines, for the terminal and the page.
 
-MAX_CAMERAS = 4  # those with the most views
+MAX_CAMERAS = 4  # number of cameras to list
 
 
 def summarize(facts: Facts) -> dict[str, str]:
-    """Return the main facts as text, by name."""
+    """Return the main facts as lines of text, by label."""
     fallback = "photographs without cameras" if facts.unplaced else "none found"
-    lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _images(facts)}
+    lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _image_counts(facts)}
     if capture := facts.capture:
         lines["sizes"] = _counts(capture.sizes)
         lines["cameras by EXIF"] = _counts(capture.cameras)
@@ -377,7 +385,7 @@ def _counts(counts: Mapping[str, int]) -> str:
 
 
 def camera_line(camera: CameraFacts) -> str:
-    """Return a camera as one line of text."""
+    """Return a line of text that describes a camera: model, size, focal length, distortion, and number of views."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     distortion = "unbounded" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
@@ -387,7 +395,7 @@ def camera_line(camera: CameraFacts) -> str:
     return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 
 
-def _images(facts: Facts) -> str:
+def _image_counts(facts: Facts) -> str:
     if not facts.registered:
         return f"{facts.on_disk} on disk"
     parts = [f"{facts.registered} with a pose"]

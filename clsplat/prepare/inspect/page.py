@@ -1,4 +1,4 @@
-"""Write an inspection as a page that opens offline, with verdict, findings, facts, cameras and points."""
+"""Write an inspection as an HTML page that opens offline, with verdict, findings, facts, cameras and points."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ from clsplat.prepare.inspect.findings import Inspection, summarize
 from clsplat.scene.points import MAX_VALUE
 from clsplat.viewer.charts import camera_plans, histogram
 
-MAX_NAMES = 200  # of a list
-MAX_VIEWS = 8  # in the table of views with the lowest numbers of points
+MAX_NAMES = 200  # names per list
+MAX_VIEWS = 8  # rows of the table of views with the lowest numbers of points
 
 
 def write_page(inspection: Inspection, out: Path) -> None:
-    """Write the page.  Raises OutputError if that fails."""
+    """Write an inspection to the HTML file `out`.  Raises OutputError if that fails."""
     write_text(out, inspection_page(inspection))
 
 
 def inspection_page(inspection: Inspection) -> str:
-    """Return the page as HTML."""
+    """Return the page of an inspection as HTML."""
     path = inspection.facts.path
     name = path.rstrip("/").rpartition("/")[2] or path
     worst = inspection.findings[0].level if inspection.findings else "note"
@@ -35,29 +35,29 @@ def inspection_page(inspection: Inspection) -> str:
         verdict=inspection.verdict[0].upper() + inspection.verdict[1:],
         findings=inspection.findings,
         figures=summarize(inspection.facts),
-        cameras=_cameras(inspection),
+        cameras=_draw_cameras(inspection),
         far=pluralize(len(inspection.facts.outlier_cameras), "camera") if inspection.facts.outlier_cameras else "",
-        points_per_view=_points_per_view(inspection),
-        lists=_lists(inspection),
+        points_per_view=_draw_points_per_view(inspection),
+        lists=_list_names(inspection),
     )
 
 
-def _cameras(inspection: Inspection) -> list[Markup]:
-    """Draw training and test cameras without outliers, and points, from above and from the side."""
+def _draw_cameras(inspection: Inspection) -> list[Markup]:
+    """Draw the cameras without outliers, and the points, from above and from the side."""
     outliers, scene, table = set(inspection.facts.outlier_cameras), inspection.parts.scene, inspection.parts.points
-    test = {view.name for view in scene.split("test")} if scene else set()
+    test_names = {view.name for view in scene.split("test")} if scene else set()
     inliers = [view for view in inspection.parts.views if view.name not in outliers]
     views = {
-        "training": [view for view in inliers if view.name not in test],
-        "test": [view for view in inliers if view.name in test],
+        "training": [view for view in inliers if view.name not in test_names],
+        "test": [view for view in inliers if view.name in test_names],
     }
     points: NDArray[np.floating] = np.empty((0, 3)) if table is None else table.positions
     finite = points[(np.abs(points) < MAX_VALUE).all(axis=1)]
     return safe_charts(camera_plans(views, finite))
 
 
-def _points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
-    """Draw the histogram of points per view, and list the views with the lowest counts; None without counts."""
+def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
+    """Draw the histogram of points per view, and list the views with the lowest counts.  None if they are unknown."""
     counts = inspection.facts.points_per_view
     if not counts:
         return None
@@ -65,8 +65,8 @@ def _points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tuple[s
     return safe_charts([histogram("views by their number of points", list(counts.values()))]), lowest
 
 
-def _lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
-    """Return lists of names: the title, up to MAX_NAMES names, and the number of all names."""
+def _list_names(inspection: Inspection) -> list[tuple[str, list[str], int]]:
+    """Return the lists of the page: the title, up to MAX_NAMES names, and the total number of names."""
     facts, photographs = inspection.facts, inspection.facts.photos
     lists = {
         "registered but missing from disk": facts.missing,
