@@ -25,7 +25,7 @@ def main(*leading: str) -> None:
     leading: arguments to insert before those of the process.
     """
     signals.install()
-    arguments = _options_first(_with_port(_one_set_each([*leading, *sys.argv[1:]])))
+    arguments = _move_options_first(_expand_live(_expand_set([*leading, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
             exit_code = app(arguments, prog_name="clsplat", standalone_mode=False)
@@ -42,7 +42,7 @@ def main(*leading: str) -> None:
 
 
 def _report(error: BaseException, debugging: bool) -> int:
-    """Print the line for an error, or for an interruption by the user; return the exit code."""
+    """Print a line for an error or for an interruption by the user, and return the exit code."""
     if isinstance(error, WrappedError | typer.Abort):
         error = error.__cause__ or error
     if isinstance(error, KeyboardInterrupt):  # outside a run; a run says how to continue
@@ -59,7 +59,7 @@ def _report(error: BaseException, debugging: bool) -> int:
 
 
 def _usage(error: Any) -> str:
-    """Return what is wrong with the command line, and where to find help."""
+    """Return a line of text: the fault of the command line, and where to find help."""
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "clsplat"
     if type(error).__name__ == "NoArgsIsHelpError":
@@ -68,23 +68,23 @@ def _usage(error: Any) -> str:
     if option := getattr(error, "option_name", None) if hasattr(error, "possibilities") else None:
         parameters = context.command.get_params(context) if context else []
         names = [name for parameter in parameters for name in parameter.opts]
-        near = difflib.get_close_matches(option, [name for name in names if name.startswith("-")], n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]}?" if near else f"see `{command} --help`"
+        matches = difflib.get_close_matches(option, [name for name in names if name.startswith("-")], n=1, cutoff=0.5)
+        hint = f"did you mean {matches[0]}?" if matches else f"see `{command} --help`"
         return f"{command}: no option {option}; {hint}"
     message = " ".join(error.format_message().split()).rstrip(".")
     return f"{command}: {message[:1].lower()}{message[1:]}; see `{command} --help`"
 
 
-def _one_set_each(arguments: list[str]) -> list[str]:
+def _expand_set(arguments: list[str]) -> list[str]:
     """Expand `--set a=1 b=2` to `--set a=1 --set b=2`."""
-    expanded: list[str] = []
+    result: list[str] = []
     for argument in arguments:
-        follows = len(expanded) >= 2 and expanded[-2] == "--set"
-        expanded += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
-    return expanded
+        is_setting = len(result) >= 2 and result[-2] == "--set"
+        result += ["--set", argument] if is_setting and "=" in argument and argument[0] != "-" else [argument]
+    return result
 
 
-def _with_port(arguments: list[str]) -> list[str]:
+def _expand_live(arguments: list[str]) -> list[str]:
     """Expand `--live` without a number to `--live=0`."""
     following = [*arguments, ""][1:]
     return [
@@ -93,7 +93,7 @@ def _with_port(arguments: list[str]) -> list[str]:
     ]
 
 
-def _options_first(arguments: list[str]) -> list[str]:
+def _move_options_first(arguments: list[str]) -> list[str]:
     """Move `--debug` and `--plugin FILE` in front of the command."""
     others = [argument for argument in arguments if argument != DEBUG]
     first = [DEBUG] if len(others) < len(arguments) else []

@@ -51,7 +51,7 @@ class WrappedError(Exception):
 
 
 class Commands(TyperGroup):
-    """The commands of clsplat; those of `data` are imported when first used."""
+    """The commands of clsplat; the commands of `data` are imported when first used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return sorted([*super().list_commands(ctx), "data"], key=ORDER.index)
@@ -83,7 +83,7 @@ class Commands(TyperGroup):
 
 
 def examples(*lines: str) -> str:
-    """Return the end of a help text, with examples."""
+    """Return examples as the end of a help text."""
     return "Examples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
@@ -101,7 +101,7 @@ app = typer.Typer(
 
 
 def command(name: str, *lines: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command, with examples for its help."""
+    """Return a decorator that registers a command.  lines: examples for its help text."""
     return app.command(name, epilog=examples(*lines))
 
 
@@ -160,7 +160,7 @@ def common(
 
 
 def _device_or_global(context: typer.Context, device: str | None) -> str | None:
-    """Return the --device after the command, else the one before it."""
+    """Return the device given after the command, or else the global --device."""
     common = context.find_root().obj
     return device if device is not None or common is None else common.device
 

@@ -15,7 +15,7 @@ from clsplat.core.files import path_exists
 from clsplat.core.text_table import text_table
 
 
-def _numbers(option: str, text: str | None, expected: str) -> list[float] | None:
+def _parse_numbers(option: str, text: str | None, expected: str) -> list[float] | None:
     """Parse the comma-separated numbers of an option.  Raises ConfigError."""
     try:
         return None if text is None else [float(part) for part in text.split(",")]
@@ -58,7 +58,7 @@ def evaluate(
         terminal.keep_stdout_for_json()
     if out is not None:
         check_result_path(out, ".json")
-    divisors = _numbers("--downscales", downscales, "numbers, separated by commas, such as 1,2,4")
+    divisors = _parse_numbers("--downscales", downscales, "numbers, separated by commas, such as 1,2,4")
     results = commands.evaluate(
         model,
         scene,
@@ -77,7 +77,7 @@ def evaluate(
 
 
 def _metrics_table(results: dict[str, Any]) -> str:
-    """Return metrics as a table, a row for each split and downscale factor."""
+    """Return metrics as a table with a row for each split and downscale factor."""
     rows = [
         {"split": split, "size": f"1/{downscale}", **averages}
         for split in ("test", "train")
@@ -203,13 +203,13 @@ def compress(
     """Prune, train and quantize a model to meet a target size or quality; each file is measured as written."""
     from clsplat.workflows.compress import table
 
-    keeps = _numbers("--keep", keep, "fractions, separated by commas, such as 1,0.7,0.5")
+    keeps = _parse_numbers("--keep", keep, "fractions, separated by commas, such as 1,0.7,0.5")
     result = commands.compress_model(model, scene, target, out, format=format_, keep=keeps, steps=steps, device=device)
     terminal.show(table(result))
-    chosen, source = result["chosen"], result["source"]
-    size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
+    best, source = result["chosen"], result["source"]
+    size = f"{best['bytes'] / 1e6:.3g} MB, {best['bytes'] / source['bytes']:.1%} of the model"
     terminal.print_message(
-        f"{result['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {result['page']}"
+        f"{result['file']}: {size}, {best['psnr'] - source['psnr']:+z.2f} dB; page: {result['page']}"
     )
 
 
@@ -236,8 +236,8 @@ def lod(
         model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device
     )
     terminal.show(table(result))
-    measured = f"; PSNR of {result['split']} views, not yet quantized" if result["split"] else ""
-    terminal.print_message(f"{result['folder']}/lod-meta.json: {result['bytes'] / 1e6:.3g} MB{measured}")
+    note = f"; PSNR of {result['split']} views, not yet quantized" if result["split"] else ""
+    terminal.print_message(f"{result['folder']}/lod-meta.json: {result['bytes'] / 1e6:.3g} MB{note}")
 
 
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
@@ -328,8 +328,8 @@ def render(
         terminal.print_message(_video_text(result, columns=1 if side is None else 2))
         return
     video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
-    if used := [name for name, value in video_options.items() if value is not None]:
-        raise ConfigError(f"{used[0]} is for videos; add --path or --video")
+    if names := [name for name, value in video_options.items() if value is not None]:
+        raise ConfigError(f"{names[0]} is for videos; add --path or --video")
     count = pictures.render_views(
         model,
         scene,
@@ -346,7 +346,7 @@ def render(
 
 
 def _video_text(result: dict[str, Any], columns: int) -> str:
-    """Return one line about a video."""
+    """Return a line of text that describes a video: size, duration, and rendering time."""
     first, *others = (Path(name) for name in result["files"])
     width, height = result["size"]
     summary = f"{result['frames']} frames of {columns * width} x {height} px in {result['took']:.1f} s"

@@ -184,14 +184,14 @@ def check(
     elif "cells" in result:
         terminal.show(f"{result['path']}: valid; {len(result['cells'])} cells: {', '.join(result['cells'])}")
     else:
-        adapts = f"; the photos decide {', '.join(result['adapts'])}" if result["adapts"] else ""
-        terminal.show(f"{result['path']}: valid; {', '.join(result['stages'])}{adapts}")
+        note = f"; the photos decide {', '.join(result['adapts'])}" if result["adapts"] else ""
+        terminal.show(f"{result['path']}: valid; {', '.join(result['stages'])}{note}")
 
 
 def _show_findings(
     result: dict[str, Any], as_json: bool, text: str, verdict: str, error: type[ClsplatError] | None
 ) -> None:
-    """Show the result of `check`, and its verdict, which is raised if it is an error."""
+    """Show the result of `check` and its verdict; raise `error` with the verdict if there is one."""
     if as_json:
         terminal.show_json(result)
     else:

@@ -130,12 +130,12 @@ def bench(
     """Time the stages of a training step on fixed scenes, next to the measured peaks of the device."""
     if as_json:
         terminal.keep_stdout_for_json()
-    earlier = tools.read_measurement(against, pipeline) if against else {}
+    baseline = tools.read_measurement(against, pipeline) if against else {}
     names = [name for name in scenes.split(",") if name]
     measurement = tools.measure_speed(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device
     )
     if as_json:
-        terminal.show_json({**measurement.data(), **({"against": earlier} if earlier else {})})
+        terminal.show_json({**measurement.data(), **({"against": baseline} if baseline else {})})
     else:
-        terminal.show(measurement.text(earlier))
+        terminal.show(measurement.text(baseline))

@@ -1,5 +1,7 @@
-"""Render the two levels of a field, coarse samples of cones and fine samples where the coarse weights are, and
-compute their gradients (Mip-NeRF, Barron et al. 2021)."""
+"""Render a field at coarse and fine samples of cones, and compute gradients (Mip-NeRF, Barron et al. 2021).
+
+Fine samples are drawn where the weights of the coarse samples are large.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ assert RAYS == BLOCK
 
 @dataclass(frozen=True)
 class Draw:
-    """The key of the random numbers for rays of a step; without it, samples are evenly spaced."""
+    """The key of the random numbers for the rays of a step."""
 
     seed: int
     step: int
@@ -32,13 +34,13 @@ class Draw:
 
 @dataclass(frozen=True)
 class Rays:
-    """Pixels of a camera, with their cones."""
+    """Rays through pixels of a camera, as cones."""
 
     camera: DeviceCamera
     pixels: Array  # [ray_count] row * width + column
     cones: Array  # [count, RAY_VALUES]
     count: int  # including padding to whole tiles
-    draw: Draw | None
+    draw: Draw | None  # None for evenly spaced samples
 
     @property
     def ray_count(self) -> int:
@@ -47,7 +49,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class SampleLevel:
-    """The samples of rays in one level, and the results; valid until this level of other rays is rendered."""
+    """The samples of rays in a level, and their colors; valid until the same level of other rays is rendered."""
 
     rays: Rays
     samples: int
@@ -69,7 +71,7 @@ class RayTarget:
 
 
 class Levels:
-    """Render rays of a field, level by level; each level can be differentiated until the next one is rendered."""
+    """A renderer of rays, level by level; each level can be differentiated until the next level is rendered."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape, background: Array) -> None:
         """background: [3] in [0, 1]."""
@@ -80,7 +82,7 @@ class Levels:
         self._rays, self._composite = device.program("rays.cl"), device.program("composite.cl")
 
     def sample_rays(self, camera: DeviceCamera, draw: Draw, count: int) -> Rays:
-        """Return rays through random pixels."""
+        """Return `count` rays through random pixels of a camera."""
         pixels = self.workspace.array("field pixels", count, np.uint32)
         pixel_count = camera.width * camera.height
         self._rays.draw_pixels(
@@ -95,7 +97,7 @@ class Levels:
         return self.cast(camera, pixels, draw)
 
     def cast(self, camera: DeviceCamera, pixels: Array, draw: Draw | None = None) -> Rays:
-        """Return the rays through pixels, [n] of row * width + column."""
+        """Return the rays through pixels of a camera.  pixels: [n], row * width + column."""
         count = -(-pixels.shape[0] // RAYS) * RAYS
         cones = self.workspace.array("field cones", (count, RAY_VALUES))
         self._rays.cast_rays(
@@ -110,14 +112,16 @@ class Levels:
         return Rays(camera, pixels, cones, count, draw)
 
     def render(self, parameters: Array, rays: Rays) -> Iterator[SampleLevel]:
-        """Yield the coarse level, then the fine one."""
+        """Render rays: yield the coarse level, then the fine level."""
         coarse = self._level(parameters, rays, self._coarse_edges(rays), "coarse")
         yield coarse
         yield self._level(parameters, rays, self._fine_edges(coarse), "fine")
 
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
-        """Add the gradient of the loss of the level that was rendered last to `gradient`, [P], and write the squared
-        differences of its rays."""
+        """Add the gradient of the loss of the last rendered level to `gradient`, [P].
+
+        Also writes the squared differences of its rays to the target.
+        """
         rays, tiles = level.rays, level.raw_colors.shape[0]
         grad_colors, grad_densities = (
             self.workspace.array(f"field by {name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
@@ -167,9 +171,14 @@ class Levels:
     def _coarse_edges(self, rays: Rays) -> Array:
         samples = self.shape.coarse_samples
         edges = self.workspace.array("field coarse edges", (rays.count, samples + 1))
-        limits: dict[str, Any] = {"near": self.shape.near, "far": self.shape.far}
+        depth_range: dict[str, Any] = {"near": self.shape.near, "far": self.shape.far}
         self._rays.spread_edges(
-            items=rays.count, edges=edges, samples=samples, count=rays.count, **limits, **_random_arguments(rays.draw)
+            items=rays.count,
+            edges=edges,
+            samples=samples,
+            count=rays.count,
+            **depth_range,
+            **_random_arguments(rays.draw),
         )
         return edges
 
@@ -193,7 +202,7 @@ class Levels:
         tiles = rays.count * samples // SAMPLES
         self.encoding.forward(parameters, Samples(rays.cones, edges))
         raw_colors, raw_densities = self.network.forward(parameters, tiles)
-        weights, left = (
+        weights, transmittances = (
             self.workspace.array(f"field {name} {kind}", (rays.count, samples)) for kind in ("weights", "left")
         )
         colors = self.workspace.array(f"field {name} rays", (rays.count, 3))
@@ -205,27 +214,27 @@ class Levels:
             edges=edges,
             background=self.background,
             weights=weights,
-            left=left,
+            left=transmittances,
             colors=colors,
             samples=samples,
             rays=rays.count,
         )
-        return SampleLevel(rays, samples, edges, raw_colors, raw_densities, weights, left, colors)
+        return SampleLevel(rays, samples, edges, raw_colors, raw_densities, weights, transmittances, colors)
 
 
 def rays_per_pass(shape: FieldShape) -> int:
-    """Return the number of rays that one pass renders."""
+    """Return the number of rays that are rendered in a pass."""
     return max(RAYS, PASS_SAMPLES // max(shape.coarse_samples, shape.fine_samples) // RAYS * RAYS)
 
 
 def _random_arguments(draw: Draw | None) -> dict[str, int]:
-    """Return the arguments for random edges."""
+    """Return the arguments of kernels for random or, without a key, evenly spaced sample edges."""
     key = draw or Draw(0, 0, 0)
     return {"drawn": int(draw is not None), "seed": key.seed, "step": key.step, "first_ray": key.first}
 
 
 class Field:
-    """A field on the device: a shape with its parameters; it renders views as Gaussians do (clsplat.render.painter)."""
+    """A field on the device, with a shape and parameters.  It renders views like Gaussians (clsplat.render.painter)."""
 
     def __init__(self, shape: FieldShape, parameters: Array, background: Array) -> None:
         """parameters: [P], changed in place by training; background: [3] in [0, 1]."""
@@ -249,9 +258,9 @@ class Field:
         return image
 
     def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        """Return the image of the fine level on the host, its alpha, and the mean depth.
+        """Return the image, alpha and mean depth of the fine level on the host.
 
-        The direction of a ray has depth 1, so that distances along it are depths.  Depths are in scene units.
+        Depths are in scene units.  The direction of a ray has depth 1, so distances along it are depths.
         """
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
@@ -260,8 +269,8 @@ class Field:
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
             opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
             alpha[pixels] = np.minimum(opacity, 1)  # rounding may exceed 1
-            mean = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
-            depths[pixels] = self.shape.scene_units * mean
+            mean_depths = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
+            depths[pixels] = self.shape.scene_units * mean_depths
         rgb = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
         return Layers(rgb, alpha.reshape(size), depths.reshape(size) if depth else None)
 
@@ -271,7 +280,7 @@ class Field:
         return image
 
     def _passes(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], SampleLevel]]:
-        """Yield pixels, [n] of row * width + column, and their fine level, valid until the next."""
+        """Yield batches of pixels, [n], row * width + column, with their fine level, valid until the next batch."""
         pixels, count = np.arange(camera.width * camera.height, dtype=np.uint32), rays_per_pass(self.shape)
         for first in range(0, len(pixels), count):
             batch = pixels[first : first + count]

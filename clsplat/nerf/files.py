@@ -53,7 +53,7 @@ class FieldModel:
     shape: FieldShape
     parameters: NDArray[np.float32]  # [P]
     rendering: Rendering  # background, and the meaning of the photographs' fourth channel
-    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of its zero
+    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of its origin
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.parameters,):
@@ -63,11 +63,11 @@ class FieldModel:
             raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
 
     def in_scene(self, scene: Scene) -> "FieldModel":
-        """Return the field.  Raises DataError for a scene with another origin."""
+        """Return the field for a scene.  Raises DataError if the scene has another origin."""
         return self.with_origin(scene.origin)
 
     def with_origin(self, origin: NDArray[np.floating]) -> "FieldModel":
-        """Return the field, which cannot be moved.  Raises DataError if its origin differs."""
+        """Return the field if it has this origin.  Raises DataError otherwise, since a field cannot be moved."""
         if np.array_equal(self.origin, origin):
             return self
         raise DataError(f"the field has the origin {self.origin}, the scene {origin}; give the scene it was trained on")
@@ -78,7 +78,7 @@ class FieldModel:
         return Field(self.shape, device.upload(self.parameters), background)
 
     def save(self, path: str | Path) -> str:
-        """Write the file; return its SHA-256.  Raises OutputError when it cannot be written."""
+        """Write the field to a file, and return the file's SHA-256.  Raises OutputError when it cannot be written."""
         path, rendering = Path(path), self.rendering
         notes = Notes(
             format=FORMAT,
@@ -104,7 +104,7 @@ def is_field(path: Path) -> bool:
 
 
 def field_of_run(folder: Path) -> Path:
-    """Return the field's file in a run folder: the last one that `export_field` wrote."""
+    """Return the path of the last file that `export_field` wrote in a run folder."""
     return run_output(folder, "export_field", FILE)
 
 

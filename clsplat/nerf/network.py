@@ -1,6 +1,6 @@
 """Run a network on the device: compute its outputs, and the gradients of its parameters.
 
-Arrays of features are in tiles of samples (cl_kernels/layers.h).
+Arrays of features are stored in tiles of samples (cl_kernels/layers.h).
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class _Table:
 
 
 class Network:
-    """The network of a shape, for a number of tiles of samples at a time."""
+    """The network of a field on the device, which processes a number of tiles of samples at a time."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape) -> None:
         self.workspace, self.shape = workspace, shape
@@ -41,20 +41,22 @@ class Network:
         self._density, self._bottleneck, self._condition, self._color = self._layers[shape.depth :]
 
     def position(self, tiles: int) -> tuple[Array, int]:
-        """Return the table with the encoded position, [tiles, rows, SAMPLES], and its first row there."""
+        """Return the array that contains the encoded position, [tiles, rows, SAMPLES], and the position's first row."""
         skip, width = self.shape.skip, self.shape.width
         if skip is None:
             return self._table("position", tiles, self.shape.position_rows), 0
         return self._trunk_outputs(skip, tiles), width
 
     def direction(self, tiles: int) -> tuple[Array, int]:
-        """Return the table with the encoded direction, as `position` does."""
+        """Return the array that contains the encoded direction, and the direction's first row, as `position` does."""
         rows = self.shape.width + self.shape.direction_rows
         return self._table("direction", tiles, rows), self.shape.width
 
     def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
-        """Return raw colors and raw densities for the encodings in the tables, each [tiles, COLOR_ROWS, SAMPLES], valid
-        until the next call."""
+        """Return raw colors and raw densities for the encodings in the tables, each [tiles, COLOR_ROWS, SAMPLES].
+
+        They are valid until the next call.
+        """
         x = _Table(*self.position(tiles))
         for i, layer in enumerate([self._first, *self._trunk]):
             outputs = self._trunk_outputs(i, tiles)
@@ -62,11 +64,11 @@ class Network:
             x = _Table(outputs)
         densities = self._table("densities", tiles, COLOR_ROWS)
         colors = self._table("colors", tiles, COLOR_ROWS)
-        direction, conditioned = self.direction(tiles)[0], self._table("conditioned", tiles, self.shape.color_width)
+        direction, color_input = self.direction(tiles)[0], self._table("conditioned", tiles, self.shape.color_width)
         self._apply(self._density, parameters, x, densities, NO_LIMIT)
         self._apply(self._bottleneck, parameters, x, direction, NO_LIMIT)
-        self._apply(self._condition, parameters, _Table(direction), conditioned, RELU)
-        self._apply(self._color, parameters, _Table(conditioned), colors, NO_LIMIT)
+        self._apply(self._condition, parameters, _Table(direction), color_input, RELU)
+        self._apply(self._color, parameters, _Table(color_input), colors, NO_LIMIT)
         return colors, densities
 
     def backward(self, parameters: Array, grad_colors: Array, grad_densities: Array, gradient: Array) -> Array:
@@ -76,27 +78,27 @@ class Network:
         """
         tiles, width = grad_colors.shape[0], self.shape.width
         last, direction = _Table(self._trunk_outputs(self.shape.depth - 1, tiles)), _Table(self.direction(tiles)[0])
-        conditioned = _Table(self._table("conditioned", tiles, self.shape.color_width))
-        grad_conditioned = self._table("by conditioned", tiles, self.shape.color_width)
+        color_input = _Table(self._table("conditioned", tiles, self.shape.color_width))
+        grad_color_input = self._table("by conditioned", tiles, self.shape.color_width)
         grad_direction, grad_x = self._table("by direction", tiles, width), self._table("by hidden", tiles, width)
-        self._sum(self._color, conditioned, grad_colors)
-        self._differentiate(self._color, parameters, grad_colors, conditioned, grad_conditioned, RELU)
-        self._sum(self._condition, direction, grad_conditioned)
-        self._differentiate(self._condition, parameters, grad_conditioned, direction, grad_direction, NO_LIMIT)
+        self._sum(self._color, color_input, grad_colors)
+        self._differentiate(self._color, parameters, grad_colors, color_input, grad_color_input, RELU)
+        self._sum(self._condition, direction, grad_color_input)
+        self._differentiate(self._condition, parameters, grad_color_input, direction, grad_direction, NO_LIMIT)
         self._sum(self._density, last, grad_densities)
         self._sum(self._bottleneck, last, grad_direction)
         self._differentiate(self._density, parameters, grad_densities, last, grad_x, NO_LIMIT)
-        self._differentiate(self._bottleneck, parameters, grad_direction, last, grad_x, RELU, kept=1)
+        self._differentiate(self._bottleneck, parameters, grad_direction, last, grad_x, RELU, add=1)
         for i in range(len(self._trunk), 0, -1):
             inputs, layer = _Table(self._trunk_outputs(i - 1, tiles)), self._trunk[i - 1]
             self._sum(layer, inputs, grad_x)
             if i - 1 == self.shape.skip:
-                self._grid_gradient(layer, parameters, grad_x, self.shape.width, kept=0)
+                self._grid_gradient(layer, parameters, grad_x, self.shape.width, add=0)
             grad_inputs = self._table(f"by hidden {i % 2}", tiles, width)
             self._differentiate(layer, parameters, grad_x, inputs, grad_inputs, RELU)
             grad_x = grad_inputs
         self._sum(self._first, _Table(*self.position(tiles)), grad_x)
-        grad_grid = self._grid_gradient(self._first, parameters, grad_x, 0, kept=int(self.shape.skip is not None))
+        grad_grid = self._grid_gradient(self._first, parameters, grad_x, 0, add=int(self.shape.skip is not None))
         count = self.shape.network_parameters
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
@@ -107,11 +109,11 @@ class Network:
         )
         return grad_grid
 
-    def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, kept: int) -> Array:
+    def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, add: int) -> Array:
         """Compute the gradient of the grid's features, which a layer reads starting at a row."""
         tiles = grad_outputs.shape[0]
         position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
-        self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, kept, row)
+        self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, add, row)
         return grad_grid
 
     def _trunk_outputs(self, i: int, tiles: int) -> Array:
@@ -152,12 +154,12 @@ class Network:
         inputs: _Table,
         grad_inputs: Array,
         lowest: float,
-        kept: int = 0,
+        add: int = 0,
         row: int = 0,
     ) -> None:
-        """Compute the gradient of the inputs of a layer that use its weights from a row on."""
-        tiles, derived, output_rows = *grad_inputs.shape[:2], grad_outputs.shape[1]
-        count = tiles * self._columns * (derived // BLOCK)
+        """Compute the gradient of a layer's inputs, for its weights from `row` on.  add: 1 to add it."""
+        tiles, grad_rows, output_rows = *grad_inputs.shape[:2], grad_outputs.shape[1]
+        count = tiles * self._columns * (grad_rows // BLOCK)
         self._program.dense_backward(
             items=count,
             grad_outputs=grad_outputs,
@@ -167,11 +169,11 @@ class Network:
             first_parameter=layer.first + row * layer.columns,
             input_rows=inputs.rows,
             first_input=inputs.first,
-            derived_count=derived,
+            derived_count=grad_rows,
             output_rows=output_rows,
             output_count=layer.columns,
             lowest=lowest,
-            kept=kept,
+            kept=add,
             count=count,
         )
 
@@ -210,7 +212,7 @@ PARTS = 64  # parts of all levels together, per compute unit of a GPU
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples along rays."""
+    """Samples along the cones of rays."""
 
     cones: Array  # [rays, RAY_VALUES]
     edges: Array  # [rays, samples + 1]
@@ -229,7 +231,7 @@ class Samples:
 
 
 class Encoding:
-    """Write the encodings of samples to the tables that the network reads."""
+    """The encodings of samples, which are written to the tables that the network reads."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape, network: Network) -> None:
         self.workspace, self.shape, self.network = workspace, shape, network
@@ -240,7 +242,7 @@ class Encoding:
         self.parts = parts_per_level(device, shape.grid.levels) if shape.grid else 0
 
     def forward(self, parameters: Array, samples: Samples) -> None:
-        """Write the encoded positions and directions."""
+        """Write the encoded positions and directions of samples."""
         if self.shape.grid:
             self._locate(samples)
             self.read_grid(parameters, samples.tiles)
@@ -274,7 +276,7 @@ class Encoding:
     def backward(self, grad_position: Array, gradient: Array) -> None:
         """Add the gradient of the grid's entries to `gradient`, [P].
 
-        grad_position: gradient of the grid's features at the last `forward`'s samples, [tiles, grid_rows, SAMPLES].
+        grad_position: [tiles, grid_rows, SAMPLES], gradient of the grid's features at the last samples.
         """
         if not self.shape.grid:
             return
@@ -294,7 +296,7 @@ class Encoding:
         )
 
     def grid_positions(self, tiles: int) -> Array:
-        """Return the positions of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES]; `forward` sets them."""
+        """Return the positions of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], which `forward` writes."""
         return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
 
     def read_grid(self, parameters: Array, tiles: int) -> None:

@@ -16,7 +16,7 @@ GRID = constants("grid.cl")
 FEATURES = int(GRID["GRID_FEATURES"])
 FARTHEST = 1e6  # units of the field: the squared ratio of two depths stays within float32
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
-UNIT_MAX = 1e15  # scene units, as numbers in a dataset; its inverse is the least
+UNIT_MAX = 1e15  # largest unit in scene units, as values in a dataset; its inverse is the smallest
 UnitLength = Annotated[float, Field(ge=1 / UNIT_MAX, le=UNIT_MAX)]
 MAX_INITIAL = 1e-4  # largest initial value of an entry (Müller et al. 2022, section 4)
 
@@ -58,8 +58,7 @@ class GridShape(Settings):
 
     @property
     def table(self) -> NDArray[np.uint32]:
-        """The levels as kernels read them, [levels, 4]: cells along a side, first entry, entries, whether they are
-        hashed."""
+        """The levels for the kernels, [levels, 4]: cells per side, first entry, entries, whether they are hashed."""
         growth = (self.finest / self.coarsest) ** (1 / max(1, self.levels - 1))
         rows, first = [], 0
         for level in range(self.levels):
@@ -160,7 +159,7 @@ class FieldShape(Settings):
         return self
 
     def with_unit(self, scene: Scene) -> "FieldShape":
-        """Return the shape with the unit that `auto` chooses by a scene, with three digits: the same everywhere."""
+        """Return the shape with the unit that `auto` chooses for a scene, rounded so that all machines agree."""
         if self.unit != "auto":
             return self
         unit = float(f"{camera_distance(scene) / BLENDER_DISTANCE:.3g}")
@@ -168,14 +167,14 @@ class FieldShape(Settings):
 
     @property
     def scene_units(self) -> float:
-        """The unit as a number.  Raises ValueError if no scene has chosen it yet."""
+        """The unit of the field, in scene units.  Raises ValueError if it is still 'auto'."""
         if self.unit == "auto":
             raise ValueError("the unit of the field is 'auto'; use FieldShape.with_unit to choose it by a scene")
         return self.unit
 
     @property
     def position_parts(self) -> list[int]:
-        """Features of the parts of the encoded position: grid, sines; each part is padded to whole blocks."""
+        """Numbers of features of the encoded position: of the grid and of the sines, each padded to full blocks."""
         return [self.grid_rows, 6 * self.degrees]
 
     @property
@@ -214,12 +213,12 @@ class FieldShape(Settings):
 
     @property
     def network_parameters(self) -> int:
-        """Number of parameters of all layers, rounded up to whole lines; the grid's entries follow."""
+        """Number of parameters of all layers, rounded up to full lines; the grid's entries follow."""
         return -(-self.layers[-1].end // LINE) * LINE
 
     @property
     def parameters(self) -> int:
-        """Length of the table of parameters, rounded up to whole lines."""
+        """Length of the table of parameters, rounded up to full lines."""
         return self.network_parameters + (-(-self.grid.parameter_count // LINE) * LINE if self.grid else 0)
 
     @property
@@ -229,18 +228,21 @@ class FieldShape(Settings):
         return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers) + grid_count
 
     def initial_parameters(self, seed: int) -> NDArray[np.float32]:
-        """Return initial parameters, [parameters]: weights uniform within sqrt(6 / (inputs + outputs)) (Glorot and
-        Bengio 2010) and biases of 0, as in the released code; a grid's entries are close to 0."""
-        random, values = np.random.default_rng([seed, self.parameter_count]), np.zeros(self.parameters, np.float32)
+        """Return the initial parameters for a seed, [parameters], as in the released code.
+
+        Weights are uniform within sqrt(6 / (inputs + outputs)) (Glorot and Bengio 2010), biases are 0, and a grid's
+        entries are close to 0.
+        """
+        rng, values = np.random.default_rng([seed, self.parameter_count]), np.zeros(self.parameters, np.float32)
         for layer in self.layers:
             limit = np.sqrt(6 / (len(layer.inputs) + layer.outputs))
             weights = np.zeros((layer.rows, layer.columns), np.float32)
-            sample = random.uniform(-limit, limit, (len(layer.inputs), layer.outputs))
+            sample = rng.uniform(-limit, limit, (len(layer.inputs), layer.outputs))
             weights[np.ix_(layer.inputs, range(layer.outputs))] = sample
             values[layer.first : layer.first_bias] = weights.ravel()
         if self.grid:
             entries = values[self.network_parameters : self.network_parameters + self.grid.parameter_count]
-            entries[:] = random.uniform(-MAX_INITIAL, MAX_INITIAL, len(entries))
+            entries[:] = rng.uniform(-MAX_INITIAL, MAX_INITIAL, len(entries))
         return values
 
     def weights(self, parameters: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -255,18 +257,20 @@ class FieldShape(Settings):
 
 
 def _require_all_keys(value: Any) -> Any:
-    """Return a shape from a file, in scene units if it has no unit.  Raises ValueError if another key is missing, since
-    defaults may have changed, or if the unit is not a number."""
-    written = {"unit": 1.0, "unit_auto": None, **value} if isinstance(value, dict) and value else {}
-    grid = written.get("grid")
-    missing = [name for name in FieldShape.model_fields if written and name not in written]
+    """Return the keys of a shape in a file, in scene units if it has no unit.
+
+    Raises ValueError if another key is missing, since defaults may have changed, or if the unit is not a number.
+    """
+    data = {"unit": 1.0, "unit_auto": None, **value} if isinstance(value, dict) and value else {}
+    grid = data.get("grid")
+    missing_names = [name for name in FieldShape.model_fields if data and name not in data]
     if isinstance(grid, dict):
-        missing += [f"grid.{name}" for name in GridShape.model_fields if name not in grid]
-    if missing:
-        raise ValueError(f"the shape lacks {', '.join(missing)}")
-    if written.get("unit") == "auto":
+        missing_names += [f"grid.{name}" for name in GridShape.model_fields if name not in grid]
+    if missing_names:
+        raise ValueError(f"the shape lacks {', '.join(missing_names)}")
+    if data.get("unit") == "auto":
         raise ValueError("the shape has the unit 'auto' instead of a number")
-    return written or value
+    return data or value
 
 
 WrittenShape = Annotated[FieldShape, BeforeValidator(_require_all_keys)]  # the shape in a file

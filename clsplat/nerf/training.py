@@ -71,9 +71,9 @@ class LearnedField(TrainedField):
     def from_tables(
         cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array
     ) -> Self:
-        """Return the field of a checkpoint from the result of `tables`."""
-        checked = _parse_shape(shape)
-        field = cls(Field(checked, background.device.zeros(checked.parameters), background))
+        """Return the field of a checkpoint.  tables: as the method `tables` returns them."""
+        parsed_shape = _parse_shape(shape)
+        field = cls(Field(parsed_shape, background.device.zeros(parsed_shape.parameters), background))
         for name, array in field._arrays.items():
             array.set(tables[name][:, 0])
         return field
@@ -103,11 +103,11 @@ class LearnedField(TrainedField):
         return self.field.shape.parameter_count
 
     def shape_as_data(self) -> dict[str, Any]:
-        """Return its shape as data for JSON."""
+        """Return the shape of the field as data for JSON."""
         return self.field.shape.model_dump()
 
     def tables(self) -> Tables:
-        """Copy its tables to the host, each [P, 1]."""
+        """Copy the tables of the field to the host, each [P, 1]."""
         return {name: array.get()[:, None] for name, array in self._arrays.items()}
 
     def not_finite(self) -> list[str]:
@@ -138,7 +138,7 @@ class LearnedField(TrainedField):
         self.update(self._gradient, adam, self.updates)
 
     def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
-        """Update the parameters with Adam and a gradient, [P].  number: number of the update, from 1."""
+        """Update the parameters with Adam and a gradient, [P].  number: index of the update, from 1."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,
@@ -155,14 +155,14 @@ class LearnedField(TrainedField):
         """Return the loss of the last step, and the mean squared difference of its fine level."""
         coarse, fine = (
             sum(
-                scale * float(part.sum(dtype=np.float64))
-                for (_, scale), part in zip(self._scales, self._parts(array.get()), strict=True)
+                scale * float(photo_errors.sum(dtype=np.float64))
+                for (_, scale), photo_errors in zip(self._scales, self._split_by_photo(array.get()), strict=True)
             )
             for array in self._errors(sum(rays for rays, _ in self._scales))
         )
         return fine + coarse_weight * coarse, fine
 
-    def _parts(self, errors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    def _split_by_photo(self, errors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         return np.split(errors, np.cumsum([rays for rays, _ in self._scales])[:-1])
 
     def _errors(self, rays: int) -> list[Array]:
@@ -214,7 +214,7 @@ class FieldPlan:
         return TABLES_HELD * self.parameters + self.features + self.partials + self.photographs
 
     def text(self, limits: DeviceLimits) -> str:
-        """Return one line of text: the memory needed, and the memory of the device."""
+        """Return a line of text: the required memory, and the memory of the device."""
         return (
             f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of "
             f"{self.parameters / MIB:,.0f} MiB, "
@@ -223,7 +223,7 @@ class FieldPlan:
         )
 
     def check(self, limits: DeviceLimits) -> None:
-        """Raise MemoryLimitError if it does not fit."""
+        """Raise MemoryLimitError if the required memory exceeds the limits."""
         if self.needed > limits.memory or max(self.parameters, self.partials) > limits.allocation:
             raise MemoryLimitError(
                 f"{self.text(limits)}: use fewer levels or entries of the grid (train_field.field.grid), a smaller "
@@ -232,11 +232,11 @@ class FieldPlan:
 
 
 def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
-    """Return the plan for a field.  photographs: their bytes on the device."""
+    """Return the memory plan for training a field.  photographs: bytes of the photographs on the device."""
     samples = rays_per_pass(shape) * max(shape.coarse_samples, shape.fine_samples)
-    hidden = (shape.depth + 3) * shape.width  # outputs of the trunk, and gradients of three layers
-    encoded = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
-    rows = hidden + encoded + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
+    hidden_rows = (shape.depth + 3) * shape.width  # outputs of the trunk, and gradients of three layers
+    encoded_rows = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
+    rows = hidden_rows + encoded_rows + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
     chunks = -(-samples // (SAMPLES * CHUNK))
     return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.network_parameters, photographs)
 
@@ -248,8 +248,10 @@ CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners
 
 
 def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
-    """Raise ConfigError if no training view sees the grid's cube between near and far, or if all points of the scene
-    are outside the cube."""
+    """Raise ConfigError if no training view shows the cube of a field's grid, or if all scene points are outside it.
+
+    Views show the cube at depths between `near` and `far` of the shape.
+    """
     cube, views, points = shape.grid, scene.split("train"), scene.points
     if cube is None or not views:
         return
@@ -274,8 +276,10 @@ def _is_in_cube(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
 
 
 def _corners(view: View, near: float, far: float, unit: float) -> Floats:
-    """Return the corners of a view's frustum between two depths, [8, 3], ordered as CORNERS: columns, rows, depth; in
-    units of `unit`."""
+    """Return the corners of a view's frustum between two depths, [8, 3], in units of `unit`.
+
+    They have the order of CORNERS: columns, rows, depth.
+    """
     camera = view.camera
     directions = (CORNERS[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     positions = np.column_stack([directions, np.ones(8)]) * (near + CORNERS[:, 2:] * (far - near))
@@ -284,8 +288,10 @@ def _corners(view: View, near: float, far: float, unit: float) -> Floats:
 
 
 def _intersect(cube: Floats, frustum: Floats) -> bool:
-    """Return whether two bodies, given by corners ordered as CORNERS, intersect: no axis separates them (Gottschalk,
-    Lin and Manocha 1996)."""
+    """Return whether a cube and a frustum intersect: no axis separates them (Gottschalk, Lin and Manocha 1996).
+
+    Both are [8, 3], corners in the order of CORNERS.
+    """
     axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
     faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])
     candidates = np.vstack([axes, faces, np.cross(axes[:, None], edges[None]).reshape(-1, 3)])

@@ -1,4 +1,4 @@
-"""Advise on what limited the result of a run, from its views, records and cameras, with a command for each."""
+"""Find what limited the result of a run, from its views, records and cameras, and suggest a command for each."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -32,16 +32,18 @@ UNEVEN = 3.0  # times the median gap
 
 
 def advice(run: Run, is_overfit: bool) -> list[str]:
-    """Return at most MAX_LINES sentences, the most important first, each with a command; empty if nothing stands out.
+    """Return at most MAX_LINES sentences of advice, the most important first, each with a command.
 
-    Renders at most MAX_MEASURED training views.
+    Empty if nothing stands out.  Renders at most MAX_MEASURED training views.
     """
     views = learned_scene(run).downscaled(run.downscale).split("train")
-    chosen = sample_views(views, MAX_MEASURED)
-    counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    metrics = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
+    sample = sample_views(views, MAX_MEASURED)
+    counted = run.status.counted(run.until_interrupted(sample), "views", len(sample))
+    metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
-    test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
+    test_psnr = {
+        line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step
+    }
     again, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
     stages = run.pipeline["stages"]
     can_mask = run.learned_field is None and not any(module_class(name).masks_objects for name in run.modules)
@@ -50,18 +52,18 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     key = find_limit(stages)
     growth = (limits[-1], f"{again} --set {key}=null") if limits and key else None
     longer = f"{resume} --steps {2 * run.step}"
-    found = [
+    sentences = [
         *advise_on_training_views(metrics, has_exposures, again, run.step if can_mask else None),
         *advise_on_fit(metrics, is_overfit, growth, again, longer),
-        *advise_on_test_views(test, again),
+        *advise_on_test_views(test_psnr, again),
         *advise_on_capture(views, run.original.views, again),
     ]
     if (reason := sky_reason(run)) and any("export" in entry for entry in stages):
         choice, effect = ("sidecar", "leaves it out") if sky_gaussians(run) else ("splats", "adds it")
-        shown = "has it as distant Gaussians" if sky_gaussians(run) else "does not show it in other viewers"
-        text = f"a sky was added, since {reason}; the model file {shown}: `{resume} --set export.sky={choice}` {effect}"
-        found.append(text)
-    return found[:MAX_LINES]
+        state = "has it as distant Gaussians" if sky_gaussians(run) else "does not show it in other viewers"
+        text = f"a sky was added, since {reason}; the model file {state}: `{resume} --set export.sky={choice}` {effect}"
+        sentences.append(text)
+    return sentences[:MAX_LINES]
 
 
 def advise_on_training_views(
@@ -69,8 +71,8 @@ def advise_on_training_views(
 ) -> Iterator[str]:
     """Yield advice from the metrics of training views.
 
-    has_exposures: whether training learns exposures; again: the command that repeats the run; steps: of the training,
-    None if moving objects cannot be masked.
+    has_exposures: whether training learns exposures.  again: the command that repeats the run.  steps: the number of
+    training steps, or None if moving objects cannot be masked.
     """
     if names := find_outliers({view.view: view.psnr for view in metrics}):
         text = f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos"
@@ -80,10 +82,10 @@ def advise_on_training_views(
             transients = shell_quote(f"optimize.modules.transients={{start: {round(TRANSIENTS_START * steps)}}}")
             yield f"{text}: remove blurred photos; if objects move, `{again} --set {transients}`"
     gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
-    gained = float(np.mean(gains)) if gains else 0.0
-    if not has_exposures and gained >= MIN_EXPOSURE_GAIN:
+    gain = float(np.mean(gains)) if gains else 0.0
+    if not has_exposures and gain >= MIN_EXPOSURE_GAIN:
         yield (
-            f"exposures or colors differ between photos: matching them would gain {gained:.1f} dB; "
+            f"exposures or colors differ between photos: matching them would gain {gain:.1f} dB; "
             f"try `{again} --set optimize.modules.exposure={{}}`"
         )
 
@@ -91,25 +93,25 @@ def advise_on_training_views(
 def advise_on_fit(
     metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, again: str, longer: str
 ) -> Iterator[str]:
-    """Yield advice if the model overfits, or else if its growth was limited, or else if it fits the photos badly.
+    """Yield advice if the model overfits, if its growth was limited, or if it fits the photos badly, in this order.
 
-    growth: the limit that stopped growth, and the command without it; again, longer: commands that repeat the run, and
-    that train it longer.
+    growth: the limit that stopped growth, and the command that trains without it.  again: the command that repeats the
+    run.  longer: the command that trains longer.
     """
-    train = float(np.mean([view.psnr for view in metrics])) if metrics else np.inf
+    train_psnr = float(np.mean([view.psnr for view in metrics])) if metrics else np.inf
     if is_overfit:
         yield f"the model overfits: add photos between the existing ones, then `{again}`"
     elif growth:
         limit, command = growth
-        yield f"growth stopped at its limit of {limit:,} Gaussians, {train:.1f} dB at training views: `{command}`"
-    elif train < LOW_PSNR:
-        yield f"the model underfits: only {train:.1f} dB at training views; train longer: `{longer}`"
+        yield f"growth stopped at its limit of {limit:,} Gaussians, {train_psnr:.1f} dB at training views: `{command}`"
+    elif train_psnr < LOW_PSNR:
+        yield f"the model underfits: only {train_psnr:.1f} dB at training views; train longer: `{longer}`"
 
 
 def find_limit(stages: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the key, as in `--set`, of the number of Gaussians per pixel in the stages of a pipeline."""
-    trainings = ((name, i, entry) for part in stages for name, stage in part.items() for i, entry in _during(stage))
-    return next((f"{name}.during.{i}.per_pixel" for name, i, entry in trainings if _has_limit(entry)), None)
+    """Return the key for `--set` of the first limit of Gaussians per pixel in a pipeline.  None without a limit."""
+    entries = ((name, i, entry) for group in stages for name, stage in group.items() for i, entry in _during(stage))
+    return next((f"{name}.during.{i}.per_pixel" for name, i, entry in entries if _has_limit(entry)), None)
 
 
 def _during(stage: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any]]]:
@@ -121,7 +123,7 @@ def _has_limit(entry: Mapping[str, Any]) -> bool:
 
 
 def advise_on_test_views(psnr: Mapping[str, float], again: str) -> Iterator[str]:
-    """Yield advice from the PSNR of test views, dB by name."""
+    """Yield advice from the PSNR of test views.  psnr: dB, by the name of the view."""
     if names := find_outliers(psnr):
         yield (
             f"{_join_names(names)}: much worse than the other test views; add photos of what is visible there, then "
@@ -131,9 +133,9 @@ def advise_on_test_views(psnr: Mapping[str, float], again: str) -> Iterator[str]
 
 def advise_on_capture(train: Sequence[View], views: Sequence[View], again: str) -> Iterator[str]:
     """Yield advice from the number of training views and the positions of all views."""
-    number = len({view.name for view in train})
-    if number < FEW_PHOTOS:
-        count = pluralize(number, "training photograph")
+    view_count = len({view.name for view in train})
+    if view_count < FEW_PHOTOS:
+        count = pluralize(view_count, "training photograph")
         yield f"only {count}; show every part in at least five, from several sides, then `{again}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap
@@ -141,7 +143,7 @@ def advise_on_capture(train: Sequence[View], views: Sequence[View], again: str) 
 
 
 def find_outliers(psnr: Mapping[str, float]) -> list[str]:
-    """Return the names of views far below the median, the worst first; psnr: dB, by name."""
+    """Return the names of views with a PSNR far below the median, the worst first.  psnr: dB, by name."""
     median = float(np.median(list(psnr.values()))) if psnr else 0.0
     return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - OUTLIER_DB]
 
@@ -149,7 +151,7 @@ def find_outliers(psnr: Mapping[str, float]) -> list[str]:
 def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     """Return the widest gap between views around the point that they look at, in degrees, and the views next to it.
 
-    None if the views do not surround a point, if no gap stands out, and for an open side.
+    None if the views do not surround a point, if no gap stands out, or if the widest gap is an open side.
     """
     if len(views) < 3:
         return None
@@ -173,9 +175,9 @@ def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
 def _cylindrical(
     offsets: NDArray[np.floating], up: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles around the upward axis, radians, and distances from it, [V] each, of offsets, [V, 3]."""
-    ahead = perpendicular(up)
-    x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
+    """Return the angles of offsets, [V, 3], around the upward axis in radians, and distances from it, [V] each."""
+    forward = perpendicular(up)
+    x, y = offsets @ forward, offsets @ np.cross(up, forward)
     return np.arctan2(y, x), np.hypot(x, y)
 
 

@@ -57,7 +57,7 @@ class Densify(Scheduled):
     @property
     def statistics(self) -> set[str]:
         """Columns of statistics that the rules read."""
-        return {name for part in (*self.rules, self.budget) if part for name in part.statistics}
+        return {name for source in (*self.rules, self.budget) if source for name in source.statistics}
 
     @property
     def tables(self) -> set[str]:
@@ -105,8 +105,8 @@ class Densify(Scheduled):
         run.refresh_filter()
         if change.after == capacity:
             remedy = f"smaller photos{offload_advice(run)} leave room for more"
-            most = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
-            LOG.warning("step %d: growth stops at %s", run.step, most)
+            limit_text = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
+            LOG.warning("step %d: growth stops at %s", run.step, limit_text)
         is_limited = self.per_pixel is not None and 0 < limit <= change.after
         run.records.add(run.step, "densify", **asdict(change), **({"limit": limit} if is_limited else {}))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
@@ -114,7 +114,7 @@ class Densify(Scheduled):
             raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
 
     def _has_growth_ended(self, run: Run) -> bool:
-        """Return whether growth has ended, by `grow_until` or by `patience`; record the step in the run."""
+        """Return whether growth has ended, and record the step at which `patience` ends it in the run."""
         if self.grow_until is not None and run.step >= self.grow_until:
             return True
         best = run.best

@@ -98,9 +98,9 @@ class Evaluate(Scheduled):
             candidates = learned_scene(run).downscaled(downscale).split(self.split)
             views = sample_views(candidates, self.max_views or len(candidates))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.empty_copy()
-            counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            trained, colors = run.scene.split("train"), color_model(run)
-            results = measure(painter, views, photographs, perceptual, colors=colors, counted=counted, trained=trained)
+            progress = run.status.counted(run.until_interrupted(views), "views", len(views))
+            train, colors = run.scene.split("train"), color_model(run)
+            results = measure(painter, views, photographs, perceptual, colors=colors, counted=progress, trained=train)
             if not results:
                 continue
             for result in results:

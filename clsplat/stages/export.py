@@ -59,7 +59,7 @@ class Export(Scheduled):
 
     def run(self, run: Run) -> None:
         model = host_model(run)
-        path, raw, sky_path, without_sky = self.outputs(run.out)
+        path, raw_path, sky_path, without_sky = self.outputs(run.out)
         if _name(sky_path, run) not in run.model_hashes:
             sky_path.unlink(missing_ok=True)
         without_sky.unlink(missing_ok=True)
@@ -68,16 +68,16 @@ class Export(Scheduled):
         if model.sky and self.sky == "splats":
             files = {path: with_sky_splats(model, center=sky_center(run)), without_sky: model.baked()}
         if model.filter_variance is not None:
-            files[raw] = model
+            files[raw_path] = model
         options = Writing(quality=self.quality)
-        for file, written in files.items():
-            run.model_hashes[_name(file, run)] = written.save(file, options)
+        for file, exported in files.items():
+            run.model_hashes[_name(file, run)] = exported.save(file, options)
             try:
                 if writing_format(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
-            LOG.debug("%s written to %s", size_text(len(model), None, len(written) - len(model)), file)
+            LOG.debug("%s written to %s", size_text(len(model), None, len(exported) - len(model)), file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)

@@ -55,10 +55,10 @@ def points_with_sweep(run: Run, count: int) -> PointCloud:
     """
     points, views = scene_points(run.scene), _views(run)
     positions = points.positions.astype(np.float64)
-    new = sweep_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
-    if not len(new):
+    new_points = sweep_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
+    if not len(new_points):
         LOG.warning("the plane sweep found no additional points; starting from the scene's points only")
-    return points.joined(new)
+    return points.joined(new_points)
 
 
 def try_sweep(run: Run, count: int) -> PointCloud | None:

@@ -1,4 +1,4 @@
-"""Initialize the motion of Gaussians: static and long-lived, unless points were seen only part of the time."""
+"""Initialize the motion of Gaussians: static and long-lived, unless points were visible only part of the time."""
 
 import numpy as np
 import scipy
@@ -10,18 +10,18 @@ from clsplat.gaussians.motion import static_motion
 from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
-STREAM = 4  # of random numbers, different from the stream of the points
-NEIGHBORS = 16  # whose timestamps decide whether a point is static (ours)
-STATIC_SPREAD = 0.18  # of these timestamps, above which a point is static (ours); below, it moves with its neighbors
+STREAM = 4  # stream of random numbers, different from the stream of the points
+NEIGHBORS = 16  # number of nearest points whose timestamps decide whether a point is static (our choice)
+STATIC_SPREAD = 0.18  # spread of these timestamps above which a point is static (our choice)
 
 
 def require_times(scene: Scene, motion: Motion | None) -> None:
-    """Raise DataError if Gaussians are to move and the scene's views have no timestamps."""
+    """Raise DataError if the model has motion, and views of the scene have no timestamps."""
     if motion is None:
         return
-    if missing := [view.name for view in scene.views if view.time is None]:
+    if untimed := [view.name for view in scene.views if view.time is None]:
         problem = (
-            "its views have no timestamps" if len(missing) == len(scene.views) else f"{missing[0]} has no timestamp"
+            "its views have no timestamps" if len(untimed) == len(scene.views) else f"{untimed[0]} has no timestamp"
         )
         raise DataError(
             f"{scene.path}: {problem}, which `model.time` needs; give a timestamp for each photograph "
@@ -38,8 +38,8 @@ def add_motion(
 ) -> Parameters:
     """Return the tables of Gaussians with an initial motion, or unchanged if `motion` is None.
 
-    seen: [N] timestamps at which their points were seen; None: random ones.  durations: of static Gaussians, and the
-    shortest of moving ones, as fractions of the scene's duration.
+    point_times: [N], timestamps at which the points were observed; None for random ones.  durations: the duration of
+    static Gaussians, and the shortest duration of moving Gaussians, as fractions of the scene's duration.
     """
     if motion is None:
         return parameters
@@ -63,9 +63,9 @@ def estimate_motion(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the spread and the velocity of the neighbors of each point.
 
-    The spread is the standard deviation of their timestamps, [N]: 0.29 for static points that are seen at all times,
-    less for moving ones.  The velocity is the least-squares slope of their positions over their timestamps, [N, 3],
-    scene units per duration of the scene.
+    The spread is the standard deviation of the neighbors' timestamps, [N]: 0.29 for static points that are visible at
+    all times, less for moving points.  The velocity is the least-squares slope of the neighbors' positions over their
+    timestamps, [N, 3], in scene units per duration of the scene.
     """
     nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
     nearest = nearest.reshape(len(positions), -1)
@@ -77,7 +77,7 @@ def estimate_motion(
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:
-    """Return the tables of a model file for settings of `model.time`; a static model gets zero motion.
+    """Return the tables of a model file with the motion of the settings; a static model gets a motion of zero.
 
     Raises ConfigError if the motion of the file differs from the settings.
     """

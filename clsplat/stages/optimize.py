@@ -30,10 +30,10 @@ from clsplat.training.stage import ALL_HARMONICS, Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
 LOG = logging.getLogger("clsplat")
-MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # per training; steps between two
+MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # evaluations of a training run, steps between two of them
 PSNR_AND_SSIM = ("psnr", "ssim")
-ROOMY = 8  # memory for this many times the initial Gaussians: growth rarely reaches the limit
-MAX_TRAINING_VIEWS = 8  # measured together with the validation views
+ROOMY = 8  # growth rarely reaches a memory limit that is this multiple of the initial number of Gaussians
+MAX_TRAINING_VIEWS = 8  # training views that are measured with the validation views
 
 
 class ValidatedTraining(Training):
@@ -68,7 +68,7 @@ class ValidatedTraining(Training):
         return self
 
     def measurements(self, during: Sequence[Scheduled]) -> list[Evaluate]:
-        """Return the evaluations that `keep: best` adds to `during`: of training views, then of validation views."""
+        """Return the evaluations that `keep: best` adds to `during`: training views, then validation views."""
         if self.keep == "last":
             return []
         listed_stage = next((stage for stage in during if _validates(stage)), None)
@@ -84,7 +84,7 @@ class ValidatedTraining(Training):
 
     @property
     def min_steps(self) -> int:
-        """Smallest number of steps, including a refit, which is reached if no measurement is better than the first."""
+        """Smallest number of steps, including a refit, which is reached if the first measurement is the best one."""
         if self.patience is None:
             return self.steps
         every = self.measurements(getattr(self, "during", ()))[-1].every or self.steps
@@ -99,7 +99,7 @@ class ValidatedTraining(Training):
         return [*self.measurements(during), *ordered]
 
     def reset_best(self, run: Run) -> None:
-        """Forget the best model of an earlier training.  Raises ConfigError if there are no validation views."""
+        """Remove the best model of an earlier training.  Raises ConfigError if there are no validation views."""
         if self.keep == "last":
             return
         if not run.scene.split("validation"):
@@ -112,11 +112,11 @@ class ValidatedTraining(Training):
         if self.keep == "best" and pipeline.scene.validation == 0:
             raise ConfigError("optimize.keep: best needs validation views; set scene.validation: auto")
         trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
-        if self.refit and (number := sum(isinstance(stage, ValidatedTraining) for stage in trainings)) > 1:
-            raise ConfigError(f"optimize.refit: expected a single stage that trains, got {number}")
-        before = list(itertools.takewhile(lambda stage: stage is not self, trainings))
-        if not any(getattr(stage, "patience", None) for stage in before):  # else the first step is unknown
-            self.require_measurement(sum(stage.steps for stage in before))
+        if self.refit and (count := sum(isinstance(stage, ValidatedTraining) for stage in trainings)) > 1:
+            raise ConfigError(f"optimize.refit: expected a single stage that trains, got {count}")
+        earlier = list(itertools.takewhile(lambda stage: stage is not self, trainings))
+        if not any(getattr(stage, "patience", None) for stage in earlier):  # else the first step is unknown
+            self.require_measurement(sum(stage.steps for stage in earlier))
 
     def require_measurement(self, first: int) -> None:
         """Raise ConfigError if `keep: best` measures nothing until the last step.
@@ -138,8 +138,8 @@ class ValidatedTraining(Training):
         if self.keep == "last" or not _validates(stage):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
-        measured = [average.get(f"{run.downscale:g}", {}) for average in averages.values()]
-        train, validation = comparable_psnr(measured)
+        metrics = [average.get(f"{run.downscale:g}", {}) for average in averages.values()]
+        train, validation = comparable_psnr(metrics)
         if train is None or validation is None:  # measured at another size, or everything is masked
             return
         best, scores = run.best, Scores(step=run.step, train=train, validation=validation)
@@ -148,11 +148,11 @@ class ValidatedTraining(Training):
             return
         first_overfit = (best and best.first_overfit) or (scores if scores.is_overfit else None)
         tables, evaluations = copy_model(run), best.evaluations + 1 if best else 1
-        copied = {split: dict(average) for split, average in averages.items()}
+        metrics_copy = {split: dict(average) for split, average in averages.items()}
         run.best = Best(
             measured=scores,
             degree=run.model.degree,
-            metrics=copied,
+            metrics=metrics_copy,
             scalars=dict(run.scalars),
             modules={
                 name: dict(state.scalars) for name, state in run.modules.items() if state.after_training != "dropped"
@@ -168,8 +168,8 @@ class ValidatedTraining(Training):
     def has_ended(self, run: Run) -> bool:
         """Return whether the training has no steps left."""
         best = run.best if self.keep == "best" and run.stage_step else None
-        ended = best is not None and self.patience is not None and best.since_best >= self.patience
-        return ended or run.stage_step >= self.steps
+        is_out_of_patience = best is not None and self.patience is not None and best.since_best >= self.patience
+        return is_out_of_patience or run.stage_step >= self.steps
 
     def finish(self, run: Run) -> None:
         """Replace the last model by the best one at the end of the training."""
@@ -188,7 +188,7 @@ class ValidatedTraining(Training):
 
 
 def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of each average, dB or None; in the photographs' colors if all averages have it for all views."""
+    """Return the PSNR of averages in dB, or None; in the photographs' colors if all averages have it for all views."""
     has_color = all(
         average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
     )
@@ -207,8 +207,8 @@ def report(
 ) -> None:
     """Record a step and report it.
 
-    values: loss and PSNR (dB) of the step.  seconds: of the steps since the last report.  distribution_every: steps
-    between records of the Gaussians' sizes and opacities.
+    values: loss and PSNR (dB) of the step.  seconds: times of the steps since the last report.  distribution_every:
+    number of steps between records of the Gaussians' sizes and opacities.
     """
     count, (loss, psnr) = run.gaussians, values
     stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # median: the first step loads files
@@ -305,7 +305,7 @@ class Optimize(ValidatedTraining):
             stage.finish(run)
 
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
-        """Train step by step; yields losses and gradients, valid until the next step."""
+        """Train step by step; yield the losses and gradients of each step, valid until the next step."""
         self.reset_best(run)
         views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps
@@ -368,8 +368,8 @@ class Optimize(ValidatedTraining):
         states: list[ModuleState] = attach_modules(self.modules, run, last_step)
         if self.views_per_update != 1:
             attach_gradients(gaussians)
-        trained = self.losses, rates, run.scene.extent, self.update, self.views_per_update
-        return StepTrainer(*parts, *trained, modules=states)
+        settings = self.losses, rates, run.scene.extent, self.update, self.views_per_update
+        return StepTrainer(*parts, *settings, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the previous step."""
@@ -399,12 +399,12 @@ class Optimize(ValidatedTraining):
         return view
 
     def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
-        """Return the losses of a view with gradients, and the parameters not to update."""
+        """Return the losses and gradients of a view, and the names of the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
         photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)
-        ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
-        run.photographs.prefetch(sampler.at(run.step + number).view for number in ahead)
+        offsets = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
+        run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
         stale = {name for stage in self.during if stage.is_due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.differentiate(photograph, run.step, sample.transforms)

@@ -29,8 +29,8 @@ from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 LOG = logging.getLogger("clsplat")
 FILE = "clusters.cl"
 TOGETHER = int(constants(FILE)["TOGETHER"])
-BLOCK = 1 << 16  # points on the device at a time, since they have many components
-AT_ONCE = 1024  # vectors per launch, which fit in a core's cache
+BLOCK = 1 << 16  # points on the device at a time, since points have many components
+AT_ONCE = 1024  # vectors per kernel launch, which fit in the cache of a core
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
 UNSEEN = 0.05  # weight of all directions together relative to the observed ones; 0.01 to 0.05 give lego the same errors
@@ -99,8 +99,9 @@ class SharePalette(Scheduled):
 
 
 def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return for each point, [N, c], the index of the vector, [E, c], with the largest dot product, the first of equal
-    ones.
+    """Return the index of the vector, [E, c], with the largest dot product for each point, [N, c].
+
+    The first of equal vectors is chosen.
     """
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     return np.concatenate([_most_alike(device, block, vectors) for block in blocks])
@@ -112,15 +113,15 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
     planes = np.zeros((components, stride), np.float32)
     planes[:, :count] = points.T
     entries = -(-len(vectors) // TOGETHER) * TOGETHER
-    padded = np.concatenate(
+    host_vectors = np.concatenate(
         [vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)]
     )  # of equal ones, the first is chosen
     label, largest = device.empty(stride), device.empty(stride)
-    uploaded, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(padded, np.float32))
+    device_points, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(host_vectors, np.float32))
     for first in range(0, entries, AT_ONCE):
         device.program(FILE).most_alike(
             items=-(-count // int(device.tuning["LANES"])),
-            points=uploaded,
+            points=device_points,
             vectors=all_vectors,
             label=label,
             largest=largest,
@@ -137,7 +138,7 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
 class VisibleError:
     """The visibility of errors of the harmonics in the training views; N Gaussians with K coefficients above band 0.
 
-    A Gaussian is seen only from some directions.  With Y(d) the harmonics above band 0 in direction d, an error e of
+    A Gaussian is visible only from some directions.  With Y(d) the harmonics above band 0 in direction d, an error e of
     its coefficients changes its color there by Y(d) . e, and band 0 can absorb the mean m . e.  Summed over the views
     with the Gaussian's weight w in each, the square of the remainder is e^T A e, A = sum w (Y - m) (Y - m)^T.
     """
@@ -150,7 +151,7 @@ class VisibleError:
     def from_views(
         cls, views: Iterable[tuple[RenderedView, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
     ) -> "VisibleError":
-        """Sum over views, each with the center of its camera, [3].  means: [N, 3] scene units."""
+        """Return the sums over views, each with the center of its camera, [3].  means: [N, 3] scene units."""
         i, j = np.triu_indices(coefficients)
         weights, first = np.zeros(len(means)), np.zeros((coefficients, len(means)))
         second = np.zeros((len(i), len(means)))
@@ -158,10 +159,10 @@ class VisibleError:
             weight, directions = view.sum(WEIGHT).astype(np.float64), means - position
             directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
             harmonics = np.ascontiguousarray(basis(directions)[:, :coefficients].T)
-            weighted = weight * harmonics
-            weights, first = weights + weight, first + weighted
+            products = weight * harmonics
+            weights, first = weights + weight, first + products
             for index, (row, column) in enumerate(zip(i, j, strict=True)):
-                second[index] += weighted[row] * harmonics[column]
+                second[index] += products[row] * harmonics[column]
         mean = first / np.where(weights > 0, weights, 1)
         for index, (row, column) in enumerate(zip(i, j, strict=True)):
             second[index] -= mean[row] * first[column]
@@ -181,7 +182,7 @@ class VisibleError:
         return products.reshape(rest.shape)
 
     def base_change(self, error: NDArray[np.floating]) -> Floats:
-        """Return the change of band 0, [N, 3], that best compensates an error of the others, [N, 3 K]."""
+        """Return the change of band 0, [N, 3], that best compensates an error of the other bands, [N, 3 K]."""
         channels = error.reshape(len(error), -1, 3)
         return np.asarray((self.mean[:, :, None] * channels).sum(axis=1) / SH_C0)
 
@@ -222,9 +223,9 @@ class VisibleError:
             form[:, row, column] = form[:, column, row] = sums
         for component in range(vectors.shape[1]):
             right_sides[:, component] = np.bincount(labels, products[:, component], minlength=entries)
-        used, minima = np.bincount(labels, minlength=entries) > 0, vectors.copy()
-        solved = np.linalg.solve(form[used], right_sides[used].reshape(-1, size, 3))
-        minima[used] = solved.reshape(-1, 3 * size)
+        is_used, minima = np.bincount(labels, minlength=entries) > 0, vectors.copy()
+        solutions = np.linalg.solve(form[is_used], right_sides[is_used].reshape(-1, size, 3))
+        minima[is_used] = solutions.reshape(-1, 3 * size)
         return minima
 
 
@@ -236,7 +237,7 @@ def _append_products(vectors: Floats) -> NDArray[np.float32]:
 
 
 def visible_error(run: Run) -> VisibleError:
-    """Return how visible errors of the harmonics are in the training views."""
+    """Measure the visibility of errors of the harmonics in the training views."""
     views, gaussians = run.scene.split("train"), run.model.gaussians
     renders = run.survey().render(run.status.counted(views, "views", len(views)))
     positions = (view.position for view in views)
@@ -244,7 +245,7 @@ def visible_error(run: Run) -> VisibleError:
     return VisibleError.from_views(zip(renders, positions, strict=False), gaussians.get("means"), coefficients)
 
 
-# Clusters of Gaussians that share values: tables hold each Gaussian's cluster and weight.
+# Clusters of Gaussians that share values: tables contain the cluster and the weight of each Gaussian.
 
 LABEL, CLUSTER_WEIGHT = "cluster/label", "cluster/weight"  # [1] an integer below 2^24, [1] at least 0
 

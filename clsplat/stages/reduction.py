@@ -50,7 +50,7 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 def score_gaussians(run: Run, score: Score = "weight") -> NDArray[np.float64]:
     """Return the score of each Gaussian, [N], summed over the pixels of the training views.
 
-    score: "weight" sums blend weights; others sum squared derivatives of the image with respect to the Gaussian.
+    score: "weight" sums blend weights; the other scores sum squared derivatives of the image with respect to it.
     """
     views = run.scene.split("train")
     renders = run.survey().render(run.status.counted(views, "views", len(views)))
@@ -92,9 +92,12 @@ class PruneLeast(Scheduled):
         change = keep_rows(gaussians, rows, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
-        lost = 100 * (1 - score[rows].sum() / (score.sum() or 1))
+        lost_percent = 100 * (1 - score[rows].sum() / (score.sum() or 1))
         LOG.info(
-            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(rows):,} of {len(score):,}", lost, self.score
+            "%s Gaussians kept; the others had %.2g %% of the %s",
+            f"{len(rows):,} of {len(score):,}",
+            lost_percent,
+            self.score,
         )
 
 
@@ -127,11 +130,11 @@ class ReduceSh(Scheduled):
             return
         rest = gaussians.get("sh_rest")
         energy = compute_band_energy(rest) * score_gaussians(run)[:, None]
-        dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
-        gaussians.set("sh_rest", np.where(expand_bands(dropped.reshape(energy.shape)), 0, rest))
+        is_dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
+        gaussians.set("sh_rest", np.where(expand_bands(is_dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
-        LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
+        LOG.info("%d of %d bands of harmonics are zero", is_dropped.sum(), is_dropped.size)
 
 
 def compute_band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -150,6 +153,6 @@ def expand_bands(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _bands(columns: int) -> list[tuple[int, int]]:
-    """Return the first column and the end of each band above 0."""
+    """Return the first column and the end column of each band above 0.  columns: the number of columns."""
     ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
     return [(first, end) for first, end in pairwise(ends) if end <= columns]

@@ -44,8 +44,8 @@ class Render(Stage):
 
     def run(self, run: Run) -> None:
         views = self._views(run)
-        counted = run.status.counted(run.until_interrupted(views.items()), "views", len(views))
-        for path, view in counted:
+        progress = run.status.counted(run.until_interrupted(views.items()), "views", len(views))
+        for path, view in progress:
             camera = upload_camera(run.device, view)
             write_image(path, render_view(run.painter(), camera))
         if views:
@@ -53,7 +53,7 @@ class Render(Stage):
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
-    """Return the paths of the renders; the suffix stays in the names of views that differ only in it."""
+    """Return the paths of the renders of views.  Views whose names differ only in their suffix keep it."""
     paths = [image_path(folder, view, suffix) for view in views]
     uses = Counter(paths)
     return [path if uses[path] == 1 else folder / f"{view}{suffix}" for path, view in zip(paths, views, strict=True)]
@@ -88,21 +88,21 @@ class Viewer(Stage):
         def read(view: View) -> NDArray[np.uint8]:
             return run.photographs.get(view).image()
 
-        def through(views: Iterable[View]) -> Iterable[View]:
+        def with_progress(views: Iterable[View]) -> Iterable[View]:
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))
 
-        views = view_entries(scene, read, self.photographs, self.photograph_budget, through)
+        views = view_entries(scene, read, self.photographs, self.photograph_budget, with_progress)
         viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
-        packed = pack(model, None, sky_center(run))
-        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views, scene.origin)
-        if page.size > MAX_SIZE and (number := page.max_splats):  # without room for any, `write` blames the photos
+        packed_model = pack(model, None, sky_center(run))
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed_model}, viewpoint, name, views, scene.origin)
+        if page.size > MAX_SIZE and (max_count := page.max_splats):  # without room for any, `write` blames the photos
             LOG.warning(
                 "%s: shows only the %s most important splats of %s, so that browsers can open it; "
                 "`clsplat compress` makes smaller models",
-                *(path, f"{number:,}", packed.count_text),
+                *(path, f"{max_count:,}", packed_model.count_text),
             )
             page = Page(
-                page.title, {run.name: pack(model, number, sky_center(run))}, viewpoint, name, views, scene.origin
+                page.title, {run.name: pack(model, max_count, sky_center(run))}, viewpoint, name, views, scene.origin
             )
         page.write(path)
         LOG.debug("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

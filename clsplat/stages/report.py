@@ -29,7 +29,7 @@ from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 
 
 def cameras(run: Run) -> list[Markup]:
-    """Draw the cameras by split, with Gaussians around them, from above and from the side."""
+    """Draw the cameras of each split, and the Gaussians around them, from above and from the side."""
     points = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     return safe_charts(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
 
@@ -41,17 +41,17 @@ DOTTED = 2  # index into DASHES
 
 
 def training_charts(run: Run) -> list[Markup]:
-    """Draw PSNR, loss, Gaussians and times over the steps."""
+    """Draw PSNR, loss, number of Gaussians and time per step over the steps."""
     train = run.records.read("train")
-    measured, trial = _psnr_lines(run), _psnr_lines(run, trial=True)
-    dash = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
+    psnr_lines, trial_lines = _psnr_lines(run), _psnr_lines(run, trial=True)
+    dash = DOTTED if any(line.name == NAMES["train"] for line in psnr_lines) else 0
     psnr = list(zip([r["step"] for r in train], moving_average([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
     running_mean = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], dash)
     return safe_charts(
         [
-            curve("PSNR, dB", [running_mean, *measured]),
-            *([curve("PSNR before the refit, dB", trial)] if trial else []),
+            curve("PSNR, dB", [running_mean, *psnr_lines]),
+            *([curve("PSNR before the refit, dB", trial_lines)] if trial_lines else []),
             curve("loss", [Line(line["loss"])], logarithmic=True),
             curve("Gaussians", [Line(line["gaussians"])]),
             curve("milliseconds per step", [Line(line["ms"])]),
@@ -62,9 +62,9 @@ def training_charts(run: Run) -> list[Markup]:
 
 
 def _psnr_lines(run: Run, trial: bool = False) -> list[Line]:
-    """Return the measured PSNR of each split over steps; of a step that was measured twice, the last one.
+    """Return the measured PSNR of each split over the steps, by the last measurement of each step.
 
-    trial: whether to return that of the training before a refit.
+    trial: whether to return the PSNR of the training before a refit.
     """
     points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
     for line in run.records.read("evaluate", trial):
@@ -95,7 +95,7 @@ def gaussians_charts(run: Run) -> list[Markup]:
 
 
 def _totals(run: Run) -> list[Line]:
-    """Return the numbers of Gaussians that each density rule has changed so far."""
+    """Return the total number of Gaussians that each density rule has changed, over the steps."""
     edits = run.records.read("densify")
     names = dict.fromkeys(name for edit in edits for name in edit["causes"])
     totals = {name: np.cumsum([edit["causes"].get(name, 0) for edit in edits]) for name in names}
@@ -112,7 +112,7 @@ REMEDY = (
 
 
 def overfitting_note(run: Run) -> str:
-    """Compare the model at training views and held-out views in words; "" if that is unknown or unremarkable."""
+    """Return sentences that compare the PSNR of training and held-out views, or "" if it is unknown or unremarkable."""
     if run.best:
         return run.best.text()
     split, scores = _held_out_scores(run)
@@ -129,24 +129,25 @@ def is_overfit(run: Run) -> bool:
 
 
 def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
-    """Return the validation or test split, and the last PSNR of its views and of training views.
+    """Return the name of the held-out split, and the last PSNR of its views and of training views.
 
-    Validation views are preferred.  Training views that were not measured have the PSNR of the training log.
+    The split is validation if it was measured, otherwise test.  The PSNR of training views that were not measured is
+    from the training log.
     """
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
     for split in ("validation", "test"):
-        measured = [line for line in lines if line["split"] == split]
-        train = _training_psnr(run, lines, measured[-1]["step"]) if measured else None
+        held_out_lines = [line for line in lines if line["split"] == split]
+        train = _training_psnr(run, lines, held_out_lines[-1]["step"]) if held_out_lines else None
         if train is not None:
-            return split, Scores(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
+            return split, Scores(step=held_out_lines[-1]["step"], train=train, validation=held_out_lines[-1]["psnr"])
     return "", None
 
 
 def _training_psnr(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
-    """Return the PSNR at training views, dB, as measured at a step, or else as logged up to it."""
-    measured = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
+    """Return the PSNR of training views in dB, as measured at a step, or otherwise as logged up to that step."""
+    values = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
     reports = [line["psnr"] for line in run.records.read("train") if line["step"] <= step]
-    return measured[-1] if measured else moving_average(reports)[-1] if reports else None
+    return values[-1] if values else moving_average(reports)[-1] if reports else None
 
 
 # The time of a training step on the device.
@@ -154,7 +155,7 @@ def _training_psnr(run: Run, lines: list[dict[str, Any]], step: int) -> float | 
 
 @dataclass(frozen=True)
 class StageTime:
-    """The mean time of one stage of a training step."""
+    """The mean time of a stage of a training step."""
 
     name: str
     milliseconds: float
@@ -197,14 +198,14 @@ class ViewFigure:
 
 
 def views(run: Run) -> dict[str, list[ViewFigure]]:
-    """Return the best and the worst views of the last evaluation, by heading."""
+    """Return images of the best and the worst views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
     last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice at the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]
     best = [r for r in reversed(ranked) if r not in worst][:MAX_VIEWS]
-    chosen = {"The best views": best, "The worst views": worst}
+    groups = {"The best views": best, "The worst views": worst}
 
     def figure(record: dict[str, Any]) -> ViewFigure:
         photograph = run.photographs.get(by_name[record["view"]])
@@ -213,7 +214,7 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
 
     return {
         title: [figure(record) for record in run.until_interrupted(records)]
-        for title, records in chosen.items()
+        for title, records in groups.items()
         if records
     }
 
@@ -274,7 +275,7 @@ class HtmlReport(Stage):
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
-    """Return the URLs, relative to the page, of the files that stages with a name write, by path in the run."""
+    """Return the relative URLs of the files that stages named `stage` write, by path in the run folder."""
     files = [Path(entry[stage]["file"]) for entry in run.pipeline["stages"] if stage in entry]
     return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
@@ -284,8 +285,8 @@ def _headline(run: Run) -> str:
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
     quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
-    others = _size(run), f"trained for {duration_text(run.train_seconds)}"
-    return " · ".join([*quality, *others])
+    facts = _size(run), f"trained for {duration_text(run.train_seconds)}"
+    return " · ".join([*quality, *facts])
 
 
 def _size(run: Run) -> str:
@@ -306,9 +307,9 @@ def _figures(run: Run) -> dict[str, str]:
             if averages.get("lpips") is not None:
                 values[f"{split} LPIPS{suffix}"] = f"{averages['lpips']:.4f}"
     if run.is_refit and run.best:
-        measured = run.best.measured
-        values["validation PSNR before the refit"] = f"{measured.validation:.2f} dB"
-        values["training PSNR before the refit"] = f"{measured.train:.2f} dB"
+        best_scores = run.best.measured
+        values["validation PSNR before the refit"] = f"{best_scores.validation:.2f} dB"
+        values["training PSNR before the refit"] = f"{best_scores.train:.2f} dB"
     text, _, sky = _size(run).partition(" and ")
     number, _, unit = text.partition(" ")
     values[unit] = number + (f" and {sky}" if sky else "")

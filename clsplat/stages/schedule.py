@@ -43,16 +43,16 @@ class ResetOpacity(Scheduled):
     """Background with which the stage acts; default: any."""
 
     def stale(self, run: Run) -> Collection[str]:
-        return ("logit_opacity",) if self._acts(run) else ()
+        return ("logit_opacity",) if self._is_active(run) else ()
 
     def run(self, run: Run) -> None:
-        if not self._acts(run):
+        if not self._is_active(run):
             return
         cap_opacity(run.model.gaussians, self.value)
         if run.adam is not None:
             run.adam.reset_moments("logit_opacity")
 
-    def _acts(self, run: Run) -> bool:
+    def _is_active(self, run: Run) -> bool:
         return self.when_background in (None, run.photographs.background_name)
 
 

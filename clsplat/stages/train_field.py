@@ -71,7 +71,7 @@ class TrainField(Training):
         return self
 
     def check_run(self, run: Run) -> None:
-        """Check the run before the field is made.
+        """Check the run before the field is created.
 
         Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and the errors of
         the stages in `during`.
@@ -102,7 +102,7 @@ class TrainField(Training):
             self.end_step(run)
 
     def rate_at(self, step: int) -> float:
-        """Return the learning rate of a global step, with the delayed warm-up of Barron et al. 2021 (released code)."""
+        """Return the learning rate at a global step, with the delayed warm-up of Barron et al. 2021 (released code)."""
         progress = math.sin(0.5 * math.pi * min(step / self.warm_up, 1.0)) if self.warm_up else 1.0
         return (self.warm_up_from + (1 - self.warm_up_from) * progress) * at_step(self.rate, step)
 
@@ -131,7 +131,7 @@ class TrainField(Training):
         run.status.note(step=run.step)
 
     def _sample(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
-        """Yield the photos of a step."""
+        """Yield the photos of a step, each with its number of rays."""
         for number in range(self.photographs):
             view = self.order.view_at(pool, (step - 1) * self.photographs + number + 1)
             photograph = run.photographs.get(view)

@@ -89,7 +89,7 @@ class Timelapse(Stage):
         encoding.check_encoder(Path(self.file))
 
     def _files(self, run: Run) -> list[Path]:
-        """Return the renders of this run, by step; the folder may also hold those of an earlier run."""
+        """Return the paths of this run's renders, by step; the folder may also contain renders of an earlier run."""
         files = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
         return [run.out / self.folder / files[step] for step in sorted(files)]
 
@@ -151,12 +151,12 @@ class Video(Stage):
     def run(self, run: Run) -> None:
         plan, path = self._plan(run), run.out / self.file
 
-        def through(views: Sequence[View]) -> Iterator[View]:
+        def with_progress(views: Sequence[View]) -> Iterator[View]:
             return counted(run.until_interrupted(views), "frames rendered", len(views))
 
         canvas = Canvas(run.painter())
         with listening(run.status.count):
-            render_video(canvas, plan, {"color": path}, None, through)
+            render_video(canvas, plan, {"color": path}, None, with_progress)
         LOG.info("video of %d frames written to %s, %.2f MB", len(plan.views), path, path.stat().st_size / 1e6)
 
 
