@@ -39,11 +39,11 @@ from clsplat.scene.scene import PointCloud
 # Merging models.
 
 LOG = logging.getLogger("clsplat")
-SHARED = ("near", "screen_variance", "background", "alpha")  # taken from the first model
+SHARED = ("near", "screen_variance", "background", "alpha")  # rendering parameters that are taken from the first model
 
 
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
-    """Merge all Gaussians into one model, with the rendering numbers of the first and the largest SH degree.
+    """Merge all Gaussians into one model, with the first model's rendering parameters and the largest SH degree.
 
     World filters are baked unless all models have one; if some models move, the others get a static motion.
     Raises DataError if the models use different screen filters or incompatible motions.
@@ -56,9 +56,10 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
         kinds = [_kind(m) for m in (first, model)]
         if kinds[0] != kinds[1]:
             raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
-        values, used = model.rendering.comment(), first.rendering.comment()
-        if other := [f"{key} = {values.get(key, 'not set')}" for key in SHARED if values.get(key) != used.get(key)]:
-            LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(other), names[0])
+        values, first_values = model.rendering.comment(), first.rendering.comment()
+        different_keys = [key for key in SHARED if values.get(key) != first_values.get(key)]
+        if texts := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:
+            LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(texts), names[0])
     models = [model.with_origin(origin) for model in models]
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
@@ -81,7 +82,7 @@ QUALITIES = get_args(Quality)
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of a model, applied in this order."""
+    """Changes to a model, applied in this order."""
 
     drop_below: float = 0.0  # opacity below which Gaussians are dropped
     transform: NDArray[np.float64] | None = None  # [4, 4], a uniform scale, rotation, and translation
@@ -93,22 +94,22 @@ class Changes:
     def apply(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError if no Gaussian is left, ConfigError for an extreme transform."""
         model = model if self.time is None else _extract_frame(model, self.time)
-        changed = model[model.opacities >= self.drop_below] if self.drop_below else model
+        result = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
             try:
-                changed = changed.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+                result = result.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
             except ValueError as error:
                 raise ConfigError(f"--transform: {error}") from error
         if self.crop is not None:
-            low, high = np.array(self.crop, np.float64).reshape(2, 3) - changed.origin
-            changed = changed[((changed.means >= low) & (changed.means <= high)).all(axis=1)]
-        if self.sh_degree is not None and self.sh_degree < changed.sh_degree:
-            changed = replace(changed, sh_rest=with_degree(changed.tables(), self.sh_degree)["sh_rest"])
-        if not len(changed):
+            low, high = np.array(self.crop, np.float64).reshape(2, 3) - result.origin
+            result = result[((result.means >= low) & (result.means <= high)).all(axis=1)]
+        if self.sh_degree is not None and self.sh_degree < result.sh_degree:
+            result = replace(result, sh_rest=with_degree(result.tables(), self.sh_degree)["sh_rest"])
+        if not len(result):
             fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
             raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
-        return changed
+        return result
 
 
 def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
@@ -142,7 +143,7 @@ def read(sources: Sequence[Path]) -> Model:
 
 
 def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
-    """Write a model that was read from `sources`; return the same as `convert`.  Raises OutputError."""
+    """Write a model that was read from `sources`, and return the same as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, writing)
     kind = writing_format(out).name
@@ -168,15 +169,15 @@ def parse_transform(text: str) -> NDArray[np.float64]:
     )
     try:
         if "=" not in text:
-            numbers = [float(part) for part in text.replace(",", " ").split()]
-            bottom = [] if len(numbers) == 16 else [0, 0, 0, 1]
-            matrix = np.array([*numbers, *bottom]).reshape(4, 4)
+            elements = [float(element) for element in text.replace(",", " ").split()]
+            last_row = [] if len(elements) == 16 else [0, 0, 0, 1]
+            matrix = np.array([*elements, *last_row]).reshape(4, 4)
         else:
             matrix = np.eye(4)
-            for part in text.split():
-                word, _, values = part.partition("=")
+            for token in text.split():
+                operation, _, values = token.partition("=")
                 with np.errstate(over="ignore", invalid="ignore"):  # checked below
-                    matrix = _operation_matrix(word, [float(value) for value in values.split(",")]) @ matrix
+                    matrix = _operation_matrix(operation, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
         raise ConfigError(expected) from error
     linear = matrix[:3, :3]
@@ -195,16 +196,16 @@ def parse_transform(text: str) -> NDArray[np.float64]:
     return matrix
 
 
-def _operation_matrix(word: str, values: list[float]) -> NDArray[np.float64]:
+def _operation_matrix(operation: str, values: list[float]) -> NDArray[np.float64]:
     """Return the matrix, [4, 4], of one operation of a transform.  Raises ValueError."""
     from scipy.spatial.transform import Rotation
 
-    if word not in OPERATIONS or len(values) != (1 if word == "scale" else 3):
-        raise ValueError(word)
+    if operation not in OPERATIONS or len(values) != (1 if operation == "scale" else 3):
+        raise ValueError(operation)
     matrix = np.eye(4)
-    if word == "scale":
+    if operation == "scale":
         matrix[:3, :3] *= values[0]
-    elif word == "rotate":
+    elif operation == "rotate":
         matrix[:3, :3] = Rotation.from_euler("xyz", values, degrees=True).as_matrix()
     else:
         matrix[:3, 3] = values
@@ -212,9 +213,9 @@ def _operation_matrix(word: str, values: list[float]) -> NDArray[np.float64]:
 
 
 def parse_crop(text: str) -> tuple[float, ...]:
-    """Parse a box `x0,y0,z0,x1,y1,z1`.  Raises ConfigError."""
+    """Parse a box `x0,y0,z0,x1,y1,z1` in world coordinates.  Raises ConfigError."""
     try:
-        box = tuple(float(part) for part in text.split(","))
+        box = tuple(float(value) for value in text.split(","))
     except ValueError:
         box = ()
     if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
@@ -223,7 +224,7 @@ def parse_crop(text: str) -> tuple[float, ...]:
 
 
 def check_degree(degree: int | None) -> int | None:
-    """Return an SH degree.  Raises ConfigError if it is invalid."""
+    """Return an SH degree unchanged.  Raises ConfigError if it is invalid."""
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
     return degree
@@ -253,7 +254,7 @@ MAX_FRAMES = 10_000  # files
 
 
 def check_time(time: float | None) -> float | None:
-    """Return a timestamp.  Raises ConfigError if it is invalid."""
+    """Return a timestamp unchanged.  Raises ConfigError if it is invalid."""
     if time is not None and not is_timestamp(time):
         raise ConfigError(f"--time {time:g}: {EXPECTED_TIME}")
     return time
@@ -300,28 +301,28 @@ def convert_frames(
 
 @contextmanager
 def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
-    """Restore files in one folder if the block fails, as on a full disk, and remove a new folder.
+    """Restore files in one folder if the block fails, such as on a full disk, and remove the folder if it is new.
 
     Raises OutputError.
     """
     folder = files[0].parent
-    existed = path_exists(folder)
+    is_new = not path_exists(folder)
     try:
         with scratch_folder(folder / "series") as backup, raising_output_error(folder):
-            existing = [file for file in files if file.is_file()]
-            for file in existing:
+            old_files = [file for file in files if file.is_file()]
+            for file in old_files:
                 _link_or_copy(file, backup / file.name)
             try:
                 yield
             except BaseException:
                 for file in files:
-                    if file in existing:
+                    if file in old_files:
                         os.replace(backup / file.name, file)
                     elif file.is_file():
                         file.unlink()
                 raise
     finally:
-        if not existed:
+        if is_new:
             with suppress(OSError):  # not empty
                 folder.rmdir()
 
@@ -335,13 +336,16 @@ def _link_or_copy(file: Path, target: Path) -> None:
 
 
 def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
-    """Raise ConfigError if a folder has frames of another series, since players would show them too."""
-    expected = {file.name for file in files}
+    """Raise ConfigError if a folder has frames of another series, since players would show them too.
+
+    names: the pattern of the frames' names.
+    """
+    frame_names = {file.name for file in files}
     with raising_output_error(folder):
-        existing = sorted(os.listdir(folder)) if folder.is_dir() else []
-    if others := [name for name in existing if names.fullmatch(name) and name not in expected]:
+        all_names = sorted(os.listdir(folder)) if folder.is_dir() else []
+    if other_frames := [name for name in all_names if names.fullmatch(name) and name not in frame_names]:
         raise ConfigError(
-            f"{folder / others[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
+            f"{folder / other_frames[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
         )
 
 
@@ -361,7 +365,7 @@ def _split_name(out: Path) -> tuple[Path, str, str]:
 COUNT = 10_000  # Gaussians, 2 degrees apart
 RADIUS = 10.0  # of the sphere, relative to the QUANTILE of distances from the center (WildGaussians, 2024)
 QUANTILE = 0.97
-WIDTH = 0.8  # standard deviation, relative to the distance of neighbors; gaps let 0.2 % of the light through
+WIDTH = 0.8  # standard deviation, relative to the distance between neighbors; gaps let 0.2 % of the light through
 FLAT = 0.1  # standard deviation along the ray, relative to that across
 LOGIT = 6.0  # of the opacity of sky Gaussians
 
@@ -369,7 +373,7 @@ LOGIT = 6.0  # of the opacity of sky Gaussians
 def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floating] | None = None) -> Model:
     """Replace the sky of a model by Gaussians; a model without a sky is returned unchanged.
 
-    center: of the sphere, [3], from which the sky is exact; default: the median of the means.
+    center: the center of the sphere, [3], from which the sky looks exact; by default, the median of the means.
     """
     if (sky := model.sky) is None:
         return model
@@ -387,7 +391,7 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
         "sh_base": (np.clip(sample_texels(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
         "sh_rest": np.zeros((count, model.sh_rest.shape[1])),
     }
-    tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in sky_tables.items()}
+    tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), table]) for name, table in sky_tables.items()}
     if model.motion is not None:
         tables["motion"] = np.concatenate([model.motion, static_motion(count, model.motion.shape[1])])
     notes = {**model.rendering.notes, "sky": "splats"}
@@ -396,9 +400,9 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
 
 def fibonacci(count: int) -> NDArray[np.float64]:
     """Return evenly distributed unit vectors (a Fibonacci sphere), [count, 3]."""
-    number = np.arange(count)
-    z = 1 - (2 * number + 1) / count
-    angle = number * np.pi * (3 - np.sqrt(5))
+    index = np.arange(count)
+    z = 1 - (2 * index + 1) / count
+    angle = index * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
@@ -417,7 +421,7 @@ MIN_DISTANCE2 = 4.0e-9  # extents², so that coincident points still get a size:
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0, extent: float = 1.0) -> Parameters:
     """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors.
 
-    extent: extent of the scene, scene units; used for a single point.
+    extent: the extent of the scene in scene units, used instead of the distance if there is only one point.
     """
     count = len(points)
     log_scales = 0.5 * np.log(neighbor_distance2(points.positions, extent)) + math.log(scale)
@@ -436,11 +440,11 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
     """Return the exact mean squared distance to the three nearest neighbors, [N] scene units².
 
-    extent: extent of the scene, scene units; used for a single point.
+    extent: the extent of the scene in scene units, used instead of the distance if there is only one point.
     """
     neighbors = min(4, len(positions))
     if neighbors < 2:
         return np.full(len(positions), extent**2)
-    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbors, workers=-1)[0]
-    squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
-    return np.maximum(squared, MIN_DISTANCE2 * extent**2)
+    distances = scipy.spatial.cKDTree(positions).query(positions, k=neighbors, workers=-1)[0]
+    mean2: NDArray[np.float64] = np.square(distances[:, 1:]).mean(axis=1)
+    return np.maximum(mean2, MIN_DISTANCE2 * extent**2)

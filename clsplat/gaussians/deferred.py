@@ -2,7 +2,7 @@
 
 The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  The
 updates of a block of rows that no view sees are therefore recorded, and applied in order when a view sees the block;
-the results are bit-identical to those of immediate updates.  This covers 81 % of the numbers of a Gaussian of SH degree
+the results are bit-identical to those of immediate updates.  This covers 81 % of the values of a Gaussian of SH degree
 3.  Means, scales, quaternions, and opacities are not deferred, because they determine which Gaussians are visible, and
 their moments keep changing them.
 """
@@ -29,7 +29,7 @@ class Deferred:
     names: ClassVar[tuple[str, ...]] = HARMONICS
 
     def __init__(self, gaussians: Gaussians, max_updates: int = MAX_UPDATES) -> None:
-        """max_updates: the number of updates after which all are applied; results do not depend on it."""
+        """max_updates: the number of recorded updates at which all are applied; results do not depend on it."""
         device = gaussians.device
         self.gaussians, self.max_updates = gaussians, max_updates
         self.updates = 0  # recorded since the last flush
@@ -48,7 +48,7 @@ class Deferred:
         return self.gaussians.tables[name].array
 
     def catch_up(self, depth_key: Array) -> None:
-        """Apply deferred updates of the blocks that a view sees.  depth_key: [S], all bits set for culled Gaussians."""
+        """Apply the deferred updates of visible blocks.  depth_key: [S], all bits set for culled Gaussians."""
         if self.updates:
             self._replay(depth_key, every=0)
 
@@ -73,9 +73,9 @@ class Deferred:
             self._updates = self.gaussians.device.zeros(self._blocks, np.uint32)
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
-        """Record an update that visible blocks have already received; factors: rate and correction2 of adam.h.
+        """Record an update that has already been applied to visible blocks.
 
-        `catch_up` must have been called before, with the same keys.
+        factors: rate and correction2 of adam.h.  `catch_up` must have been called before, with the same keys.
         """
         self.gaussians.device.program("deferred.cl").note_update(
             items=-(-self.gaussians.count // self._lanes),

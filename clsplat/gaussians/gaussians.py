@@ -27,7 +27,7 @@ from clsplat.opencl.device import Array, Device
 
 
 def not_finite(gaussians: Struct) -> list[str]:
-    """Return the names of parameters that have NaN or infinity, or whose moments do."""
+    """Return the names of parameters that contain NaN or infinity, in their values or in their Adam moments."""
     device, names = gaussians.device, set()
     counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}
     for name, counter in counters.items():
@@ -50,7 +50,10 @@ def not_finite(gaussians: Struct) -> list[str]:
 
 @dataclass(frozen=True)
 class DropoutMask:
-    """The Gaussians that one step drops: each with a probability below 1, drawn by (seed, step, row)."""
+    """The Gaussians that a training step drops at random, each with a probability below 1.
+
+    The random numbers depend only on seed, step, and row.
+    """
 
     probability: float
     seed: int
@@ -58,7 +61,7 @@ class DropoutMask:
 
     @property
     def opacity_factor(self) -> float:
-        """The factor on other opacities that conserves a Gaussian's mean opacity (DropGaussian, Park et al. 2025)."""
+        """The factor on remaining opacities that conserves their mean over steps (DropGaussian, Park et al. 2025)."""
         return 1 / (1 - self.probability)
 
 
@@ -81,7 +84,7 @@ class Gaussians:
     """N Gaussians and their tables."""
 
     def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
-        """Upload `parameters`, each [N, components] by the names of PARAMETERS; also filter_variance and motion."""
+        """Upload `parameters`, [N, components] by name: all of PARAMETERS; optional: filter_variance and motion."""
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _align(self.count)
@@ -125,7 +128,7 @@ class Gaussians:
         self.tables[name] = Table(array, components, zero_fresh)
 
     def move_to_host(self) -> None:
-        """Move the SH bands above 0 and their moments to the host; the device holds only those visible in a view."""
+        """Move the SH bands above 0 and their moments to host memory; the device stores only those that a view sees."""
         if self.on_host:
             return
         harmonics = {name: self.get(name) for name in HARMONICS if name in self.tables}
@@ -143,7 +146,7 @@ class Gaussians:
         return np.ascontiguousarray(planes[:, : self.count].T)
 
     def set(self, name: str, values: NDArray[Any]) -> None:
-        """Copy [N, components] from the host into a table."""
+        """Copy values, [N, components], from the host into a table."""
         table = self._up_to_date(name)
         if values.shape != (self.count, table.components):
             raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
@@ -155,7 +158,7 @@ class Gaussians:
         table.array.set(planes)
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
-        """Write [n, components] from the host into some rows of a table.
+        """Write values, [n, components], from the host into some rows of a table.
 
         rows: [n] integers, see `check_rows`.  Raises ValueError for invalid rows or shapes.
         """
@@ -220,43 +223,43 @@ class Gaussians:
         return [name for name, table in self.tables.items() if table.zero_fresh]
 
     def not_finite(self) -> list[str]:
-        """Return the names of parameters that have NaN or infinity, or whose moments do."""
+        """Return the names of parameters that contain NaN or infinity, in their values or in their Adam moments."""
         return not_finite(self)
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
         """Replace row i of every table by its row source[i]; set moments and statistics of fresh rows to zero.
 
-        source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
+        source, fresh: [count] uint32; fresh is 1 for new rows.  No other operation changes the number of Gaussians.
         """
         capacity = self.capacity
         self._up_to_date("sh_rest")
         if count > capacity:
             row_bytes = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
-            grown = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
-            capacity = _align(max(count, grown))
-        on_host = self.on_host.rearrange(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
-        for table in (table for name, table in self.tables.items() if name not in on_host):
-            moved = self.device.zeros((table.components, capacity))
+            larger = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
+            capacity = _align(max(count, larger))
+        host_tables = self.on_host.rearrange(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
+        for table in (table for name, table in self.tables.items() if name not in host_tables):
+            array = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(
                 items=(count, table.components),
                 table=table.array,
                 source=source,
                 fresh=fresh,
-                moved=moved,
+                moved=array,
                 zero_fresh=int(table.zero_fresh),
                 table_stride=self.capacity,
                 moved_stride=capacity,
                 count=count,
             )
-            table.array = moved
+            table.array = array
         self.count, self.capacity = count, capacity
-        for name, values in on_host.items():
+        for name, values in host_tables.items():
             self.set(name, values)
 
 
 @dataclass
 class DeviceModel:
-    """Gaussians on the device and the numbers for rendering them."""
+    """Gaussians on the device and their rendering parameters."""
 
     gaussians: Gaussians
     degree: int  # active SH degree
@@ -298,9 +301,9 @@ def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
 
 
 def visibility_arguments(model: DeviceModel, view: int | None, mask: Array) -> dict[str, Any]:
-    """Return the arguments of project_forward that omit Gaussians.
+    """Return the kernel arguments with which project_forward omits hidden and dropped Gaussians.
 
-    view: the index of a training view with hidden Gaussians; mask: [S], written if the model has a dropout.
+    view: the index of a training view with hidden Gaussians; mask: [S], overwritten if the model has a dropout mask.
     """
     hidden = _hidden_arguments(model.gaussians, view)
     if model.dropout is None:

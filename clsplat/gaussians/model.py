@@ -1,4 +1,4 @@
-"""Define a model on the host: NumPy arrays in the units of model files, and the numbers for rendering."""
+"""Define a model on the host: NumPy arrays in the units of model files, and rendering parameters."""
 
 import logging
 from collections.abc import Mapping
@@ -43,12 +43,12 @@ from clsplat.opencl.device import Device
 from clsplat.scene.quality import near_plane
 from clsplat.scene.scene import Scene, far_origin, position_text
 
-# The numbers for rendering a model, as stored in its file.
+# The rendering parameters of a model, as stored in its file.
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """The numbers for rendering a model."""
+    """The rendering parameters of a model."""
 
     near: float = 0.0  # scene units; nearer Gaussians are not rendered; 0: chosen for the scene or model
     screen_variance: float = VARIANCE  # px², added to every splat
@@ -60,12 +60,12 @@ class Rendering:
 
     @classmethod
     def from_comment(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
-        """Read the numbers from a file's comment; the defaults are those of 3DGS or Mip-Splatting."""
+        """Read the rendering parameters from a file's comment; the defaults are those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate", "pixel_box")
-        numbers = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
+        values = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
         return cls(
-            **{**mip, **numbers},
+            **{**mip, **values},
             background=comment["background"] if comment.get("background") in ("black", "white") else None,
             alpha="mask" if comment.get("alpha") == "mask" else "transparency",
             notes=dict(comment),
@@ -73,12 +73,12 @@ class Rendering:
 
     def comment(self) -> dict[str, Any]:
         """Return the values for a model file's comment."""
-        numbers = {"screen_variance": self.screen_variance, "compensate": self.compensate}
-        numbers = {"near": self.near, **numbers} if self.near else numbers
+        values = {"screen_variance": self.screen_variance, "compensate": self.compensate}
+        values = {"near": self.near, **values} if self.near else values
         optional: dict[str, Any] = {"background": self.background} if self.background else {}
         if self.pixel_box or "pixel_box" in self.notes:  # leaves files of other models unchanged
             optional["pixel_box"] = self.pixel_box
-        return {**self.notes, **numbers, **optional, "alpha": self.alpha}
+        return {**self.notes, **values, **optional, "alpha": self.alpha}
 
 
 # Paths of models.
@@ -87,19 +87,19 @@ MODEL = "point_cloud.ply"  # default in a run folder
 
 
 def model_path(path: Path) -> Path:
-    """Return the model file of a path: for a SOG folder its meta.json, for a run folder its model."""
+    """Return the model file of a path: its meta.json for a SOG folder, and its model for a run folder."""
     file = model_file(path)
     return run_model(file) if file.is_dir() else file
 
 
 def run_model(folder: Path) -> Path:
-    """Return the model file of a run folder: the last export, or the one next to it without Gaussians of the sky."""
+    """Return the model file of a run folder: the last export, preferably the one without sky Gaussians."""
     file = exported_model(folder)
-    return without if (without := without_sky_path(file)).is_file() else file
+    return scene_file if (scene_file := without_sky_path(file)).is_file() else file
 
 
 def exported_model(path: Path) -> Path:
-    """Return the model file that a run folder exports last, as its metrics.json names it; other paths are unchanged."""
+    """Return the last export of a run folder, as named in its metrics.json; return other paths unchanged."""
     return run_output(path, "export", MODEL) if model_file(path).is_dir() else path
 
 
@@ -113,7 +113,7 @@ def run_output(folder: Path, stage: str, default: str) -> Path:
 
 
 def raw_model(file: Path) -> Path:
-    """Return the PLY with the separate world filter next to a run's model if it exists, else the model."""
+    """Return the PLY next to a run's model that stores the world filter separately, or the model if there is none."""
     raw = file.with_name(f"{file.stem.removesuffix(WITHOUT_SKY)}_raw.ply")
     return raw if raw.is_file() else file
 
@@ -125,7 +125,7 @@ WIDTHS = {  # allowed numbers of columns
     "filter_variance": (1,),
     columns.MOTION: tuple(columns.WIDTHS),
 }
-NUMBERS = Rendering()  # the defaults
+DEFAULT_RENDERING = Rendering()
 MIN_LOGIT = -80.0  # of an opacity that the filter reduces to nothing; smallest value that kernels handle
 
 
@@ -143,7 +143,7 @@ class Model:
     sh_base: Floats  # [N, 3] band 0
     sh_rest: Floats  # [N, (K-1)*3] the other bands, coefficient-major
     filter_variance: Floats | None = None  # [N, 1] scene units², a world filter that is not baked into the scales
-    rendering: Rendering = NUMBERS
+    rendering: Rendering = DEFAULT_RENDERING
     sky: Sky | None = None  # behind the Gaussians, instead of a background color
     motion: Floats | None = None  # [N, 5 or more] of moving Gaussians, see clsplat/formats/splats.py
     origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of zero
@@ -163,11 +163,11 @@ class Model:
 
     def upload(self, device: Device) -> DeviceModel:
         """Copy the model to a device for rendering."""
-        numbers = self.rendering
+        rendering = self.rendering
         gaussians = Gaussians(device, self.tables())
-        screen = numbers.screen_variance, numbers.compensate, numbers.pixel_box
+        screen_filter = rendering.screen_variance, rendering.compensate, rendering.pixel_box
         sky = self.sky.upload(device) if self.sky else None
-        return DeviceModel(gaussians, self.sh_degree, self.near, *screen, sky=sky)
+        return DeviceModel(gaussians, self.sh_degree, self.near, *screen_filter, sky=sky)
 
     def tables(self) -> dict[str, Floats]:
         """Return the arrays by name, including filter_variance and motion if present."""
@@ -193,12 +193,12 @@ class Model:
 
     @property
     def sh_degree(self) -> int:
-        """The SH degree."""
+        """The degree of the spherical harmonics."""
         return columns_to_sh_degree(self.sh_rest.shape[1])
 
     @property
     def scene_means(self) -> Floats:
-        """The means without those of Gaussians of a sky."""
+        """The means, [N, 3], without those of sky Gaussians."""
         if self.rendering.notes.get("sky") != "splats":
             return self.means
         means = self.means.astype(np.float64)
@@ -206,7 +206,7 @@ class Model:
 
     @property
     def near(self) -> float:
-        """The near plane, scene units: that of `rendering`, or else a fraction of the size of the model."""
+        """The near plane in scene units: `rendering.near`, or a fraction of the model's size if that is 0."""
         return self.rendering.near or usual_near(self.means)
 
     @property
@@ -237,27 +237,27 @@ class Model:
         rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means.
         Raises ValueError for a matrix that is not a rotation, and if the result does not fit in a model file.
         """
-        turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        matrix = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
         if np.shape(translation) != (3,):
             raise ValueError(f"the translation has shape {np.shape(translation)}; expected (3,)")
         origin, shift = self.origin, np.asarray(translation, np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             if origin.any():
-                origin, shift = scale * turn @ origin + shift, np.zeros(3)
-            changed: dict[str, Any] = transform(self.tables(), scale, turn, shift)
+                origin, shift = scale * matrix @ origin + shift, np.zeros(3)
+            results: dict[str, Any] = transform(self.tables(), scale, matrix, shift)
             if self.motion is not None:
-                changed["motion"] = transform_motion(self.motion, scale, turn)
+                results["motion"] = transform_motion(self.motion, scale, matrix)
             if self.filter_variance is not None:
-                changed["filter_variance"] = self.filter_variance * scale**2
-            tables = {name: table.astype(np.float32) for name, table in changed.items()}
+                results["filter_variance"] = self.filter_variance * scale**2
+            tables = {name: table.astype(np.float32) for name, table in results.items()}
         near = self.rendering.near * scale
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
             raise ValueError("the result does not fit in a model file; use a smaller scale and translation")
-        sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
+        sky = self.sky.rotated(matrix) if self.sky and rotation is not None else self.sky
         return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky, origin=origin)
 
     def in_scene(self, scene: Scene) -> "Model":
-        """Return the model relative to the scene's origin, with the scene's near plane unless its file gives one."""
+        """Return the model relative to the scene's origin, with the scene's near plane unless the model has one."""
         model = self.with_origin(scene.origin)
         if model.rendering.near:
             return model
@@ -298,7 +298,7 @@ class Model:
         """Write a file in the format of its name: .ply, .spz, .sog, .glb, and others (docs/formats.md).
 
         A PLY stores a world filter as the property `filter_3D`; for other formats, it is baked.  A sky is written next
-        to the model as NAME_sky.json, which holds the SHA-256 of the model file, so that no other model uses it.
+        to the model as NAME_sky.json, which contains the SHA-256 of the model file, so that no other model uses it.
         Returns the SHA-256 of the file, or of meta.json for a SOG folder.
         Raises ConfigError for an unknown extension or world coordinates that the format cannot hold, and OutputError if
         the file cannot be written.
@@ -360,7 +360,7 @@ COARSE = 0.05  # spacing of positions that becomes visible, relative to the medi
 def float32_holds(means: NDArray[np.floating], log_scales: Floats) -> bool:
     """Return whether float32 is precise enough for the means, [N, 3], of Gaussians with these scales, [N, 3].
 
-    Also returns True beyond MAX_NUMBER, where means are not coordinates.
+    Also returns True for means beyond MAX_NUMBER, which are not valid coordinates.
     """
     if not len(means):
         return True
@@ -390,12 +390,12 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     model = Model(**tables, rendering=Rendering.from_comment(comment, file.mode), sky=sky)
     if file.placement is not None:
         scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
-        turn, shift = file.placement[:3, :3] / (scale or 1), file.placement[:3, 3]
-        origin = scale * turn @ origin
+        rotation, shift = file.placement[:3, :3] / (scale or 1), file.placement[:3, 3]
+        origin = scale * rotation @ origin
         if not float32_holds(shift[None], model.log_scales + np.log(abs(scale) or 1)):
             origin, shift = origin + shift, np.zeros(3)
         try:
-            model = model.transformed(scale, turn, shift)
+            model = model.transformed(scale, rotation, shift)
         except ValueError as error:
             raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
     return replace(model, origin=origin) if origin.any() else model

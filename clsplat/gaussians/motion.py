@@ -49,9 +49,9 @@ def evaluate_at(parameters: Parameters, time: float) -> Parameters:
     if "turn" in fields:
         tables["quats"] = (tables["quats"] + motion[:, fields["turn"]] * dt).astype(np.float32)
     logit = tables["logit_opacity"].astype(np.float64)
-    bounded = np.minimum(logit, MAX_LOGIT)
-    faded = bounded + np.log(factor) - np.log1p(np.exp(bounded) * (1 - factor))
-    tables["logit_opacity"] = np.where(factor < 1, faded, logit).astype(np.float32)
+    clamped_logit = np.minimum(logit, MAX_LOGIT)
+    faded_logit = clamped_logit + np.log(factor) - np.log1p(np.exp(clamped_logit) * (1 - factor))
+    tables["logit_opacity"] = np.where(factor < 1, faded_logit, logit).astype(np.float32)
     return tables
 
 
@@ -66,18 +66,18 @@ def transform_motion(motion: NDArray[np.floating], scale: float, rotation: NDArr
 
 
 def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
-    """Return the tables of models; if any of them moves, add a static motion to the others.
+    """Return the tables of several models; if any model moves, add a static motion to the others.
 
     Raises DataError if their motions have different columns.
     """
-    widths = {table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table}
-    if len(widths) > 1:
-        first, second, *_ = widths.values()
+    by_width = {table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table}
+    if len(by_width) > 1:
+        first, second, *_ = by_width.values()
         raise DataError(
             f"{second}: its motion differs from {first} in degree or rotation; merge them at one "
             "time (`clsplat convert MODEL OUT --time T`)"
         )
     return [
-        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *widths))} if widths else table
+        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *by_width))} if by_width else table
         for table in tables
     ]

@@ -1,7 +1,7 @@
 """Offload the SH bands above 0 and their moments to host memory.
 
-They are 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device holds the blocks of LANES rows
-that a view sees in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is rendered, and
+They take 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device stores the blocks of LANES
+rows that a view sees in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is rendered, and
 downloaded before the next one.
 """
 
@@ -23,7 +23,7 @@ class HostTables:
     """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
-        """gaussians: its `tables` will hold the slots instead of the offloaded tables."""
+        """gaussians: its `tables` will contain the slots instead of the offloaded tables."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}
@@ -45,7 +45,7 @@ class HostTables:
         return int(self.tables["sh_rest"].shape[1]) * self.lanes
 
     def add(self, name: str, components: int) -> Array:
-        """Add a table of zeros; return its slots."""
+        """Add a table of zeros, and return its slots, [slots, components, LANES]."""
         self.finish_download()
         self._forget_slots()
         self.tables[name] = np.zeros((self._blocks, components, self.lanes), np.float32)
@@ -59,7 +59,7 @@ class HostTables:
         return np.ascontiguousarray(rows[: self.gaussians.count])
 
     def set(self, name: str, values: NDArray[np.float32]) -> None:
-        """Replace a table by [N, components]."""
+        """Replace the values of a table, [N, components]."""
         self.finish_download()
         self._forget_slots()
         count, components = values.shape
@@ -68,7 +68,7 @@ class HostTables:
         self.tables[name] = np.ascontiguousarray(rows.reshape(self._blocks, self.lanes, components).transpose(0, 2, 1))
 
     def upload_visible(self, depth_key: Array) -> None:
-        """Upload the blocks that a view sees, and wait.  depth_key: [S], all bits set for culled Gaussians."""
+        """Upload the visible blocks, and wait.  depth_key: [S], all bits set for culled Gaussians."""
         rows = self._blocks * self.lanes
         is_visible = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
         self.load(np.flatnonzero(is_visible))
@@ -102,15 +102,15 @@ class HostTables:
         self._downloads = {}
 
     def parts(self) -> Iterator[None]:
-        """Load all blocks into the slots, part by part, and finally the blocks that were loaded before."""
-        before, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
+        """Load all blocks into the slots in parts, yielding after each; then load the previous blocks again."""
+        previous_blocks, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
         for first in range(0, self._blocks, size):
             self.load(np.arange(first, min(first + size, self._blocks)))
             yield
-        self.load(before)
+        self.load(previous_blocks)
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.float32]) -> None:
-        """Write [n, components] into rows, [n], of a table."""
+        """Write values, [n, components], into the rows, [n], of a table."""
         table = self.get(name)
         table[rows] = values
         self.set(name, table)
@@ -124,7 +124,7 @@ class HostTables:
         return tables
 
     def _first_slots(self, name: str, count: int) -> Array:
-        """Return the first slots of a table."""
+        """Return the first `count` slots of a table, which share its memory."""
         slots = self.gaussians.tables[name].array
         return Array(self.device, slots.buffer, (count, *slots.shape[1:]), slots.dtype)
 

@@ -1,4 +1,4 @@
-"""Store a sky: colors by direction behind the Gaussians, on the host, on the device, and in a file next to a model."""
+"""Represent a sky, the colors behind the Gaussians by direction, on the host, on a device, and in a file."""
 
 import json
 import logging
@@ -46,7 +46,7 @@ def texel_directions(side: int) -> Floats:
 
 
 def texel_indices(i: Integers, j: Integers, side: int) -> Integers:
-    """Return the indices of texels in columns i and rows j, from -1 to `side`.
+    """Return the indices of the texels in columns i and rows j, which may be from -1 to `side`.
 
     Beyond an edge, the map continues at the mirrored position of the same edge.
     """
@@ -58,24 +58,24 @@ def texel_indices(i: Integers, j: Integers, side: int) -> Integers:
 
 
 def neighbor_texels(side: int) -> Integers:
-    """Return each texel's 3x3 neighborhood, [side * side, 9]."""
+    """Return the indices of the texels in each texel's 3x3 neighborhood, [side * side, 9]."""
     j, i = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     return np.stack([texel_indices(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
 
 
 def bilinear_texels(i: Integers, j: Integers, side: int) -> Integers:
-    """Return the four texels around coordinates with integer parts i and j, from -1 to side - 1, [..., 4]."""
+    """Return the indices, [..., 4], of the four texels around coordinates with integer parts i, j in [-1, side - 1]."""
     return np.stack([texel_indices(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
 
 
 def bilinear_weights(fractions: Floats) -> Floats:
-    """Return the bilinear weights of the four texels, [..., 4], for fractional parts [..., 2]."""
-    a, b = fractions[..., 0], fractions[..., 1]
-    return np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=-1)
+    """Return the bilinear weights, [..., 4], of the four texels around coordinates with fractional parts [..., 2]."""
+    x, y = fractions[..., 0], fractions[..., 1]
+    return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
 
 
 def sample_texels(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> Floats:
-    """Return the values of a map, [side * side, C], in directions, [..., 3], as [..., C]."""
+    """Sample a map, [side * side, C], in directions, [..., 3], by bilinear interpolation; return [..., C]."""
     side = int(np.sqrt(len(texels)))
     position = texel_positions(directions, side)
     first = np.floor(position).astype(np.int64)
@@ -107,7 +107,7 @@ class DeviceSky:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """An octahedral map of the colors behind a model."""
+    """The colors behind a model by direction, as an octahedral map."""
 
     texels: NDArray[np.float32]  # [side * side, 3], row by row
 
@@ -121,13 +121,13 @@ class Sky:
         return DeviceSky(device.upload(np.ascontiguousarray(self.texels.T)), self.side)
 
     def rotated(self, rotation: NDArray[np.floating]) -> "Sky":
-        """Return the sky of a scene after x -> rotation x, [3, 3], with bilinear interpolation."""
+        """Return the sky rotated by a matrix, [3, 3], and resampled by bilinear interpolation."""
         return Sky(sample_texels(self.texels, texel_directions(self.side) @ rotation).astype(np.float32))
 
     def write(self, path: Path, models: Mapping[str, str]) -> None:
-        """Write the sky as JSON, with exact numbers and the SHA-256 of its model files by name.
+        """Write the sky as JSON, with exact values and the SHA-256 of each of its model files.
 
-        Raises OutputError.
+        models: SHA-256 by file name.  Raises OutputError.
         """
         rows = [[float(value) for value in texel] for texel in self.texels]
         hashes = dict(sorted(models.items()))
@@ -139,7 +139,7 @@ WITHOUT_SKY = "_without_sky"  # in the name of a model file next to one with Gau
 
 
 def sky_path(model: Path) -> Path:
-    """Return the path of the sky of a model file, also of a `_raw` or `_without_sky` model."""
+    """Return the path of a model's sky file; `_raw` and `_without_sky` models share that of the model."""
     return model.with_name(f"{model.stem.removesuffix('_raw').removesuffix(WITHOUT_SKY)}_sky.json")
 
 
@@ -149,22 +149,22 @@ def without_sky_path(model: Path) -> Path:
 
 
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
-    """Write a sky next to its model file with SHA-256 `digest`; if `sky` is None, remove the model from that file.
+    """Write a sky next to its model file; if `sky` is None, remove the model from the sky file.
 
-    Other models with the same stem keep an identical sky.  Raises OutputError.
+    digest: SHA-256 of the model file.  Other models with the same stem keep an identical sky.  Raises OutputError.
     """
     path = sky_path(model)
     try:
-        old, models = _read(path) if path.is_file() else (None, {})
+        old_sky, models = _read(path) if path.is_file() else (None, {})
     except DataError:  # a damaged sky belongs to no model
-        old, models = None, {}
-    others = {name: other for name, other in models.items() if name != model.name and (sky or other != digest)}
+        old_sky, models = None, {}
+    other_models = {name: hash_ for name, hash_ in models.items() if name != model.name and (sky or hash_ != digest)}
     if sky:
-        is_same = old is not None and np.array_equal(old.texels, sky.texels)
-        sky.write(path, {**(others if is_same else {}), model.name: digest})
-    elif old and others:
-        old.write(path, others)
-    elif old and models:
+        is_same = old_sky is not None and np.array_equal(old_sky.texels, sky.texels)
+        sky.write(path, {**(other_models if is_same else {}), model.name: digest})
+    elif old_sky and other_models:
+        old_sky.write(path, other_models)
+    elif old_sky and models:
         try:
             path.unlink()
         except OSError as error:
@@ -172,7 +172,7 @@ def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
 
 
 def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
-    """Return the sky of a model file, or None; warn if it is missing but expected, or belongs to another model.
+    """Return the sky of a model file, or None; warn if the sky is missing but expected, or belongs to another model.
 
     Raises DataError if its file is damaged.
     """

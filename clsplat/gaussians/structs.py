@@ -1,4 +1,4 @@
-"""Define protocols and helpers that the parts of `Gaussians` share."""
+"""Define protocols and helpers for modules that `gaussians.py` imports and that use its classes."""
 
 import copy
 from typing import Any, ClassVar, Protocol
@@ -18,7 +18,7 @@ class DeferredUpdates(Protocol):
     updates: int
 
     def catch_up(self, depth_key: Array) -> None:
-        """Apply deferred updates of the rows that a view sees."""
+        """Apply the deferred updates of visible rows."""
 
     def flush(self) -> None:
         """Apply deferred updates of all rows."""
@@ -27,7 +27,7 @@ class DeferredUpdates(Protocol):
         """Make room for recording an update of the bands up to `degree`."""
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
-        """Record an update that the rows in the view have already received."""
+        """Record an update that has already been applied to visible rows."""
 
 
 class Struct(Protocol):
@@ -73,13 +73,13 @@ class GaussianGradients:
         return self.arrays[name]
 
     def without_deferred(self) -> "GaussianGradients":
-        """Return the same arrays, but raise ConfigError for those with deferred updates."""
+        """Return a copy with the same arrays that raises ConfigError on access to arrays with deferred updates."""
         gradients = copy.copy(self)
         gradients._withheld = ("sh_rest",)
         return gradients
 
     def replace(self, arrays: dict[str, Array]) -> "GaussianGradients":
-        """Return a copy with other arrays, by name of the parameter."""
+        """Return a copy with other arrays, given by parameter name."""
         gradients = copy.copy(self)
         gradients.arrays = arrays
         return gradients
@@ -89,7 +89,7 @@ class GaussianGradients:
         return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)
 
     def arguments(self) -> dict[str, Any]:
-        """Return the gradients of the projection by the names of kernel arguments."""
+        """Return the gradients that the projection kernels write, by the names of their arguments."""
         return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
@@ -102,7 +102,7 @@ def _shapes(gaussians: Struct) -> dict[str, tuple[int, ...]]:
 
 
 def check_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
-    """Return rows, [n], for a kernel; raise ValueError unless they are distinct integers in [0, count)."""
+    """Return row indices, [n], as uint32.  Raises ValueError unless they are distinct integers in [0, count)."""
     if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
         raise ValueError(
             f"rows: expected integers [n], got {rows.dtype} {list(rows.shape)}; np.flatnonzero gives the rows of a mask"

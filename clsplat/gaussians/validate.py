@@ -24,7 +24,7 @@ DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "fl
 
 
 def is_model(path: Path) -> bool:
-    """Return whether a path is a model, by content or name, or another binary file; pipeline files are not."""
+    """Return whether a path is a model, by name or content, or another binary file, rather than a pipeline file."""
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
@@ -39,20 +39,22 @@ def _is_binary(path: Path) -> bool:
 
 
 def examine(path: Path) -> dict[str, Any]:
-    """Summarize a model file: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, `moves`, `ranges`,
-    `bounds` in scene units, counts of `degenerate` Gaussians, `findings` as text, and `valid` (no findings).
+    """Return a summary of a model file.
 
-    Raises DataError if it cannot be read.
+    Its keys include `model` (the path), `format`, `gaussians`, `sh_degree`, `mode`, `moves`, `ranges`, `bounds` in
+    scene units, counts of `degenerate` Gaussians, `findings` as text, and `valid` (whether there are no findings).
+    Raises DataError if the file cannot be read.
     """
     codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
-    bad = not_finite(model.tables())
-    finite = model[~bad] if bad.any() else model
-    findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians have values that are not finite"] if bad.any() else []
+    is_bad = not_finite(model.tables())
+    finite = model[~is_bad] if is_bad.any() else model
+    fault = f"{int(is_bad.sum()):,} of {len(model):,} Gaussians have values that are not finite"
+    findings = [fault] if is_bad.any() else []
     findings += [message] if (message := too_large_message(finite.tables())) else []
     findings += _find_activated(finite)
-    length = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
-    if no_rotation := int((length == 0).sum()):
+    lengths = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
+    if no_rotation := int((lengths == 0).sum()):
         findings.append(f"{no_rotation} quaternions have length 0")
     if not len(model):
         findings.append("it has no Gaussians")
@@ -70,7 +72,7 @@ def examine(path: Path) -> dict[str, Any]:
         "bounds": [finite.means.min(axis=0).tolist(), finite.means.max(axis=0).tolist()] if len(finite) else [],
         **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
-            "not_finite": int(bad.sum()),
+            "not_finite": int(is_bad.sum()),
             "no_rotation": no_rotation,
             "flat": int((finite.log_scales < np.log(FLAT * typical_size(finite.means))).any(axis=1).sum()),
             "invisible": int((finite.opacities < FAINT).sum()),
@@ -81,26 +83,26 @@ def examine(path: Path) -> dict[str, Any]:
 
 
 def lines(report: dict[str, Any]) -> str:
-    """Format the result of `examine`, one line per fact."""
-    marks = (
+    """Format the result of `examine` as lines of text."""
+    suffix = (
         " (mip)" * (report["mode"] == "mip") + " (filter_3D)" * report["world_filter"] + " (moves)" * report["moves"]
     )
-    degree = f"SH degree {report['sh_degree']}{marks}"
+    degree = f"SH degree {report['sh_degree']}{suffix}"
     rows = [f"{report['model']}: {report['format']}, {report['gaussians']:,} Gaussians, {degree}"]
     for name, (low, median, high) in report["ranges"].items():
         rows.append(f"  {name:<12} {low:.4g} to {high:.4g}, median {median:.4g}")
     for low, high in [report["bounds"]] if report["bounds"] else []:
-        text = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
-        rows.append(f"  {'bounds':<12} ({next(text)}) to ({next(text)})")
+        texts = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
+        rows.append(f"  {'bounds':<12} ({next(texts)}) to ({next(texts)})")
     if origin := report.get("origin"):
         rows.append(f"  {'origin':<12} {position_text(np.array(origin))}, to which the bounds are relative")
     counts = report["degenerate"]
-    rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {words}" for name, words in DEGENERATE.items()))
+    rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {label}" for name, label in DEGENERATE.items()))
     return "\n".join(rows)
 
 
 def verdict(report: dict[str, Any]) -> str:
-    """Summarize the result of `examine` in one sentence."""
+    """Summarize the result of `examine` in one sentence, with a remedy for a faulty model."""
     if report["valid"]:
         return f"{report['model']}: valid"
     if not report["gaussians"]:

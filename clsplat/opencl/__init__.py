@@ -1,1 +1,1 @@
-"""OpenCL devices, their programs and their caches; nothing else imports pyopencl."""
+"""OpenCL devices, programs, and kernel caches; no other package imports pyopencl."""

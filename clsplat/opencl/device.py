@@ -1,4 +1,4 @@
-"""Open an OpenCL device with its context, queue, memory and programs.
+"""Open an OpenCL device, allocate its memory, and build and launch its kernels.
 
 Only this package imports pyopencl.
 """
@@ -37,7 +37,7 @@ LOG = logging.getLogger("clsplat")
 
 @contextmanager
 def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
-    """Convert errors of the runtime in a block that does `action` to MemoryLimitError or DeviceError.
+    """Convert runtime errors in the block to MemoryLimitError or DeviceError; `action` describes the block.
 
     Some runtimes allocate device memory on first use, and run out of it only at a launch or a copy.
     """
@@ -52,7 +52,7 @@ def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
 
 
 class Timings:
-    """Times of kernels on the device, from profiling events, while `sampling` is True.
+    """Kernel times on the device, measured by profiling events while `sampling` is True.
 
     Events are dropped as soon as they are read: some drivers slow down when many are alive.
     """
@@ -68,9 +68,9 @@ class Timings:
             self._events.append((name, self.section, event))
 
     def take(self) -> dict[tuple[str, str], list[float]]:
-        """Return the seconds of each launch since the last call, by kernel and section; wait for the launches.
+        """Return the seconds of each launch since the last call, by kernel and section.
 
-        Raises MemoryLimitError or DeviceError if a launch failed.
+        Waits for the launches.  Raises MemoryLimitError or DeviceError if a launch failed.
         """
         seconds: dict[tuple[str, str], list[float]] = defaultdict(list)
         for name, section, event in self._events:
@@ -98,7 +98,7 @@ class Array:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
-        """Copy to the host; waits for the device.  Raises MemoryLimitError, DeviceError."""
+        """Copy the array to the host, after waiting for the device.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
             with self.device.raising_errors("a copy to the host"):
@@ -130,7 +130,7 @@ class Array:
         return host[0]
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from the host; the shapes must agree.  Raises MemoryLimitError, DeviceError."""
+        """Copy values of the same shape from the host.  Raises ValueError, MemoryLimitError, DeviceError."""
         host = np.ascontiguousarray(values, self.dtype)
         if host.shape != self.shape:
             raise ValueError(f"cannot copy {host.shape} into {self.shape}")
@@ -149,11 +149,11 @@ class Array:
 class Device:
     """An open OpenCL device: one context, in-order commands, and programs that are built once.
 
-    At its end, a `with` block waits for all work.  Memory is released with the arrays, and the device with the last
+    A `with` block waits for all work when it ends.  Memory is released with the arrays, and the device with the last
     object that uses it.
 
-    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  Without it, the device is
-    CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
+    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  By default, the device is
+    the one named in CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
     Raises DeviceError if there is none, MemoryLimitError or DeviceError if the runtime cannot open it, and KernelError
     if the blending kernels do not fit.
     """
@@ -204,20 +204,23 @@ class Device:
 
     @property
     def queue(self) -> Any:
-        """The command queue, which profiles while `timings` samples; at a switch, the device waits, not the host."""
+        """The command queue: one with profiling while `timings` samples, otherwise one without.
+
+        After a switch, the new queue waits for the commands of the other on the device, without blocking the host.
+        """
         sampling = self.timings.sampling
         if sampling != self._sampling:
-            before = cl.enqueue_marker(self._queues[self._sampling])
+            marker = cl.enqueue_marker(self._queues[self._sampling])
             self._queues[self._sampling].flush()
-            cl.enqueue_barrier(self._queues[sampling], wait_for=[before])
+            cl.enqueue_barrier(self._queues[sampling], wait_for=[marker])
             self._sampling = sampling
         return self._queues[sampling]
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Allocate an array with undefined values.  Raises MemoryLimitError, with the size."""
+        """Allocate an array with undefined values.  Raises MemoryLimitError."""
         shape = (shape,) if isinstance(shape, int) else shape
-        kind = np.dtype(dtype)
-        size = _round_up_to_lines(math.prod(shape) * kind.itemsize)
+        element_type = np.dtype(dtype)
+        size = _round_up_to_lines(math.prod(shape) * element_type.itemsize)
         if size > self.info.allocation:
             raise MemoryLimitError(
                 f"one buffer of {size / 2**20:.0f} MiB is more than {self.info.name} allows "
@@ -233,7 +236,7 @@ class Device:
         self.allocated += size
         self.peak = max(self.peak, self.allocated)
         weakref.finalize(buffer, self._record_release, size)
-        return Array(self, buffer, shape, kind)
+        return Array(self, buffer, shape, element_type)
 
     def _record_release(self, size: int) -> None:
         self.allocated -= size
@@ -251,9 +254,9 @@ class Device:
         return array
 
     def program(self, file: str | Path, **defines: int | str) -> "Program":
-        """Build `cl_kernels/<file>`, or an absolute path, with this device's tuning and `defines`; cached.
+        """Return the program of `cl_kernels/<file>`, or of an absolute path, which is built once per set of macros.
 
-        Raises KernelError if it does not build or is missing.
+        The macros are this device's tuning and `defines`.  Raises KernelError if the file is missing or does not build.
         """
         key = (str(file), *defines.items(), *self.tuning.items())
         with self.lock:
@@ -267,17 +270,17 @@ class Device:
             self.queue.finish()
 
     def raising_errors(self, action: str) -> AbstractContextManager[None]:
-        """Convert errors of the runtime in a block that does `action` (see `raising_device_errors`)."""
+        """Convert runtime errors in the block, which `action` describes (see `raising_device_errors`)."""
         return raising_device_errors(action, self.info.name)
 
 
 def create_context(device: Any) -> Any:
-    """Return a new context for a device of the runtime."""
+    """Return a new context for a device of pyopencl."""
     return cl.Context([device])
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
-    """Open a device by a part of its name, or return an open one; None: the device that `choose` chooses.
+    """Open a device given by part of its name, or by default the one that `choose` selects; return an open device.
 
     Raises DeviceError if there is none, and ConfigError for an open device with another schedule.
     """
@@ -291,11 +294,11 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
 
 
 def _round_up_to_lines(size: int) -> int:
-    """Round bytes up to 64, at least 64: vectors may read past the last value, and no buffer may be empty."""
+    """Round a size up to a positive multiple of 64 bytes: vector loads may read past the last value of a buffer."""
     return max(64, -(-size // 64) * 64)
 
 
-# Kernels by name: load a .cl file, build it, check arguments against its source, launch.
+# Kernels: build a .cl file, check the arguments of calls against its source, and launch.
 
 
 CACHE_ERRORS = (cl.Error, sqlite3.Error, UnpicklingError)  # raised if a cache of the runtime or pyopencl is damaged
@@ -317,9 +320,12 @@ _TYPES: dict[str, np.dtype[Any]] = {
 }
 
 
-def flatten(path: Path, included: set[Path] | None = None) -> str:
-    """Return the source with each local header inlined once; #line directives keep line numbers in messages right."""
-    included = set() if included is None else included
+def flatten(path: Path, headers: set[Path] | None = None) -> str:
+    """Return the source with each local header inlined once, and #line directives for correct compiler messages.
+
+    headers: the headers that are already inlined; new ones are added.
+    """
+    headers = set() if headers is None else headers
     text = [f'#line 1 "{path.name}"']
     for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
         match = _INCLUDE.match(line)
@@ -329,9 +335,9 @@ def flatten(path: Path, included: set[Path] | None = None) -> str:
         header = path.parent / match[1]
         if not header.is_file():  # a plug-in's kernels may include the package's headers
             header = resource_dir("cl_kernels") / match[1]
-        if header not in included:
-            included.add(header)
-            text.append(flatten(header, included))
+        if header not in headers:
+            headers.add(header)
+            text.append(flatten(header, headers))
         text.append(f'#line {number + 1} "{path.name}"')
     return "\n".join(text)
 
@@ -379,9 +385,10 @@ def group_limit(kernel: Any, device: Any) -> int:
 
 
 def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> bool:
-    """Return whether a runtime reports too small a limit, as rusticl does: the number of items that run together.
+    """Return whether a runtime reports a group size limit that is too small, as rusticl does.
 
-    It runs larger groups: Mesa 22.3.6 reports 32 for a kernel that requires 256.
+    It reports `multiple`, the number of items that run together, but runs larger groups: Mesa 22.3.6 reports 32 for a
+    kernel that requires 256.
     https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
     """
     return info.platform.startswith("rusticl") and limit == multiple
@@ -409,7 +416,7 @@ class Kernel:
             )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch over `items`, rounded up to whole groups, or over `groups`; if one is 0, do nothing."""
+        """Launch over `items`, rounded up to full work-groups, or over `groups`; if a size is 0, do nothing."""
         total = items or groups
         size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]
@@ -442,14 +449,14 @@ class Kernel:
     def _raise_argument_error(self, values: dict[str, Any]) -> NoReturn:
         expected = {a.name: a for a in self.arguments}
         missing, surplus = expected.keys() - values.keys(), values.keys() - expected.keys()
-        wrong = [
+        mismatches = [
             f"{name} is {getattr(value, 'dtype', type(value).__name__)}, expected {expected[name].dtype or 'a struct'}"
             for name, value in values.items()
             if name in expected and expected[name].pointer and getattr(value, "dtype", None) != expected[name].dtype
         ]
-        parts = [f"missing arguments {', '.join(sorted(missing))}"] if missing else []
-        parts += [f"unknown arguments {', '.join(sorted(surplus))}"] if surplus else []
-        raise KernelError(f"{self.label}: {'; '.join(parts + wrong)}")
+        faults = [f"missing arguments {', '.join(sorted(missing))}"] if missing else []
+        faults += [f"unknown arguments {', '.join(sorted(surplus))}"] if surplus else []
+        raise KernelError(f"{self.label}: {'; '.join(faults + mismatches)}")
 
 
 class Program:

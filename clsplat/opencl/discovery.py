@@ -47,15 +47,15 @@ class DeviceInfo:
 
     def fault(self) -> str | None:
         """Return None if the device is large enough and runs a test kernel, else the fault as a sentence."""
-        needed = int(tuning_macros(self, resolve_schedule(self, "auto"))["GROUP"])
-        if self.group < needed:
-            return f"its work-groups have at most {self.group} items; {needed} are needed"
+        min_group = int(tuning_macros(self, resolve_schedule(self, "auto"))["GROUP"])
+        if self.group < min_group:
+            return f"its work-groups have at most {self.group} items; {min_group} are needed"
         if self.local_memory < LOCAL_MEMORY:
             return f"its work-groups have {self.local_memory} bytes of local memory; {LOCAL_MEMORY} are needed"
         return runtimes.probe_fault(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.index)
 
     def matches(self, device_name: str) -> bool:
-        """Return whether `device_name` is a part of platform, name and kind, ignoring case."""
+        """Return whether `device_name` is part of the platform, name, and kind, ignoring case."""
         return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
 
 
@@ -118,11 +118,11 @@ def _short_version(version: str) -> str:
 
 
 def choose(device_name: str | None = None) -> DeviceInfo:
-    """Choose a device; log the devices that do not work.
+    """Choose a device, and log the devices that do not work.
 
-    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, counted from 0.  Without it,
-    the variable CLSPLAT_DEVICE gives the name, else the choice is the strongest GPU that works, else the first CPU,
-    else the first other device.  Raises DeviceError with the names of all devices.
+    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, counted from 0.  The default
+    is the environment variable CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU, else the first
+    other device.  Raises DeviceError if no device matches or works.
     """
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
@@ -134,9 +134,9 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     for info in sorted(devices, key=_rank):
         fault = info.fault()
         if fault is None:
-            others = [other.text for other in devices if other.kind == info.kind == "GPU" and other is not info]
-            if others:
-                LOG.info("chose %s; other GPUs: %s; --device NAME chooses one", info.text, "; ".join(others))
+            gpus = [device.text for device in devices if device.kind == info.kind == "GPU" and device is not info]
+            if gpus:
+                LOG.info("chose %s; other GPUs: %s; --device NAME chooses one", info.text, "; ".join(gpus))
             return info
         faults.append(f"{info.text} does not work: {fault}")
         LOG.warning("%s", faults[-1])
@@ -146,19 +146,19 @@ def choose(device_name: str | None = None) -> DeviceInfo:
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
     """Return the sort key: GPUs first, discrete before integrated ones, by units times clock; then CPUs, then others.
 
-    The number of units alone says little: some vendors count whole processors, others parts of them.
+    The number of units does not suffice, because some vendors count entire processors, and others their parts.
     """
     gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
 
 
 def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
-    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", device_name, re.DOTALL)
-    name, number = numbered.groups() if numbered else (device_name, "0")
-    matching = [info for info in devices if info.matches(name)]
-    if int(number) >= len(matching):
+    match = re.fullmatch(r"(.*):([0-9]{1,4})", device_name, re.DOTALL)
+    name, number = match.groups() if match else (device_name, "0")
+    candidates = [info for info in devices if info.matches(name)]
+    if int(number) >= len(candidates):
         raise DeviceError(f"no device matches {quote(device_name)}; available: {'; '.join(i.text for i in devices)}")
-    info = matching[int(number)]
+    info = candidates[int(number)]
     fault = info.fault()
     if fault is not None:
         raise runtimes.no_device_error(f"{info.text} does not work: {fault}")

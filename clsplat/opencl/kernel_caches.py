@@ -26,7 +26,7 @@ POCL_KERNEL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")
 
 
 def kernel_caches() -> str:
-    """Return the folders of built kernels, as text."""
+    """Return the paths of all folders of built kernels, joined for a message."""
     *others, last = map(str, _kernel_folders())
     return f"{', '.join(others)} and {last}"
 
@@ -100,14 +100,14 @@ def _is_truncated(library: Path) -> bool:
 
 def _is_database(file: Path) -> bool:
     """Return whether a file is empty or a complete SQLite database, with all pages that its header counts."""
-    with suppress(OSError), open_regular(file) as opened:
-        head = opened.read(SQLITE_HEADER)
+    with suppress(OSError), open_regular(file) as stream:
+        head = stream.read(SQLITE_HEADER)
         if len(head) < SQLITE_HEADER or not head.startswith(SQLITE):
             return not head
         page, changes, pages, valid_for = struct.unpack(">16xH6x2I60xI4x", head)
         if changes != valid_for or any(file.with_name(f"{file.name}-{end}").exists() for end in ("journal", "wal")):
             return True  # the page count is out of date, or another process is writing
-        return bool(opened.seek(0, os.SEEK_END) >= pages * (65536 if page == 1 else page))
+        return bool(stream.seek(0, os.SEEK_END) >= pages * (65536 if page == 1 else page))
     return True
 
 

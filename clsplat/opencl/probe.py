@@ -1,6 +1,6 @@
-"""Build and run two small kernels on a device, given by platform and device number; exit code 0 means success.
+"""Build and run two small kernels on the device with a platform and device index; exit code 0 means success.
 
-Without numbers, load all runtimes and query their devices.
+Without arguments, load all runtimes and query their devices.
 """
 
 import os
@@ -38,17 +38,20 @@ WITHOUT_VECTORS = "changes the ABI"
 
 
 def main(platform: int, device: int) -> None:
-    """Double and reverse eight numbers on the device, and take the square roots of a vector; raise if that fails."""
-    chosen = cl.get_platforms()[platform].get_devices()[device]
-    context = cl.Context([chosen])
+    """Double and reverse eight numbers on the device, and take the square roots of a vector.
+
+    Raises SystemExit if a result is wrong.
+    """
+    cl_device = cl.get_platforms()[platform].get_devices()[device]
+    context = cl.Context([cl_device])
     queue = cl.CommandQueue(context)
     numbers = np.arange(8, dtype=np.float32)
     flags = cl.mem_flags
     source = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=numbers)
     reversed_numbers = cl.Buffer(context, flags.WRITE_ONLY, numbers.nbytes)
-    lanes = 16 if chosen.native_vector_width_float >= 16 else 8 if chosen.native_vector_width_float >= 8 else 4
+    lanes = 16 if cl_device.native_vector_width_float >= 16 else 8 if cl_device.native_vector_width_float >= 8 else 4
     program = cl.Program(context, SOURCE % {"lanes": lanes}).build(["-cl-std=CL1.2"])
-    if WITHOUT_VECTORS in program.get_build_info(chosen, cl.program_build_info.LOG):
+    if WITHOUT_VECTORS in program.get_build_info(cl_device, cl.program_build_info.LOG):
         raise SystemExit("error: kernels are compiled without the vectors of the processor")
     cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_numbers)
     result = np.empty_like(numbers)

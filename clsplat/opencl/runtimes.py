@@ -38,7 +38,7 @@ _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
 OTHER_DRIVERS = "remove this file, or set OCL_ICD_VENDORS to a folder with the .icd files of the other runtimes"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
-_ADVICE = (  # words in the output of a failed test kernel -> remedy
+_ADVICE = (  # text in the output of a failed test kernel, and advice
     ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
     ("invalid_kernel_name", f"this runtime may not support the processor: {_OTHER_RUNTIMES}"),
@@ -65,15 +65,15 @@ def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitEr
 
 
 def no_device_advice() -> str:
-    """Return what to do without a device: correct the variables that the user has set, or install a runtime."""
+    """Return advice for a machine without devices: correct environment variables, or install a runtime."""
     variables = _user_variables()
     return f"{variables} may hide the runtimes: correct or unset it; or {INSTALL}" if variables else INSTALL
 
 
 def _user_variables() -> str:
-    """Return the variables that the user has set, with their values, as text; '' if there are none."""
-    ours = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # set by `prepare`
-    values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, ours[0]).startswith(ours)}
+    """Return the VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
+    folders = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # in values that `prepare` has set
+    values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, folders[0]).startswith(folders)}
     return ", ".join(f"{name}={quote(value)}" for name, value in values.items())
 
 
@@ -81,9 +81,10 @@ def _user_variables() -> str:
 def check_runtimes(loader: str) -> None:
     """Load all runtimes in a child process first, since a runtime may crash the process that loads it.
 
-    A success is recorded until the next boot, or until the runtimes change.  loader: the OpenCL loader and its version.
-    Raises DeviceError with the faulty driver file, MemoryLimitError, and OutputError if built
-    kernels do not fit.
+    A success is recorded until the next boot, or until the runtimes change.
+    loader: name and version of the OpenCL loader.
+    Raises DeviceError with the faulty driver file, MemoryLimitError if the address space is limited, and OutputError if
+    built kernels do not fit.
     """
     require_space()
     limit = process_limit("RLIMIT_AS")
@@ -105,7 +106,7 @@ def check_runtimes(loader: str) -> None:
 
 
 def _drivers() -> dict[Path, str]:
-    """Return the libraries of the runtimes by the files that the loader reads: an .icd file, or the library itself."""
+    """Return the library of each runtime by the file that the loader reads: an .icd file, or the library itself."""
     vendors = Path(os.environ.get("OCL_ICD_VENDORS") or SYSTEM_DRIVERS)
     files = sorted(vendors.glob("*.icd")) if vendors.is_dir() else [vendors]
     drivers = {
@@ -120,7 +121,7 @@ def _drivers() -> dict[Path, str]:
 
 
 def _blame(drivers: Mapping[Path, str], fault: str) -> DeviceError:
-    """Return the error about the first driver that crashes a process in which it is the only one."""
+    """Load each driver separately, and return an error about the first one that crashes the process."""
     remedy = f"correct or unset {variables}" if (variables := _user_variables()) else OTHER_DRIVERS
     for path, library in drivers.items():
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -153,9 +154,9 @@ def _add_intel_runtime() -> None:
     if not library.exists() or "OCL_ICD_VENDORS" in os.environ:
         return
     folder = cache_folder() / "drivers" / hashlib.sha256(str(library).encode()).hexdigest()[:12]
-    for old in folder.glob("*.icd"):
-        if old.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / old.name).exists():
-            old.unlink(missing_ok=True)
+    for file in folder.glob("*.icd"):
+        if file.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / file.name).exists():
+            file.unlink(missing_ok=True)
     texts = {driver.name: driver.read_text("utf-8", errors="replace") for driver in SYSTEM_DRIVERS.glob("*.icd")}
     for name, text in {**texts, "intel-pip.icd": f"{library}\n"}.items():
         if not (folder / name).exists() or (folder / name).read_text("utf-8", errors="replace") != text:
@@ -164,7 +165,7 @@ def _add_intel_runtime() -> None:
 
 
 def probe_fault(key: str, platform: int, device: int) -> str | None:
-    """Return None if the device builds and runs a kernel, else a sentence with the fault and the remedy.
+    """Return None if the device builds and runs a test kernel, else a sentence with the fault and a remedy.
 
     `key` identifies the runtime.  Only successes are recorded, so that a repaired runtime is tested again.  A device
     that fails is tested again with empty caches of built kernels.
@@ -196,8 +197,8 @@ def _run_probe(platform: int, device: int, variables: Mapping[str, str]) -> str 
     if "failed to map segment" in output.lower():
         return _NO_EXECUTION
     reason = "the runtime aborts the process" if result.crash else _error_line(output)
-    for word, advice in _ADVICE:
-        if word in f"{output} {reason}".lower():
+    for pattern, advice in _ADVICE:
+        if pattern in f"{output} {reason}".lower():
             return f"{reason}; {advice}"
     return reason
 

@@ -31,7 +31,7 @@ from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.conversion import from_points
-from clsplat.gaussians.model import NUMBERS, Model, model_path, raw_model
+from clsplat.gaussians.model import DEFAULT_RENDERING, Model, model_path, raw_model
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
@@ -347,7 +347,7 @@ def plan_blocks(
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "points.ply")
         tables = from_points(points, Init().opacity, settings.model.sh_degree, extent=original.extent)
-        Model(**tables, rendering=NUMBERS, sky=None, origin=original.origin).save(model)
+        Model(**tables, rendering=DEFAULT_RENDERING, sky=None, origin=original.origin).save(model)
         blocks_run = Blocks(scene, Path(folder), BlocksPlan(pipeline, str(model), blocks), device)
         try:
             return blocks_run.plan_data(blocks_run.partition())
