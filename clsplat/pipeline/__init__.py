@@ -1,1 +1,1 @@
-"""Define, read, override, explain and combine pipeline files."""
+"""Define, read, override, and combine pipeline files, and explain their errors."""

@@ -1,4 +1,4 @@
-"""Choose settings based on the photos (`adapt:`): a class decides from measurements, and gives reasons."""
+"""Choose settings based on the photos (`adapt:`): classes decide from measurements, and explain their decisions."""
 
 import json
 from abc import abstractmethod
@@ -45,21 +45,22 @@ class Adaptation(Settings):
 
     @abstractmethod
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
-        """Yield a decision for each key.  The keys must not depend on the measures; they are of the model or of stages.
+        """Yield a decision for each key.  Decisions are validated like `--set`.
 
-        training: the first stage that trains Gaussians.  Decisions are validated like `--set`.
+        The keys must belong to the model or to a stage, and must not depend on the measures.
+        training: the first stage that trains Gaussians.
         """
 
     def keys(self, training: Optimize) -> list[str]:
-        """Return the keys that are decided."""
+        """Return the keys of all decisions, which are the same for all photos."""
         return [decision.key for decision in self.decide(training, Measures(0))]
 
 
 FEW = 40  # training photos; with fewer, a model overfits
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
-MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # smallest fraction of photos with sky, Gaussians per pixel
-MAX_ERROR = 1.0  # px of mean reprojection error at the training size; from here on, poses are optimized
-STEPS = 3400  # of `photos`: the steps below are for a training of this length
+MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # minimum fraction of photos with sky, Gaussians per pixel
+MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
+STEPS = 3400  # training steps of the pipeline `photos`, to which the steps below refer
 DROPOUT_UNTIL, POSES_START = 1460, 500
 
 
@@ -104,18 +105,18 @@ class Photos(Adaptation):
         yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 
         error = measures.reprojection_error
-        misses = error is not None and error >= MAX_ERROR
+        is_large = error is not None and error >= MAX_ERROR
         fit = "the reprojection error is unknown" if error is None else f"cameras fit the points to {error:,.4g} px"
-        poses = {"start": POSES_START * training.steps // STEPS} if misses else None
-        reason = f"{fit}: poses {'are optimized' if misses else 'stay as they are'}"
+        poses = {"start": POSES_START * training.steps // STEPS} if is_large else None
+        reason = f"{fit}: poses {'are optimized' if is_large else 'stay as they are'}"
         yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=reason, matters=error is not None)
-        exposure = {"when": "auto"} if misses else {"when": "auto", "min_spread": 0.2}
-        reason = f"{fit}: {'small' if misses else 'only large'} differences of exposure are corrected"
+        exposure = {"when": "auto"} if is_large else {"when": "auto", "min_spread": 0.2}
+        reason = f"{fit}: {'small' if is_large else 'only large'} differences of exposure are corrected"
         yield Decision(key="optimize.modules.exposure", value=exposure, reason=reason, matters=False)
 
 
 def _max_per_pixel(measures: Measures) -> tuple[float, str]:
-    """Return how many Gaussians per pixel few photos can constrain, and the reason."""
+    """Return how many Gaussians per pixel a small set of photos can constrain, and the reason as text."""
     sky = measures.sky
     count = next(count for fraction, count in MAX_PER_PIXEL if (sky or 0.0) >= fraction)
     sky_text = "" if sky is None else f", {sky:.0%} of them with sky"

@@ -1,6 +1,6 @@
-"""Define where the cells of a matrix run: the keys of `execution:`, and of a file given by `--on`.
+"""Define where the cells of a matrix run: the keys of `execution:` and of a file given by `--on`.
 
-A pipeline file may come from a stranger, so it names neither other machines nor folders outside of the run folder.
+A pipeline file may come from a stranger, so it cannot name other machines or folders outside of the run folder.
 """
 
 import re
@@ -74,7 +74,7 @@ class LocalExecution(Settings):
 
     @model_validator(mode="after")
     def _refuse_unused_keys(self) -> "LocalExecution":
-        """Refuse keys without an effect."""
+        """Raise ValueError for a key that has no effect but is not at its default."""
         for key, reason in self._unused_keys().items():
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; leave it out")
@@ -92,7 +92,7 @@ class LocalExecution(Settings):
 
 
 class Execution(LocalExecution):
-    """Where the cells of a matrix run, and where they are kept."""
+    """Where the cells of a matrix run, and where they are stored."""
 
     engine: Annotated[str, BeforeValidator(_check_engine), Field(pattern=ENGINE)] = "inline"
     """inline: one after another in this process; local: one process per device of this machine; dask://HOST:PORT or
@@ -114,7 +114,7 @@ class Execution(LocalExecution):
 
     @model_validator(mode="after")
     def _refuse_unsafe_scheduler(self) -> "Execution":
-        """Refuse a scheduler that anyone could reach."""
+        """Raise ValueError for a scheduler that anyone could reach."""
         if self.engine.startswith("dask://") and not self.is_local and not self.insecure:
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
         if self.engine.startswith("tls://") and self.tls is None:
@@ -159,7 +159,7 @@ class Execution(LocalExecution):
 
 
 def read_execution(file: Path | None) -> dict[str, Any] | None:
-    """Return the checked keys of an execution file as plain data; None without a file.  Raises ConfigError."""
+    """Return the keys of a valid execution file as plain data, or None without a file.  Raises ConfigError."""
     if file is None:
         return None
     document = read_yaml(file)
@@ -173,7 +173,7 @@ def read_execution(file: Path | None) -> dict[str, Any] | None:
 
 
 def from_options(values: dict[str, Any]) -> Execution:
-    """Check the options of `clsplat worker`.  Raises ConfigError with the option."""
+    """Create an Execution from the options of `clsplat worker`.  Raises ConfigError with the name of the option."""
     try:
         return Execution.model_validate(values)
     except ValidationError as error:

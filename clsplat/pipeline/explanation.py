@@ -1,4 +1,4 @@
-"""Explain a failed validation in one sentence: file, line, key, expectation, nearest match."""
+"""Explain a failed validation in one sentence: the file, line, and key, what is expected, and the nearest match."""
 
 import difflib
 import re
@@ -41,8 +41,8 @@ def bases(annotation: Any) -> list[type[Settings]]:
 
 def is_union(annotation: Any) -> bool:
     """Return whether an annotation allows several types, not counting null."""
-    types_ = typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else ()
-    return len([type_ for type_ in types_ if type_ is not types.NoneType]) > 1
+    members = typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else ()
+    return len([member for member in members if member is not types.NoneType]) > 1
 
 
 def annotation_of(field: FieldInfo) -> Any:
@@ -58,7 +58,7 @@ def annotations(model: type[BaseModel]) -> dict[str, Any]:
 
 @lru_cache(maxsize=1024)
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    """Return the names of the model in pipeline files; empty if it is not a variant."""
+    """Return the names of a model in pipeline files; an empty tuple if it is not a variant."""
     field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
     return typing.get_args(field.annotation) if field else ()
 
@@ -71,16 +71,16 @@ def item_annotation(annotation: Any) -> Any:
 
 
 def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
-    """Return the model that the tag of plain data selects; None if it is unknown."""
-    allowed = models(annotation)
-    if len(allowed) > 1 and isinstance(data, dict):
+    """Return the model that the tag in plain data selects, or None if the tag is unknown."""
+    candidates = models(annotation)
+    if len(candidates) > 1 and isinstance(data, dict):
         names = [data[name] for name in TAGS if name in data]
-        allowed = [model for model in allowed for name in names if name in tags(model)]
-    return allowed[0] if len(allowed) == 1 else None
+        candidates = [model for model in candidates for name in names if name in tags(model)]
+    return candidates[0] if len(candidates) == 1 else None
 
 
 def with_tags(data: Any, annotation: Any) -> Any:
-    """Return plain data with each bare variant name as {type: name}, and each stage as {stage: name, …}."""
+    """Return plain data with each name of a variant as {type: name}, and each stage as {stage: name, key: value, …}."""
     if not isinstance(data, list | dict | str):
         return data
     if isinstance(data, list):
@@ -93,8 +93,8 @@ def with_tags(data: Any, annotation: Any) -> Any:
             if name != "stage" and isinstance(fields, dict | None):
                 data = {"stage": name, **(fields or {})}
     if isinstance(data, dict) and (model := model_of(data, annotation)):
-        types_ = annotations(model)
-        return {key: with_tags(value, types_.get(key)) for key, value in data.items()}
+        by_key = annotations(model)
+        return {key: with_tags(value, by_key.get(key)) for key, value in data.items()}
     return data
 
 
@@ -121,16 +121,16 @@ EXPECTATIONS = {
 
 
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
-    """Describe the first fault, with its file and line."""
+    """Return a message about the first fault, with its file, line, and key."""
     key_path, complaint = first_fault(error, root)
-    where = f"{key_path_text(key_path)}: " if key_path else ""  # else the file as a whole
-    return f"{path}:{document.line(key_path)}: {where}{complaint}"
+    prefix = f"{key_path_text(key_path)}: " if key_path else ""  # "": a fault of the entire file
+    return f"{path}:{document.line(key_path)}: {prefix}{complaint}"
 
 
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
-    """Return the first fault, with its key path in the file.
+    """Return the key path and a description of the first fault.
 
-    A misspelled key comes before a missing key, because it is often its cause.
+    A misspelled key comes before a missing key, because the first often causes the second.
     """
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     key_path, model, annotation = _follow(first["loc"], root)
@@ -142,30 +142,31 @@ def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] 
     if kind == "extra_forbidden":
         if advice := getattr(model, "unavailable", {}).get(key_path[-1]):
             return str(advice)
-        known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
-        return f"unknown key {quote(key_path[-1])}{_nearest(str(key_path[-1]), known)}"
+        keys = [name for name in (model.model_fields if model else {}) if name not in TAGS]
+        return f"unknown key {quote(key_path[-1])}{_nearest(str(key_path[-1]), keys)}"
     if kind == "missing":
         return f"'{key_path[-1]}' is missing"
     if kind == "union_tag_invalid":
-        known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
+        names = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shorten(str(error["ctx"]["tag"]))
-        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; plug-ins need --plugin FILE.py"
+        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, names)}; plug-ins need --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"
-    got = f", got {quote(value)}"
+    suffix = f", got {quote(value)}"
     if kind in EXPECTATIONS:
-        return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{got}"
+        return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{suffix}"
     message = error["msg"].removeprefix("Value error, ")
     message = f"{message[:1].lower()}{message[1:]}"
-    return message if isinstance(value, dict | list) else message + got
+    return message if isinstance(value, dict | list) else message + suffix
 
 
-def _nearest(word: str, known: list[str]) -> str:
-    matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+def _nearest(name: str, names: list[str]) -> str:
+    """Return a hint at the name that is most similar to an unknown name, or a list of all names."""
+    matches = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if matches:
         return f"; did you mean '{matches[0]}'?"
-    return f"; expected one of {', '.join(sorted(known))}" if known else "; remove it: no keys are allowed here"
+    return f"; expected one of {', '.join(sorted(names))}" if names else "; remove it: no keys are allowed here"
 
 
 def _kind(annotation: Any) -> str:
@@ -185,9 +186,9 @@ def key_path_text(key_path: KeyPath) -> str:
 
 
 def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[KeyPath, type[BaseModel] | None, Any]:
-    """Translate pydantic's location, which names union members, into a key path of the file.
+    """Translate pydantic's location, which includes the names of union members, into a key path of the file.
 
-    Also return the model that holds the key, and the key's annotation.  In the file the name of a stage is a key
+    Also return the model that contains the key, and the key's annotation.  In the file, the name of a stage is a key
     (stages[1].optimize.steps), while the type of a loss or rule is not.
     """
     key_path: list[str | int] = []
@@ -195,12 +196,12 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Key
     model: type[BaseModel] | None = root
     for part in location:
         members = models(annotation)
-        tagged = [m for m in members if part in tags(m)]
+        matches = [member for member in members if part in tags(member)]
         if isinstance(part, int):
             key_path.append(part)
             annotation = item_annotation(annotation)
-        elif tagged and not (len(members) == 1 and part in members[0].model_fields):
-            annotation = model = tagged[0]
+        elif matches and not (len(members) == 1 and part in members[0].model_fields):
+            annotation = model = matches[0]
             if "stage" in model.model_fields:
                 key_path.append(part)
         elif not members and is_union(annotation):

@@ -74,34 +74,34 @@ class SceneSettings(Settings):
 
     @property
     def downscales(self) -> tuple[float, ...]:
-        """Divisors of the original image size in training, ascending."""
+        """The divisors of the original image size in training, in ascending order."""
         return tuple(self.downscale * 2**level for level in range(self.levels))
 
     @property
     def folder(self) -> Path:
-        """Folder of the dataset.  Raises ConfigError if it was not given."""
+        """The folder of the dataset.  Raises ConfigError if no scene is set."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
         return Path(self.path)
 
     @property
     def split(self) -> Split:
-        """The views for training, validation and testing."""
+        """The views for training, validation, and testing."""
         lists = None if self.path is None else Path(self.path)
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
     def apply_masks(self, scene: Scene) -> Scene:
-        """Return a scene with the masks of these settings.  Raises DataError if the folder has no masks for it."""
+        """Return a scene with the masks of these settings.  Raises DataError if their folder has no masks for it."""
         return with_masks(scene, None if self.masks is None else Path(self.masks))
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
-        """Read a scene with these settings; return it and its background.  Raises DataError."""
+        """Read a scene with these settings, and return it with its background.  Raises DataError."""
         return self.apply(read_scene(folder, self.split))
 
     def apply(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with these settings of alpha, masks and extent, and its background.  Raises DataError."""
-        changed = replace(self.apply_masks(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
-        return changed, scene.background if self.background == "auto" else self.background
+        """Return a scene with these settings of alpha, masks, and extent, and its background.  Raises DataError."""
+        new_scene = replace(self.apply_masks(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
+        return new_scene, scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):
@@ -127,7 +127,7 @@ class RasterizerSettings(Settings):
         return {ON_HOST} if self.harmonics == "host" else set()
 
     def limits(self) -> RenderLimits | None:
-        """Return the rasterizer's limits of memory and launches; None for the defaults."""
+        """Return the rasterizer's limits on memory and launches, or None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
@@ -172,25 +172,28 @@ class PipelineFile(Settings):
 
     def check_conflicts(self) -> None:
         """Raise ConfigError for the first two settings that exclude each other according to their classes."""
-        parts = list(iter_settings(self))
-        for path, part in parts:
-            part.check_pipeline(self)
-            for name, reason in part.active_conflicts().items():
-                for other, rival in parts:
-                    is_elsewhere = other.startswith("stages[") and other.partition(".")[0] != path.partition(".")[0]
+        items = list(iter_settings(self))
+        for path, settings in items:
+            settings.check_pipeline(self)
+            for name, reason in settings.active_conflicts().items():
+                for rival_path, rival in items:
+                    stage, rival_stage = path.partition(".")[0], rival_path.partition(".")[0]
+                    is_elsewhere = rival_stage.startswith("stages[") and rival_stage != stage
                     if name in rival.conflict_names() and not is_elsewhere:
-                        label = getattr(part, "type", getattr(part, "stage", path))
+                        label = getattr(settings, "type", getattr(settings, "stage", path))
                         remedy = "" if ";" in reason else "; leave one of them out"
-                        raise ConfigError(
-                            f"{path}: '{label}' cannot be combined with {name} ({other}): {reason}{remedy}"
-                        )
+                        text = f"{path}: '{label}' cannot be combined with {name} ({rival_path}): {reason}{remedy}"
+                        raise ConfigError(text)
 
     @property
     def harmonics(self) -> Harmonics:
-        """Where spherical harmonics are stored; `auto`: on the device if a stage needs them there, or at degree 0."""
-        setting = self.rasterizer.harmonics
-        is_needed = any(ON_HOST in part.active_conflicts() for _, part in iter_settings(self.stages))
-        return "device" if setting == "auto" and (self.model.sh_degree == 0 or is_needed) else setting
+        """Where spherical harmonics are stored.
+
+        `auto` becomes `device` if a stage needs them there, or at degree 0.
+        """
+        harmonics = self.rasterizer.harmonics
+        is_needed = any(ON_HOST in settings.active_conflicts() for _, settings in iter_settings(self.stages))
+        return "device" if harmonics == "auto" and (self.model.sh_degree == 0 or is_needed) else harmonics
 
     @property
     def training(self) -> Training:

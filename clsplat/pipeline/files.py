@@ -1,7 +1,7 @@
-"""Find the files of pipelines, by path or by the name of a shipped one.
+"""Find pipeline files by path, or by the name of a shipped pipeline.
 
 A file NAME.yaml with the key `short` defines two pipelines, NAME and NAME_7k.  The path of the second is NAME_7k.yaml,
-which does not exist on disk: `read_pipeline` makes its text from NAME.yaml.
+which does not exist on disk: `read_pipeline` creates its text from NAME.yaml.
 """
 
 import difflib
@@ -30,7 +30,7 @@ def origin(path: Path) -> Path:
 
 
 def find(name: str) -> Path:
-    """Return the file of a pipeline given by path or by the name of a shipped one.  Raises ConfigError."""
+    """Return the file of a pipeline, given its path or the name of a shipped pipeline.  Raises ConfigError."""
     path = Path(name)
     try:
         is_folder = path.is_dir()
@@ -56,6 +56,6 @@ def find(name: str) -> Path:
         remedy = f"to train on it, use `clsplat run splat_7k --scene {shell_quote(path)}`"
         raise ConfigError(f"{path}: is a folder; expected a pipeline file; {remedy}")
     matches = difflib.get_close_matches(name, files, n=1)
-    unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"
-    hint = f"; did you mean '{matches[0]}'?" if matches else unknown
+    advice = ", and no such file or folder; `clsplat pipelines` lists pipelines"
+    hint = f"; did you mean '{matches[0]}'?" if matches else advice
     raise ConfigError(f"no pipeline named {quote(name)}{hint}")

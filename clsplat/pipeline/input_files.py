@@ -1,4 +1,4 @@
-"""Hash the files that a pipeline names, so that runs are compared by content rather than by path."""
+"""Hash the input files of a pipeline, so that runs are compared by content rather than by path."""
 
 import hashlib
 import os
@@ -19,13 +19,13 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import fingerprint
 from clsplat.scene.images import is_image
 
-Change = Callable[[str, Path], str]  # of a path as text, and as the path it refers to, to another text
+Change = Callable[[str, Path], str]  # maps a setting and the path to which it refers to a new setting
 
 
 def with_content_hashes(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the resolved pipeline with the content hash instead of the path of each file that it reads.
+    """Return the resolved pipeline with each input path replaced by a hash of its content.
 
-    The folder of the scene is left out, since a scene is identified by its content.  Raises DataError for unreadable
+    The folder of the scene is omitted, because a scene is identified by its content.  Raises DataError for unreadable
     files.
     """
     return _map_paths(pipeline, lambda text, path: hash_content(path) or text, None).resolved()
@@ -38,7 +38,7 @@ def with_absolute_paths(pipeline: Pipeline) -> Pipeline:
 
 
 def content_hashes(pipeline: Pipeline) -> dict[str, str]:
-    """Return the hash of each readable input file, by the text of its path."""
+    """Return the hashes of the readable input files, by the text of their paths in the pipeline."""
     hashes: dict[str, str] = {}
 
     def add(text: str, path: Path) -> str:
@@ -52,7 +52,7 @@ def content_hashes(pipeline: Pipeline) -> dict[str, str]:
 
 
 def hash_content(path: Path) -> str:
-    """Return a hash of a file, of a model and its side files, or of a folder of images; "" if the path does not exist.
+    """Return a hash of a file, of a model with its side files, or of a folder of images; "" if the path does not exist.
 
     Raises DataError for other folders, and for files that cannot be read.
     """
@@ -89,9 +89,9 @@ def _map_paths(pipeline: Pipeline, change: Change, scene: str | None) -> Pipelin
     """Return the pipeline with its input paths mapped by `change`, and with `scene` as its scene folder."""
     settings = pipeline.settings
     without_scene = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
-    changed = _map_value(without_scene, settings.scene.path, change)
-    moved = changed.scene.model_copy(update={"path": scene})
-    return replace(pipeline, settings=changed.model_copy(update={"scene": moved}))
+    new_settings = _map_value(without_scene, settings.scene.path, change)
+    new_scene = new_settings.scene.model_copy(update={"path": scene})
+    return replace(pipeline, settings=new_settings.model_copy(update={"scene": new_scene}))
 
 
 def _map_value(value: Any, scene: str | None, change: Change) -> Any:

@@ -1,4 +1,4 @@
-"""Load pipeline files as checked stages, and write the resolved pipeline of a run folder."""
+"""Load and check pipeline files, and apply overrides and the decisions of `adapt:`."""
 
 import copy
 import logging
@@ -30,7 +30,7 @@ LOG = logging.getLogger("clsplat")
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A checked pipeline."""
+    """A pipeline whose settings have been checked."""
 
     path: Path
     settings: PipelineFile
@@ -39,7 +39,7 @@ class Pipeline:
 
     @property
     def names(self) -> list[str]:
-        """The names of its preparation steps and stages, in order."""
+        """The names of the preparation steps and stages, in order."""
         return [*(step.stage for step in self.settings.prepare), *(stage.stage for stage in self.stages)]
 
     @property
@@ -58,13 +58,16 @@ class Pipeline:
 
     @property
     def undecided(self) -> list[str]:
-        """The keys that the photos will decide."""
+        """The keys whose values will be decided from the photos."""
         if (adapt := self.settings.adapt) is None or adapt.decisions is not None:
             return []
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
 
     def preparation(self, out: Path) -> list[PlannedStep]:
-        """Return the preparation steps of a run in `out`, with reasons to run.  Raises DataError or ConfigError."""
+        """Return the preparation steps of a run in `out`, each with the reason to run it, if any.
+
+        Raises DataError or ConfigError.
+        """
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:
             raise ConfigError(
@@ -74,32 +77,33 @@ class Pipeline:
         return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
-        """Return every setting with its value, as plain data with the structure of a file."""
+        """Return all settings with their values, as plain data with the structure of a pipeline file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untag_stage(stage) for stage in data[key]] for key in STAGE_LISTS}
         return {key: value for key, value in data.items() if value or key not in ("plugins", "adapt")}
 
     def text(self) -> str:
-        """Return the text of the resolved file."""
+        """Return the resolved pipeline as YAML."""
         return yaml_text(self.resolved())
 
 
 def prepared_folder(out: Path) -> Path:
-    """Return the folder for the results of `prepare:`, next to the run folder and shared by the runs there."""
+    """Return the folder for the results of `prepare:`, next to the run folder `out` and shared by the runs there."""
     return out.absolute().parent / PREPARED
 
 
 def load(name: str, overrides: list[str] | None = None) -> Pipeline:
-    """Read and check a pipeline, by path or by the name of a shipped one; `overrides` are 'stage.key=value'.
+    """Read and check a pipeline, given its path or the name of a shipped pipeline.
 
-    Raises ConfigError with file, line, key and the nearest match.
+    overrides: settings as for `--set`, such as 'optimize.steps=500'.
+    Raises ConfigError with the file, line, key, and nearest match.
     """
     path = find(name)
     return check_document(path, read_yaml(path), overrides or [])
 
 
 def check_document(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
-    """Check a document with overrides, without changing it.  Raises ConfigError as `load` does."""
+    """Return the pipeline in a document with overrides; the document stays unchanged.  Raises ConfigError as `load`."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = _tag_file(document, path)
@@ -113,7 +117,7 @@ def check_document(path: Path, document: Document, overrides: Sequence[str] = ()
 
 
 def _without_done_steps(pipeline: Pipeline) -> Pipeline:
-    """Return the pipeline without `prepare` where the scene has cameras already, and log that."""
+    """Return the pipeline without `prepare` if the scene already has cameras, and log that."""
     steps, scene = pipeline.settings.prepare, pipeline.settings.scene
     if not steps or scene.path is None or not steps[0].is_done_in(scene.folder):
         return pipeline
@@ -123,8 +127,8 @@ def _without_done_steps(pipeline: Pipeline) -> Pipeline:
 
 
 def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:
-    if isinstance(recorded := data.get("plugins"), dict):
-        plugins.require({str(name): str(digest) for name, digest in recorded.items()}, str(path))
+    if isinstance(record := data.get("plugins"), dict):
+        plugins.require({str(name): str(digest) for name, digest in record.items()}, str(path))
     try:
         settings = PipelineFile.model_validate(data)
     except ValidationError as error:
@@ -134,21 +138,21 @@ def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineF
         settings.check_conflicts()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    parts = [part for _, part in iter_settings(settings)]
-    kinds = {*map(type, parts), *(kind for part in parts if isinstance(part, Rule) for kind in part.columns)}
+    nested = [inner for _, inner in iter_settings(settings)]
+    kinds = {*map(type, nested), *(kind for inner in nested if isinstance(inner, Rule) for kind in inner.columns)}
     return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
 
 
 def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
-    """Raise the error of the file without overrides, or that of the first invalid override."""
-    known_paths = [key.key_path for key in list_keys(_validate(data, path, document))]
+    """Raise the error of the file without overrides, or else the error of the first invalid override."""
+    all_paths = [key.key_path for key in list_keys(_validate(data, path, document))]
     conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
     for override in overrides:
         names, _ = split(override)
         try:
             key_path = apply(data, override, PipelineFile)
         except NoSuchKey as error:
-            raise OverrideError(override, error.reason + suggestion(names, known_paths)) from error
+            raise OverrideError(override, error.reason + suggestion(names, all_paths)) from error
         try:
             settings = PipelineFile.model_validate(data)
             _check_order(path, settings)
@@ -166,38 +170,41 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
         raise OverrideError(conflict[0], one_line(conflict[1]).removeprefix(f"{path}: ")) from conflict[1]
 
 
-# Settings that follow from the photos: decided once, as if by `--set`, and decided again for other photos.
+# Settings that follow from the photos.  They are decided once, as if by `--set`, and again if the photos change.
 
 AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
-LENGTHS = ("near", "unit")  # keys that a run replaces by numbers if they are `auto`
+LENGTHS = ("near", "unit")  # keys that a run replaces by lengths if they are `auto`
 
 
 def apply_adaptation(pipeline: Pipeline, measures: Measures) -> Pipeline:
-    """Return the pipeline with the decisions of its `adapt`; existing decisions are kept.  Raises ConfigError."""
+    """Return the pipeline with the decisions of its `adapt`; existing decisions stay.  Raises ConfigError."""
     adapt = pipeline.settings.adapt
     return with_decisions(pipeline, adapt.decide(pipeline.settings.optimize, measures)) if adapt else pipeline
 
 
 def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipeline:
-    """Return the pipeline with decisions, except for keys it keeps and existing decisions.  Raises ConfigError."""
+    """Return the pipeline with decisions, except for the keys in `adapt.keep`; existing decisions stay.
+
+    Raises ConfigError.
+    """
     if (adapt := pipeline.settings.adapt) is None or adapt.decisions is not None:
         return pipeline
     data = pipeline.settings.model_dump(mode="json")
-    new = [decision for decision in decisions if decision.key not in adapt.keep]
+    new_decisions = [decision for decision in decisions if decision.key not in adapt.keep]
     try:
-        for decision in new:
+        for decision in new_decisions:
             apply(data, decision.override, PipelineFile)
-        data["adapt"]["decisions"] = [decision.model_dump() for decision in new]
+        data["adapt"]["decisions"] = [decision.model_dump() for decision in new_decisions]
         return replace(pipeline, settings=_validate(data, pipeline.path, Document(data)))
     except ConfigError as error:
-        keys = ", ".join(decision.key for decision in new)
+        keys = ", ".join(decision.key for decision in new_decisions)
         raise ConfigError(
             f"adapt: {adapt.type}: {one_line(error)}; override one of its keys with --set: {keys}"
         ) from error
 
 
 def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> PipelineFile:
-    """Let `adapt` keep the keys that overrides set.  Raises ConfigError if it decides a key that does not exist."""
+    """Add the keys that overrides set to `adapt.keep`.  Raises ConfigError if `adapt` decides an unknown key."""
     if (adapt := settings.adapt) is None:
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
@@ -217,13 +224,13 @@ def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> Pip
 
 
 def without_decisions(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data without the decisions of a run, so that they are made again."""
+    """Return a file's data without the decisions of a run, so that the next run decides again."""
     adapt = data.get("adapt")
     return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
 
 
 def without_auto(data: Any) -> Any:
-    """Return plain data of a resolved pipeline without the choices of keys that are `auto`."""
+    """Return plain data of a resolved pipeline without the values that a run chose for keys that are `auto`."""
     if isinstance(data, list):
         return [without_auto(item) for item in data]
     if not isinstance(data, dict):
@@ -259,8 +266,8 @@ def _tag_stage(item: Any, key_path: tuple[str | int, ...], document: Document, p
     name, fields = next(iter(item.items()))
     fields = dict(fields or {})
     if "stage" in fields:
-        inner = (*key_path, name, "stage")
-        raise ConfigError(f"{path}:{document.line(inner)}: {key_path_text(inner)}: unknown key 'stage'; remove it")
+        tag = (*key_path, name, "stage")
+        raise ConfigError(f"{path}:{document.line(tag)}: {key_path_text(tag)}: unknown key 'stage'; remove it")
     if isinstance(fields.get("during"), list):
         fields["during"] = [
             _tag_stage(inner, (*key_path, name, "during", i), document, path)
@@ -279,7 +286,7 @@ def _untag_stage(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _explain_late_stage(stages: Sequence[Stage], need: str) -> str:
-    """Explain which stage inside `during` makes what another needs, but too late; "" if there is none."""
+    """Return a text about a stage in `during` that would make `need`, but too late; "" if there is none."""
     step = 0
     for training in stages:
         if not isinstance(training, Training):
@@ -315,7 +322,7 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
         removed |= dict.fromkeys(available & stage.removes, f"stages[{i}] {stage.stage}")
         available = (available - stage.removes) | stage.makes
         if isinstance(stage, Training):
-            available.update(part for inner in stage.active_stages(step) for part in inner.makes)
+            available.update(output for inner in stage.active_stages(step) for output in inner.makes)
             step += stage.steps
     if file := find_output_conflict(settings.stages):
         raise ConfigError(f"{path}: two stages write '{file}'; give one of them another name")

@@ -1,4 +1,4 @@
-"""Read a pipeline file with `matrix:`, which describes one run per combination of pipelines, scenes, settings, seeds.
+"""Read a pipeline file with `matrix:`: one run for each combination of pipelines, scenes, settings, and seeds.
 
     name: ablation
     matrix:
@@ -9,7 +9,7 @@
         densify.every: [100, 200]
       steps: 2000                              # per cell; schedules are stretched to fit
 
-Each cell runs in its own folder in the run folder.  Its name has its value on each axis.
+Each run is a cell of the matrix, in a separate subfolder of the run folder.  Its name contains its value on each axis.
 """
 
 import itertools
@@ -34,7 +34,7 @@ from clsplat.pipeline.loading import Pipeline, check_document
 from clsplat.pipeline.stretching import stretch_to_steps
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
-# Short labels for the values of a matrix, from which the names of its cells are made.
+# Short labels for the values of a matrix, of which the names of its cells consist.
 
 
 def shortest_labels(paths: Sequence[tuple[str, ...]]) -> list[str]:
@@ -47,7 +47,7 @@ def shortest_labels(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value as part of a name."""
+    """Format a value for the name of a cell."""
     if isinstance(value, list):
         return "+".join(value_text(item) for item in value)
     return value if isinstance(value, str) else json.dumps(value)
@@ -96,19 +96,19 @@ class MatrixFile(Settings):
 
 @dataclass(frozen=True)
 class Cell:
-    """One run."""
+    """A run of a matrix."""
 
-    name: str  # of its folder
+    name: str  # also of its folder
     pipeline: Pipeline
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """All runs of a file."""
+    """All runs of a file with `matrix:`."""
 
     path: Path
     name: str
-    text: str  # of the file, with the options of the command
+    text: str  # content of the file, with the options of the command
     cells: list[Cell]
     execution: Execution = field(default_factory=Execution)
 
@@ -125,10 +125,10 @@ class _Choice:
 def load_experiment(
     name: str, overrides: Sequence[str] = (), execution: dict[str, Any] | None = None
 ) -> Experiment | None:
-    """Read and check a pipeline file with `matrix:` and all its cells; None for a file without `matrix:`.
+    """Read and check a pipeline file with `matrix:` and all its cells; return None for a file without `matrix:`.
 
-    execution: keys that replace those of the file, and are left out of the text of the experiment, which may be shared.
-    Raises ConfigError with file and line.
+    execution: keys that replace the file's `execution:`; the experiment's text, which may be shared, omits them.
+    Raises ConfigError with the file and line.
     """
     path = find(name)
     document = read_yaml(path)
@@ -158,13 +158,13 @@ def load_experiment(
         execution = document.data.get("execution", {})
     else:
         data.pop("execution", None)
-    chosen = Execution.model_validate(execution)
-    return Experiment(path, file.name, yaml_text(data) if has_options else read_pipeline(path), cells, chosen)
+    text = yaml_text(data) if has_options else read_pipeline(path)
+    return Experiment(path, file.name, text, cells, Execution.model_validate(execution))
 
 
 @dataclass(frozen=True)
 class _Base:
-    """The pipeline of some cells, before their settings."""
+    """A pipeline of the matrix, before the settings of its cells are applied."""
 
     label: str  # "" for the file with the matrix
     path: Path
@@ -198,9 +198,9 @@ def _axes(matrix: Matrix) -> list[list[_Choice]]:
             for i, (label, scene) in enumerate(zip(labels, matrix.scenes, strict=True))
         ])  # fmt: skip
     keys = shortest_labels([tuple(key.split(".")) for key in matrix.set])
-    for short, (key, values) in zip(keys, matrix.set.items(), strict=True):
+    for short_key, (key, values) in zip(keys, matrix.set.items(), strict=True):
         axes.append([
-            _Choice(f"{short}={value_text(value)}", _override(key, value), ("matrix", "set", key, i))
+            _Choice(f"{short_key}={value_text(value)}", _override(key, value), ("matrix", "set", key, i))
             for i, value in enumerate(values)
         ])  # fmt: skip
     if matrix.seeds:
@@ -212,8 +212,8 @@ def _axes(matrix: Matrix) -> list[list[_Choice]]:
 
 
 def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> Cell:
-    parts = [base.label, *(choice.label for choice in choices)]
-    name = re.sub(r"[^\w.=+-]+", "_", "-".join(part for part in parts if part))
+    labels = [base.label, *(choice.label for choice in choices)]
+    name = re.sub(r"[^\w.=+-]+", "_", "-".join(label for label in labels if label))
     try:
         pipeline = check_document(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
     except OverrideError as error:

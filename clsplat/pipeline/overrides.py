@@ -21,7 +21,7 @@ from clsplat.pipeline.explanation import annotations, bases, item_annotation, mo
 from clsplat.pipeline.yaml_file import KeyPath, parse_value
 
 MAX_SUGGESTIONS = 3
-MAX_PARTS = 32  # of a key path; those of the settings have up to ten
+MAX_PARTS = 32  # in a key path; the longest in the settings has ten
 NOT_SETTABLE = {"plugins": "runs write it; load a plug-in with --plugin FILE"}
 
 
@@ -30,7 +30,7 @@ class NoSuchKey(OverrideError):
 
 
 def split(text: str) -> tuple[list[str], str]:
-    """Return the parts of the key path, and the value.  Raises OverrideError."""
+    """Split KEY=VALUE into the parts of the key path and the value.  Raises OverrideError."""
     key_path, equals, value = text.partition("=")
     names = re.findall(r"[^.\[\]]+", key_path)
     if not equals or not 0 < len(names) <= MAX_PARTS:
@@ -39,33 +39,33 @@ def split(text: str) -> tuple[list[str], str]:
 
 
 def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
-    """Apply `KEY=VALUE` to a file's data, whose stages have the form {stage: NAME, …}; return the key path in the file.
+    """Apply `KEY=VALUE` to a file's data in place, and return the key path in the file.
 
-    Raises OverrideError.
+    The stages in the data have the form {stage: NAME, …}.  Raises OverrideError.
     """
     _, value = split(text)
     try:
-        parsed = parse_value(value)
+        new_value = parse_value(value)
     except ConfigError as error:
         raise OverrideError(text, f"cannot read the value: {error}") from error
     node, last = _parent(data, text, root)
     if isinstance(node.data, list) and node.is_keyed(last):
-        node.put(last, parsed, text)
+        node.put(last, new_value, text)
         return (*node.key_path, last)
     if isinstance(node.data, list):
         i = node.number(last, text)
-        node.data[i] = with_tags(parsed, node.items)
+        node.data[i] = with_tags(new_value, node.items)
         return (*node.key_path, i)
     if not isinstance(node.data, dict):
         raise NoSuchKey(text, f"{quote(node.key_path[-1])} has no keys")
     if not node.key_path and last not in root.model_fields:
         raise NoSuchKey(text, f"no key {quote(last)} at the top of a pipeline")
-    node.data[last] = with_tags(parsed, node.annotation(last))
+    node.data[last] = with_tags(new_value, node.annotation(last))
     return (*node.key_path, last)
 
 
 def _parent(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_Node, str]":
-    """Return the node that holds the key of 'key=value', and the key's name there.  Raises OverrideError."""
+    """Return the node that contains the key of KEY=VALUE, and the last part of the key.  Raises OverrideError."""
     names, _ = split(text)
     if names[0] in NOT_SETTABLE:
         raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
@@ -76,7 +76,7 @@ def _parent(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_N
 
 
 class _Node:
-    """A dict or list of the data, with its annotation and its key path in the file."""
+    """A dict or list in a file's data, with its annotation and its key path in the file."""
 
     def __init__(self, data: Any, annotation: Any, key_path: KeyPath) -> None:
         self.data = data
@@ -85,7 +85,7 @@ class _Node:
         self.items = item_annotation(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":
-        """Return the node of a key, which is created from its default if missing.  Raises OverrideError."""
+        """Return the node of a key; a missing one is created from its default.  Raises OverrideError."""
         if isinstance(self.data, list) and self.is_keyed(name):
             if all(item["type"] != name for item in self.data):
                 self.put(name, {}, text)
@@ -106,7 +106,7 @@ class _Node:
         return self._key(name)
 
     def is_keyed(self, name: str) -> bool:
-        """Return whether the name is the type of a list item, and not an index."""
+        """Return whether a name is the type of a list item, rather than an index."""
         keyed_by_type = any(base.keyed_by_type for base in bases(self.items))
         return (
             keyed_by_type
@@ -115,7 +115,7 @@ class _Node:
         )
 
     def put(self, name: str, value: Any, text: str) -> None:
-        """Insert a list item at the position of its type, or replace the item of that type; None removes it.
+        """Insert a list item of a type in order, or replace the item of that type; the value None removes it.
 
         Raises OverrideError.
         """
@@ -138,7 +138,7 @@ class _Node:
         self.data.insert(index, with_tags(item, self.items))
 
     def number(self, name: str, text: str) -> int:
-        """Return a name as an index of the list.  Raises OverrideError."""
+        """Parse a name as an index of the list.  Raises OverrideError."""
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
         count = len(self.data)
@@ -149,12 +149,12 @@ class _Node:
         return dict(self.model.model_fields) if self.model else {}
 
     def annotation(self, name: str) -> Any:
-        """Return the annotation of a key; None if unknown."""
+        """Return the annotation of a key, or None if the key is unknown."""
         return annotations(self.model).get(name) if self.model else None
 
     def _key(self, name: str) -> "_Node":
         annotation = self.annotation(name)
-        self.data[name] = with_tags(self.data[name], annotation)  # a bare name has no keys
+        self.data[name] = with_tags(self.data[name], annotation)  # a name alone has no keys
         return _Node(self.data[name], annotation, (*self.key_path, name))
 
     def _item(self, i: int) -> "_Node":
@@ -163,7 +163,7 @@ class _Node:
         return _Node(item, self.items, (*self.key_path, i, *name))
 
     def _stages(self) -> "list[_Node]":
-        """Return the stages in the lists of a map."""
+        """Return the nodes of the stages in all lists of a map."""
         lists = [
             self._key(key)
             for key, value in self.data.items()
@@ -178,9 +178,9 @@ class _Node:
         return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
-        """Return the stage with a name, here or, at the top, inside another stage.
+        """Return the node of the stage with a name, or None.  At the top, stages inside other stages are searched too.
 
-        Raises OverrideError if several have the name.
+        Raises OverrideError if several stages have the name.
         """
         stages = self._stages()
         matches = [node for node in stages if node.data["stage"] == name]
@@ -193,18 +193,18 @@ class _Node:
 
 
 def _to_plain(default: BaseModel) -> dict[str, Any]:
-    """Return a model as a pipeline file holds it: its tag, and the keys whose values differ from their defaults."""
-    changed = default.model_dump(mode="json", exclude_defaults=True)
-    return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **changed}
+    """Return a model as in a pipeline file: its tag, and the keys whose values differ from their defaults."""
+    values = default.model_dump(mode="json", exclude_defaults=True)
+    return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **values}
 
 
 def _address(key_path: KeyPath) -> str:
-    """Return a stage's key path with indices only, without the names of stages."""
+    """Return the address of a stage: its key path with indices, but without the names of stages."""
     return ".".join(str(part) for i, part in enumerate(key_path) if not (i and isinstance(key_path[i - 1], int)))
 
 
 def suggestion(names: Sequence[str], key_paths: Sequence[str]) -> str:
-    """Return '; did you mean …?' with the known key paths that end with `names` or resemble them; '' without any."""
+    """Return '; did you mean …?' with the key paths that end with `names` or resemble them, or '' if none do."""
     key_path = ".".join(names)
     similar = [path for path in key_paths if path.endswith(f".{key_path}")]
     similar = similar or difflib.get_close_matches(key_path, key_paths, n=1)
@@ -222,7 +222,7 @@ CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 
 @dataclass(frozen=True)
 class Key:
-    """One setting."""
+    """A setting that `--set` can change."""
 
     key_path: str  # in the syntax of --set, such as optimize.losses.0.weight
     value: Any  # plain data
@@ -235,7 +235,7 @@ class Key:
 
 
 def list_keys(settings: BaseModel) -> list[Key]:
-    """List every key of checked settings, in order."""
+    """Return all keys of checked settings, in order."""
     return list(_keys(settings, "", _addresses(settings)))
 
 
@@ -252,28 +252,28 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
             yield from _keys(value, f"{prefix}{name}.", addresses)
         elif items is not None:
             for i, item in enumerate(items):
-                part = item.type if getattr(item, "keyed_by_type", False) else i
-                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{part}") + ".", addresses)
+                key = item.type if getattr(item, "keyed_by_type", False) else i
+                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{key}") + ".", addresses)
         else:
             yield Key(prefix + name, plain.get(name), texts.get(name, ""))
 
 
 def _addresses(settings: BaseModel) -> dict[int, str]:
-    """Return the shortest key path of each stage, by id: its name, OUTER.NAME, or an index."""
-    outer = list(_stages(settings))
-    names = [stage.stage for _, stage in outer]
-    inner = [(i, list(_stages(stage))) for i, (_, stage) in enumerate(outer)]
-    inner_names = [stage.stage for _, stages in inner for _, stage in stages]
+    """Return the shortest key path of each stage, by id: its name, OUTER.NAME, or a path with an index."""
+    outer_stages = list(_stages(settings))
+    names = [stage.stage for _, stage in outer_stages]
+    inner_stages = [(i, list(_stages(stage))) for i, (_, stage) in enumerate(outer_stages)]
+    inner_names = [stage.stage for _, stages in inner_stages for _, stage in stages]
     addresses = {
-        id(stage): stage.stage if names.count(stage.stage) == 1 else key_path for key_path, stage in outer
+        id(stage): stage.stage if names.count(stage.stage) == 1 else key_path for key_path, stage in outer_stages
     }  # fmt: skip
-    for i, stages in inner:
-        siblings = [stage.stage for _, stage in stages]
-        prefix = addresses[id(outer[i][1])]
+    for i, stages in inner_stages:
+        sibling_names = [stage.stage for _, stage in stages]
+        prefix = addresses[id(outer_stages[i][1])]
         for key_path, stage in stages:
             if stage.stage not in names and inner_names.count(stage.stage) == 1:
                 addresses[id(stage)] = stage.stage
-            elif siblings.count(stage.stage) == 1:
+            elif sibling_names.count(stage.stage) == 1:
                 addresses[id(stage)] = f"{prefix}.{stage.stage}"
             else:
                 addresses[id(stage)] = f"{prefix}.{key_path}"
@@ -281,7 +281,7 @@ def _addresses(settings: BaseModel) -> dict[int, str]:
 
 
 def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
-    """Yield the stages in the lists of a model, each with its key path there."""
+    """Yield the stages in the lists of a model, each with its key path in the model."""
     for name in type(model).model_fields:
         value = getattr(model, name)
         for i, item in enumerate(value if isinstance(value, list) else []):
@@ -290,7 +290,7 @@ def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value in the syntax of --set, with as few quotes as possible."""
+    """Format a value in the syntax of --set, with as few quotes as possible."""
     text = f"[{','.join(map(value_text, value))}]" if isinstance(value, list) else str(value)
     try:
         return text if parse_value(text) == value and not isinstance(value, bool) else json.dumps(value)

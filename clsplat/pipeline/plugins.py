@@ -1,4 +1,4 @@
-"""Import plug-ins: losses, rules, filters, stages, readers and more from outside the package.
+"""Import plug-ins: losses, rules, filters, stages, readers, and more from outside the package.
 
 A plug-in is a Python file, given by `--plugin FILE.py`, or a module that an installed package names in the entry-point
 group `clsplat.plugins`.  Once it is imported, its classes can be used.  Its kernels are files next to it, which may
@@ -32,29 +32,29 @@ _loaded: dict[str, "Plugin"] = {}  # by name
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plug-in that is imported."""
+    """A plug-in that has been imported."""
 
-    name: str  # of the file without .py, or of the entry point
+    name: str  # name of the file without .py, or of the entry point
     path: Path
-    digest: str  # sha256 of its Python files, the kernel files that they name, and the headers of those
+    digest: str  # SHA-256 of its Python files, the kernel files that they name, and the headers of the kernels
     installed: bool  # from a package rather than --plugin
     kinds: tuple[type, ...]  # its classes of settings and readers
 
 
 def load_file(path: Path) -> Plugin:
-    """Import a plug-in.  Raises ConfigError, with file and line, if that fails or its name is taken."""
+    """Import a plug-in from a Python file.  Raises ConfigError if that fails or its name is already in use."""
     path = path.resolve()
     if not path.is_file():
         raise ConfigError(f"--plugin {path}: no such file; expected a Python file")
     name = f"clsplat_plugin_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}"
-    if (earlier := _loaded.get(path.stem)) is not None:
-        if earlier.path != path:
+    if (plugin := _loaded.get(path.stem)) is not None:
+        if plugin.path != path:
             raise ConfigError(
-                f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {earlier.path}; rename the file"
+                f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {plugin.path}; rename the file"
             )
-        if earlier.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
+        if plugin.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
             raise ConfigError(f"--plugin {path}: its files have changed since it was loaded; restart Python")
-        return earlier
+        return plugin
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"--plugin {path}: expected a Python file with the suffix .py")
@@ -67,22 +67,22 @@ def load_file(path: Path) -> Plugin:
 
 
 def load_installed() -> None:
-    """Import the plug-ins of installed packages, once.  Raises ConfigError if one fails."""
+    """Import the plug-ins of installed packages that are not yet imported.  Raises ConfigError if one fails."""
     for entry in entry_points(group=GROUP):
         if entry.name not in _loaded:
             _loaded[entry.name] = _load_entry(entry)
 
 
 def loaded_plugins() -> list[Plugin]:
-    """Return the plug-ins that are imported."""
+    """Return all imported plug-ins."""
     return list(_loaded.values())
 
 
 def used_by(kinds: Collection[type]) -> dict[str, str]:
     """Return the names and content hashes of the plug-ins that a run with settings of these classes uses.
 
-    These are all plug-ins from files, and installed ones that define one of the classes, a base of one, or a reader,
-    as a run may be checked before its scene is known.
+    These are all plug-ins from files, and the installed plug-ins that define one of the classes, one of their bases, or
+    a reader, because a run may be checked before its scene is known.
     """
     bases = {base for kind in kinds for base in kind.__mro__}
     return {
@@ -93,7 +93,7 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
 
 
 def require(recorded: Mapping[str, str], source: str) -> None:
-    """Raise ConfigError if a recorded plug-in is missing or has changed; `source` names the record."""
+    """Raise ConfigError if a recorded plug-in is not loaded or has changed; `source` is the file with the record."""
     if faults := differences(recorded):
         raise ConfigError(f"{source}: {faults[0]}")
 
@@ -105,14 +105,14 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
         if name not in _loaded:
             faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py")
         elif _loaded[name].digest != digest:
-            path, other = _loaded[name].path, _loaded[name].digest
-            change = f"{path} has changed since (sha256 {other[:12]}, was {digest[:12]})"
+            path, new_digest = _loaded[name].path, _loaded[name].digest
+            change = f"{path} has changed since (sha256 {new_digest[:12]}, was {digest[:12]})"
             faults.append(f"needs the plug-in '{name}', but {change}; use the earlier file")
     return faults
 
 
 def digest_of(*modules: Path) -> str:
-    """Return the sha256 of Python files, and of the kernel files and headers next to them that they name."""
+    """Return the SHA-256 of Python files and of the kernel files and headers next to them that they name."""
     digest, queue = sha256(), list(dict.fromkeys(modules))
     visited = set(queue)
     while queue:
@@ -121,9 +121,9 @@ def digest_of(*modules: Path) -> str:
         digest.update(f"{file.name}\n{len(content)}\n".encode() + content)
         references = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
         references |= {file.with_suffix(".cl")} if file in modules else set()
-        new = sorted(path for path in references if path not in visited and path.is_file())
-        queue += new
-        visited.update(new)
+        new_files = sorted(path for path in references if path not in visited and path.is_file())
+        queue += new_files
+        visited.update(new_files)
     return digest.hexdigest()
 
 
@@ -134,26 +134,26 @@ def _load_entry(entry: EntryPoint) -> Plugin:
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
         digest = digest_of(path, *files)
-    defined = [kind for classes in _class_lists() for kind in classes]
-    earlier = [kind for kind in defined if _is_within(kind.__module__, package.__name__)]  # imported by another plug-in
-    return Plugin(entry.name, path, digest, installed=True, kinds=tuple(dict.fromkeys([*kinds, *earlier])))
+    all_kinds = [kind for classes in _class_lists() for kind in classes]  # another plug-in may have imported the module
+    package_kinds = [kind for kind in all_kinds if _is_within(kind.__module__, package.__name__)]
+    return Plugin(entry.name, path, digest, installed=True, kinds=tuple(dict.fromkeys([*kinds, *package_kinds])))
 
 
 @contextmanager
 def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
-    """Yield a list that receives the classes that the block defines.
+    """Yield a list to which the classes that the block defines are added at its end.
 
-    If the block fails, or a class has the name of another, remove all that the block defined and raise ConfigError.
-    Every exception is caught except KeyboardInterrupt.
+    If the block fails or two classes have the same name, remove everything that the block defined, and raise
+    ConfigError.  Every exception except KeyboardInterrupt is converted.
     """
     kinds: list[type] = []
     lists = _class_lists()  # complete for this package, so that new classes belong to the plug-in
-    before, modules = [list(classes) for classes in lists], set(sys.modules)
+    old_lists, modules = [list(classes) for classes in lists], set(sys.modules)
     try:
         with redirect_stdout(sys.stderr):  # stdout is for results
             yield kinds
-        added = [kind for classes, old in zip(lists, before, strict=True) for kind in classes if kind not in old]
-        kinds += [kind for kind in added if not _is_within(kind.__module__, "clsplat")]
+        new_kinds = [kind for classes, old in zip(lists, old_lists, strict=True) for kind in classes if kind not in old]
+        kinds += [kind for kind in new_kinds if not _is_within(kind.__module__, "clsplat")]
         rebuild_models()
         readers()
         for kind in kinds:
@@ -162,13 +162,12 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
                 raise ConfigError(f"class {kind.__name__}: {fault}")
     except BaseException as error:
         location = _locate(module, path, error)
-        new = {
-            kind.__module__ for classes, old in zip(lists, before, strict=True) for kind in classes if kind not in old
-        }
+        new_kinds = [kind for classes, old in zip(lists, old_lists, strict=True) for kind in classes if kind not in old]
+        new_modules = {kind.__module__ for kind in new_kinds}
         for name in set(sys.modules) - modules:
-            if name in new or _is_within(name, module.partition(".")[0]):
+            if name in new_modules or _is_within(name, module.partition(".")[0]):
                 del sys.modules[name]
-        for classes, old in zip(lists, before, strict=True):
+        for classes, old in zip(lists, old_lists, strict=True):
             classes[:] = [kind for kind in classes if kind in old or _is_within(kind.__module__, "clsplat")]
         rebuild_models()
         if isinstance(error, KeyboardInterrupt):
@@ -177,7 +176,7 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
 
 
 def _class_lists() -> tuple[list[type], list[type]]:
-    """Return the lists of all settings and all readers, which importing `clsplat.pipeline.file` has filled."""
+    """Return the lists of all settings and all readers; importing `clsplat.pipeline.file` fills them."""
     return Settings.subclasses, Reader.subclasses
 
 
@@ -206,7 +205,7 @@ def _helpers(module: ModuleType, folder: Path) -> list[Path]:
 
 
 def _imports(module: ModuleType) -> list[ModuleType]:
-    """Return the modules that the import statements of a module name."""
+    """Return the modules that the import statements in a module refer to."""
     names: list[str] = []
     for node in ast.walk(ast.parse(read_file(Path(module.__file__ or ""), kind=ConfigError))):
         if isinstance(node, ast.Import):
@@ -229,19 +228,19 @@ def _locate(module: str, path: Path | None, error: BaseException) -> str:
         for frame, line in traceback.walk_tb(error.__traceback__)
     ]
     frames = [frame for frame in frames if "importlib" not in frame[0] and frame[0] not in (__name__, "contextlib")]
-    inside = [
+    plugin_frames = [
         (file, line)
         for name, file, line in frames
         if _is_within(name, module.partition(".")[0]) or (path and Path(file).is_relative_to(path.parent))
     ]
-    if inside or (frames and not isinstance(error, ClsplatError)):
-        file, line = inside[-1] if inside else frames[-1][1:]
+    if plugin_frames or (frames and not isinstance(error, ClsplatError)):
+        file, line = plugin_frames[-1] if plugin_frames else frames[-1][1:]
         return f"{file}:{line}"
     return str(path or getattr(sys.modules.get(module), "__file__", None) or module)
 
 
 def _failure(location: str, error: BaseException) -> ConfigError:
-    """Return a one-line error: file, line and reason."""
+    """Return an error with the location and the reason in one line."""
     if isinstance(error, ClsplatError):
         return ConfigError(f"{location}: {error}")
     reason = error.msg if isinstance(error, SyntaxError) else " ".join(str(error).split()) or "no message"

@@ -34,18 +34,18 @@ def summary(path: Path) -> str:
 
 
 def summaries() -> list[dict[str, str]]:
-    """Return the name, summary and path of each shipped pipeline."""
+    """Return the name, summary, and path of each shipped pipeline."""
     files = shipped_pipelines()
     return [{"name": name, "summary": summary(path), "path": str(origin(path))} for name, path in files.items()]
 
 
 def summaries_text(pipelines: list[dict[str, str]]) -> str:
-    """Return `summaries` as a table."""
+    """Format the result of `summaries` as a table."""
     return text_table(((pipeline["name"], pipeline["summary"]) for pipeline in pipelines), left_columns=2)
 
 
 def manual(name: str) -> dict[str, Any]:
-    """Return the name, summary, path and stages of a pipeline, and its keys for --set with values and descriptions.
+    """Return the name, summary, path, and stages of a pipeline, and its keys for --set with values and descriptions.
 
     Raises ConfigError.
     """
@@ -61,7 +61,7 @@ def manual(name: str) -> dict[str, Any]:
 
 
 def manual_text(pipeline: dict[str, Any]) -> str:
-    """Return a `manual` as text: each key with its value and its meaning."""
+    """Format the result of `manual` as text, with one line per key, its value, and its description."""
     keys = [Key(**key) for key in pipeline["keys"]]
     width = min(max(len(key.text) for key in keys), MAX_KEY_WIDTH)
     lines = [f"{key.text:<{width}}  {' '.join(key.description.split())}".rstrip() for key in keys]
@@ -71,7 +71,10 @@ def manual_text(pipeline: dict[str, Any]) -> str:
 
 
 def copy(name: str, file: Path) -> Path:
-    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError if the copy exists."""
+    """Copy a pipeline to a file or into a folder, and return the path of the copy.
+
+    Raises ConfigError if that file exists.
+    """
     source = find(name)
     target = file / source.name if path_exists(file) and file.is_dir() else file
     if path_exists(target):
@@ -84,7 +87,7 @@ def copy(name: str, file: Path) -> Path:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of the file, in which a stage is a name, or a name with settings."""
+    """Return the JSON schema of a pipeline file, in which a stage is a name, or a name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
     for kind in (*variants(Stage).values(), *variants(Step).values()):
@@ -96,8 +99,8 @@ def json_schema() -> dict[str, Any]:
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
     models: dict[str, type[Settings]] = {"matrix": Matrix, "execution": LocalExecution}
     for key, kind in models.items():
-        part = kind.model_json_schema()
-        definitions |= {**part.pop("$defs", {}), kind.__name__: part}
+        definition = kind.model_json_schema()
+        definitions |= {**definition.pop("$defs", {}), kind.__name__: definition}
         schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
     short = "Values for the pipeline NAME_7k, by keys as for --set; the comment above describes that pipeline."
     schema["properties"]["short"] = {"type": "object", "title": "Short", "description": short}
@@ -113,7 +116,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the schema of the stages in a list, which need the `required` keys in addition to their own."""
+    """Return the schema of the stages in a list; every stage also needs the `required` keys."""
     names = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
     with_settings = [
         {

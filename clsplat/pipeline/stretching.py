@@ -1,9 +1,9 @@
 """Stretch the schedules of a pipeline to another number of training steps.
 
-Steps, durations and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
-order as before, and stages that acted at the same step still do.  Intervals may become fractional.  If there are so few
-steps that two actions fall on one, they happen in the order of the list.  Learning rates of parameters that are
-learned over the whole training, such as a filter, are divided by the factor.
+Steps, durations, and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
+order as before, and stages that acted at the same step still do.  Intervals may become fractional.  If two actions then
+fall on one step, they happen in the order of the list.  Learning rates of parameters that are learned over the entire
+training, such as a filter, are divided by the factor.
 """
 
 import math
@@ -22,13 +22,13 @@ from clsplat.training.stage import Scheduled, Training
 
 Value = TypeVar("Value")
 Kind = TypeVar("Kind", bound=Training)
-MAX_STEP = 2**63 - 1  # that a file can store
-PARTS = 10**6  # of a step: intervals are multiples of one part, which a file stores exactly
+MAX_STEP = 2**63 - 1  # the largest that a file can store
+PARTS = 10**6  # parts of a step; intervals are multiples of a part, which a file stores exactly
 
 
 @dataclass(frozen=True)
 class Axis:
-    """The stretched steps of a training: step x becomes floor(x * factor)."""
+    """A mapping from steps to stretched steps: step x becomes floor(x * factor)."""
 
     exact: Fraction
     """Factor of the number of steps."""
@@ -37,7 +37,7 @@ class Axis:
 
     @classmethod
     def from_factor(cls, factor: float | Fraction) -> "Axis":
-        """Return the axis of a factor; a float stands for its shortest decimal representation."""
+        """Return the axis of a factor; a float is read as its shortest decimal representation."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
@@ -50,18 +50,18 @@ class Axis:
         interval = Fraction(str(every)) * self.factor
         if every == 1 or interval <= 1:
             return 1
-        bounded = min(interval, Fraction(MAX_STEP))
-        return int(bounded) if bounded.denominator == 1 else float(bounded)
+        interval = min(interval, Fraction(MAX_STEP))
+        return int(interval) if interval.denominator == 1 else float(interval)
 
     def scale_start(self, start: int, every: float) -> int:
-        """Return the stretched `start`, which excludes and allows the same actions as before."""
+        """Return the stretched `start`, which excludes and includes the same actions as before."""
         number = count_fired(every, start)
         return max(
             0, min(max(self.scale(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
         )
 
     def scale_stop(self, stop: int, every: float) -> int:
-        """Return the stretched `stop`, which allows the same actions as before."""
+        """Return the stretched `stop`, which includes the same actions as before."""
         number = count_fired(every, stop - 1)
         return min(
             max(self._action_step(every, number) + 1, min(self.scale(stop), self._action_step(every, number + 1))),
@@ -80,9 +80,9 @@ class Axis:
 
 
 def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
-    """Return settings with another number of training steps, without changing the steps that are `done`.
+    """Return settings with another number of training steps, without changing the first `done` steps.
 
-    Steps up to the last edit also stay as they are, if there are enough.  Stages that start later start at the same
+    Steps up to the last edit also stay as they are, if `steps` is larger.  Stages that start later start at the same
     fraction of the remaining steps.
     """
 
@@ -97,16 +97,16 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
 
 
 def last_edit(training: Training) -> int:
-    """Return the last step at which Gaussians grow or the size of photos changes; 0 if the settings do not limit it.
+    """Return the last step at which Gaussians grow or the size of photos changes; 0 if the settings set no limit.
 
-    A training that ended earlier would end with small photos, or before its last pruning.
+    If training ended earlier, it would end with small photos, or before its last pruning.
     """
     stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
     return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])
 
 
 def min_steps(training: Training) -> int:
-    """Return the smallest number of steps for a training in which no two edits fall on one step."""
+    """Return the smallest number of steps to which a training can be scaled without two edits falling on one step."""
     edits = {
         step
         for stage in training.during
@@ -121,7 +121,7 @@ def min_steps(training: Training) -> int:
 
 
 def stretch_to_steps(settings: PipelineFile, steps: int) -> PipelineFile:
-    """Return settings stretched to a number of steps of the first training.  Raises ConfigError if no stage trains."""
+    """Return settings stretched so that the first training has `steps` steps.  Raises ConfigError without training."""
     return stretch(settings, Fraction(steps, settings.training.steps))
 
 
@@ -137,13 +137,13 @@ def _stretch_rest(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
 
 
 def map_trainings(settings: PipelineFile, kind: type[Kind], change: Callable[[Kind], Kind]) -> PipelineFile:
-    """Return settings with each training of a kind replaced."""
+    """Return settings with each training stage of a kind replaced by the result of `change`."""
     stages = [change(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 
 def stretch(value: Value, factor: float | Fraction) -> Value:
-    """Return settings for `factor` times as many steps; the `step_keys` of each class are scaled."""
+    """Return settings for `factor` times as many steps, with the `step_keys` of each class scaled."""
     return _stretch(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
 
 
@@ -158,28 +158,29 @@ def _stretch(value: Any, axis: Axis) -> Any:
     fields = {name: getattr(value, name) for name in type(value).model_fields}
     keys = {key for base in type(value).__mro__ if issubclass(base, Settings) for key in base.step_keys}
     every = fields["every"] if "every" in keys else None
-    changed = {
+    new_fields = {
         name: _steps(name, field, axis, every) if name in keys else _stretch(field, axis)
         for name, field in fields.items()
     }
-    changed |= {name: divide(changed[name], float(axis.exact)) for name in type(value).rate_keys if axis.exact != 1}
-    return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
+    rates = {name: new_fields[name] for name in type(value).rate_keys if axis.exact != 1}
+    new_fields |= {name: divide(rate, float(axis.exact)) for name, rate in rates.items()}
+    return value.model_copy(update={name: new for name, new in new_fields.items() if new is not fields[name]})
 
 
 def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
-    """Return a stretched step; as the start or stop of an interval `every`, it stays between the same actions."""
+    """Return a stretched step; the start or stop of actions with interval `every` stays between the same actions."""
     if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":
         return axis.scale_interval(steps)
     if name == "steps":
         return max(1, math.floor(steps * axis.exact))
-    limits = {"start": axis.scale_start, "stop": axis.scale_stop, "until": axis.scale_until}
-    if name in limits and every not in (None, 1):
-        return limits[name](int(steps), every)
+    scale_functions = {"start": axis.scale_start, "stop": axis.scale_stop, "until": axis.scale_until}
+    if name in scale_functions and every not in (None, 1):
+        return scale_functions[name](int(steps), every)
     return max(1, axis.scale(int(steps)))
 
 
 def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
-    """Return the points of a schedule; if two fall on one step, the later one wins."""
+    """Return the stretched points of a schedule; if two fall on one step, the later one is used."""
     return [list(point) for point in {math.floor(step * axis.factor): value for step, value in points}.items()]

@@ -1,7 +1,7 @@
 """Read YAML as plain data, with the line of each value; a file cannot run code.
 
-Text, numbers, true, false, null, lists, and maps with text keys are allowed.  Anchors, aliases and merge keys (`<<`)
-work; every other tag is an error.
+Text, numbers, true, false, null, lists, and maps with text keys are allowed, and so are anchors, aliases, and merge
+keys (`<<`).  Every other tag is an error.
 """
 
 import io
@@ -27,14 +27,14 @@ INTEGER_LIMIT = 1 << 63
 CORE = "tag:yaml.org,2002:"
 MERGE = f"{CORE}merge"
 SCALAR_TAGS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
-PLAIN_TYPES = (bool, int, float, str)  # of scalars; ruamel's subclasses also hold how a value was written
+PLAIN_TYPES = (bool, int, float, str)  # types of scalars, whose subclasses in ruamel also store the notation of a value
 TEXT_TAGS = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
 KeyPath = tuple[str | int, ...]
 
 
 @dataclass
 class Document:
-    """Plain dicts, lists and scalars, and the line of each value, from 1."""
+    """Plain dicts, lists, and scalars, and the line number of each value, from 1."""
 
     data: Any
     lines: dict[KeyPath, int] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class Document:
 
 
 class _BadValue(Exception):
-    """A value that is not allowed in a file of settings, and its line."""
+    """Raised for a value that is not allowed in a file of settings; `line` is its line number."""
 
     def __init__(self, node: Any, complaint: str) -> None:
         super().__init__(complaint)
@@ -55,7 +55,7 @@ class _BadValue(Exception):
 
 
 class _Bounded(Composer):
-    """Stops as soon as a limit is exceeded, because parsing time grows with the square of the depth."""
+    """A composer that fails as soon as a limit is exceeded; parsing time grows with the square of the depth."""
 
     def __init__(self, loader: Any = None) -> None:
         super().__init__(loader=loader)
@@ -74,12 +74,15 @@ class _Bounded(Composer):
 
 
 def read_yaml(path: Path) -> Document:
-    """Read one document.  Raises ConfigError with file and line."""
+    """Read a file with one YAML document.  Raises ConfigError with the file and line."""
     return _parse(read_pipeline(path), str(path))
 
 
 def read_pipeline(path: Path) -> str:
-    """Return the text of a pipeline; NAME_7k is made from NAME.yaml and its key `short`.  Raises ConfigError."""
+    """Return the text of a pipeline; that of NAME_7k is created from NAME.yaml and its key `short`.
+
+    Raises ConfigError.
+    """
     file = origin(path)
     text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
     return text if file == path else _short(text, path, file)
@@ -103,13 +106,13 @@ def _short(text: str, path: Path, file: Path) -> str:
             line = f"{file}:{document.line(('short', key_path))}: short"
             raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
-    for first, last, new in sorted(edits, reverse=True):
-        text = text[:first] + new + text[last:]
+    for start, stop, new_text in sorted(edits, reverse=True):
+        text = text[:start] + new_text + text[stop:]
     return f"{comment}#\n{text}"
 
 
 def _node(root: Node, key_path: str) -> Node | None:
-    """Return the value of a key path, as --set writes it; None if there is none."""
+    """Return the node of a key path in the syntax of --set, or None if there is none."""
     first, *names = key_path.split(".")
     if not names:
         return _children(root).get(first)
@@ -125,14 +128,14 @@ def _node(root: Node, key_path: str) -> Node | None:
 
 
 def _children(node: Node | None) -> dict[str, Node]:
-    """Return the values of a map by key, or the items of a list by index."""
+    """Return the nodes in a map by key, or in a list by index."""
     if isinstance(node, MappingNode):
         return {str(key.value): value for key, value in node.value}
     return {str(i): item for i, item in enumerate(node.value)} if isinstance(node, SequenceNode) else {}
 
 
 def parse_value(text: str) -> Any:
-    """Parse a value in the syntax of a file: a number, true, false, null, a [list], a {map} or text.
+    """Parse a value in the syntax of a file: a number, true, false, null, a [list], a {map}, or text.
 
     Raises ConfigError.
     """
@@ -172,7 +175,7 @@ def _parse(text: str, name: str) -> Document:
 
 
 class _Reader:
-    """Converts the nodes of one document to plain data."""
+    """A converter of the nodes of one document to plain data."""
 
     def __init__(self, yaml: YAML) -> None:
         self._scalars = yaml.constructor
@@ -200,10 +203,10 @@ class _Reader:
 
     def _map(self, node: MappingNode, key_path: KeyPath) -> dict[str, Any]:
         data: dict[str, Any] = {}
-        merged: list[Node] = []
+        merge_nodes: list[Node] = []
         for key_node, value in node.value:
             if key_node.tag == MERGE:
-                merged += value.value if isinstance(value, SequenceNode) else [value]
+                merge_nodes += value.value if isinstance(value, SequenceNode) else [value]
                 continue
             key = self._plain(key_node, key_path) if isinstance(key_node, ScalarNode) else None
             if not isinstance(key, str):
@@ -214,18 +217,18 @@ class _Reader:
                 raise _BadValue(key_node, f"duplicate key {quote(key)}")
             self._lines[*key_path, key] = key_node.start_mark.line + 1
             data[key] = self._plain(value, (*key_path, key))
-        for part in merged:
-            data = {**self._merge(part, key_path), **data}
+        for merge_node in merge_nodes:
+            data = {**self._merge(merge_node, key_path), **data}
         return data
 
     def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
-        """Return the map that `<<` refers to; the line of a key that the outer map also has does not change."""
+        """Return the map to which `<<` refers; the lines of keys that the outer map also has do not change."""
         if not isinstance(node, MappingNode):
             raise _BadValue(node, "expected a map after '<<'")
-        outer, self._lines = self._lines, {}
+        outer_lines, self._lines = self._lines, {}
         data: dict[str, Any] = self._plain(node, key_path)
-        self._lines, inner = outer, self._lines
-        for inner_path, line in inner.items():
+        self._lines, inner_lines = outer_lines, self._lines
+        for inner_path, line in inner_lines.items():
             self._lines.setdefault(inner_path, line)
         return data
 
@@ -237,4 +240,4 @@ class _Reader:
             raise _BadValue(node, f"{quote(node.value)} cannot be read as {kind}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
             raise _BadValue(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
-        return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)
+        return next((type_(value) for type_ in PLAIN_TYPES if isinstance(value, type_)), None)
