@@ -44,8 +44,7 @@ def describe(
     """Describe what a run would do in a folder, one line per stage, without writing anything.
 
     read: function that reads the scene.  with_time: whether to add a time estimate for a new run.
-    Raises the errors that the run would raise before its first stage.  Errors in photos that still have to be prepared
-    are not found.
+    Raises the errors that the run would raise before its first stage.  Photos are checked only if they are prepared.
     """
     out = state.out
     actual_start = choose_start(pipeline, state, start)
@@ -128,6 +127,6 @@ def _describe_stage(stage: Stage, run: Run | None) -> str:
 
 def _describe_cadence(stage: Scheduled) -> str:
     """Describe when a scheduled stage runs, such as "densify every 100 (start 500, stop 15000)"."""
-    limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
-    text = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
+    conditions = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
+    text = ", ".join(f"{name} {value}" for name, value in conditions.items() if value)
     return f"{stage.stage} every {stage.every}" + (f" ({text})" if text else "")

@@ -55,20 +55,20 @@ def estimate_time(
 ) -> list[str]:
     """Return a line with the estimated time of the run, and one line per part; empty if nothing can be estimated.
 
-    names, measures: of the photos to prepare.  run: None if the scene is not prepared yet.
+    names, measures: file names and measures of the photos to prepare.  run: None if the scene is not prepared yet.
     """
-    parts = list(_preparation_estimates(planned_steps, len(names))) if names else []
+    estimates = list(_preparation_estimates(planned_steps, len(names))) if names else []
     if (training_size := _training_size(pipeline, planned_steps, names, run)) is not None:
         settings = (apply_adaptation(pipeline, measures) if measures and run is None else pipeline).settings
         training_stages = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-        parts += [_training_estimate(training, *training_size, device.info.units) for training in training_stages]
+        estimates += [_training_estimate(training, *training_size, device.info.units) for training in training_stages]
     field_stages = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
-    parts += [_field_estimate(training, device.info.units) for training in field_stages]
-    if not parts:
+    estimates += [_field_estimate(training, device.info.units) for training in field_stages]
+    if not estimates:
         return []
-    low, high = (sum(part.seconds[end] for part in parts) for end in (0, 1))
+    low, high = (sum(estimate.seconds[end] for estimate in estimates) for end in (0, 1))
     total = f"expected: {minutes_text((low, high))}, roughly, without evaluation, renders, and pages"
-    return [total, *(part.text for part in parts)]
+    return [total, *(estimate.text for estimate in estimates)]
 
 
 def _preparation_estimates(planned_steps: Sequence[PlannedStep], photo_count: int) -> Iterator[Estimate]:
@@ -107,7 +107,7 @@ def _first_photo_size(folder: Path, names: Sequence[str]) -> tuple[int, int] | N
 def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, units: int) -> Estimate:
     """Estimate the time of a training stage, from its minimum and maximum numbers of steps and Gaussians.
 
-    size: width and height of the images, px.  initial: the initial number of Gaussians.  units: of the device.
+    size: width and height of the images, px.  initial: the initial number of Gaussians.  units: as for `step_seconds`.
     """
     pixels = size[0] * size[1]
     maximum = max(initial, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))

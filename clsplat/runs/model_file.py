@@ -212,7 +212,7 @@ def photo_folder(scene: Path) -> Path:
 
 
 def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
-    stages = [part for stage in pipeline.stages for part in (stage, *getattr(stage, "during", ()))]
+    stages = [item for stage in pipeline.stages for item in (stage, *getattr(stage, "during", ()))]
     return [stage for stage in stages if isinstance(stage, Export | ExportField)]
 
 

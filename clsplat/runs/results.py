@@ -157,7 +157,7 @@ def read_metrics(path: Path) -> RunMetrics:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:
         first_error = error.errors()[0]
-        key = shorten(".".join(str(part) for part in first_error["loc"]))
+        key = shorten(".".join(str(item) for item in first_error["loc"]))
         message = shorten(first_error["msg"].removeprefix("Invalid JSON: "), 200)
         raise DataError(
             f"{path}: {key + ': ' if key else ''}{message}; the file is damaged: run the pipeline again"

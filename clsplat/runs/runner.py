@@ -142,14 +142,14 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         run_stages(pipeline, run)
     for finding in check_view_count(len(run.original.train)):
         LOG.warning("%s", finding.text)
-    if run.best is None and (text := overfitting_note(run)):
-        LOG.info("%s", text)
+    if run.best is None and (note := overfitting_note(run)):
+        LOG.info("%s", note)
     run.status.require_lock()
     write_metrics(pipeline, run)
-    damaged = damaged_files(run.out, previous)
-    check_outputs(pipeline, run, damaged)
+    damaged_names = damaged_files(run.out, previous)
+    check_outputs(pipeline, run, damaged_names)
     write_checksums(pipeline, run, previous)
-    for name in damaged:
+    for name in damaged_names:
         LOG.warning("%s: is missing or has changed; only --restart writes it again", run.out / name)
     run.status.end("done", exit_code=0)
 

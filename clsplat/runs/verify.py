@@ -267,6 +267,6 @@ def check(pipeline: str) -> dict[str, Any]:
             "name": experiment.name,
             "cells": [cell.name for cell in experiment.cells],
         }
-    loaded = load(pipeline)
-    stages = {"stages": loaded.names, "adapts": loaded.undecided}
-    return {"path": str(origin(loaded.path)), "name": loaded.settings.name, **stages}
+    loaded_pipeline = load(pipeline)
+    stages = {"stages": loaded_pipeline.names, "adapts": loaded_pipeline.undecided}
+    return {"path": str(origin(loaded_pipeline.path)), "name": loaded_pipeline.settings.name, **stages}

@@ -42,8 +42,8 @@ def copy_result(source: Path, target: Path) -> None:
     The manifest is copied last, so that it marks a complete copy.
     """
     with raising_output_error(target):
-        for old in (target / MANIFEST, *checkpoint.list_files(target)):  # the checkpoints may belong to another run
-            old.unlink(missing_ok=True)
+        for file in (target / MANIFEST, *checkpoint.list_files(target)):  # the checkpoints may belong to another run
+            file.unlink(missing_ok=True)
         copy_files(source, target, {LEASE, ERRORS, MANIFEST})
         link_or_copy(source / MANIFEST, target / MANIFEST)
 
@@ -98,7 +98,7 @@ class Batch:
         """React to a change.  started: name of the cell that has started; None: a cell has ended."""
 
     def require_lock(self) -> None:
-        """Raise OutputError if the folder now belongs to another process."""
+        """Raise OutputError if another process now owns the folder."""
 
     def run(self, execution: Execution, device: str | None) -> None:
         """Run every cell whose result is not in the store, and record the failed cells in `failures`.
@@ -124,16 +124,16 @@ class Batch:
         if time.monotonic() - self._last_report < PROGRESS_INTERVAL_S:
             return
         self._last_report = time.monotonic()
-        done, progress = sum(self._steps[name] for name in self.outcomes), []
+        completed_steps, progress = sum(self._steps[name] for name in self.outcomes), []
         for name, cell in self.running.items():
             newest = max(self.store.folder(cell.key).attempts(), key=lambda attempt: attempt.last_beat, default=None)
             step = read_status(newest.path).get("step") if newest else 0
             if isinstance(step, int):
-                done += step
+                completed_steps += step
                 progress.append(f"{name} {step}/{self._steps[name]}")
         names = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
         self._count.label = f"steps ({names})" if progress else "steps"
-        self._count.reach(min(done, self._count.total))
+        self._count.reach(min(completed_steps, self._count.total))
 
     def _is_stopped(self) -> bool:
         """Report progress, because the inline engine calls this regularly; return whether a signal has arrived."""

@@ -31,7 +31,7 @@ def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
 
     The option -P keeps the working folder out of the import path.
     """
-    plugin_options = [word for path in plugins for word in ("--plugin", str(path))]
+    plugin_options = [argument for path in plugins for argument in ("--plugin", str(path))]
     device_options = ["--device", device] if device else []
     return [
         PYTHON,
@@ -52,7 +52,7 @@ def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
 def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
     """Replace the placeholders of a command with the interpreter, a pipeline file, and a run folder."""
     values = {PYTHON: sys.executable, FILE: str(pipeline), OUT: str(out)}
-    return [values.get(word, word) for word in command]
+    return [values.get(argument, argument) for argument in command]
 
 
 def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], cores: Cores = ()) -> int:

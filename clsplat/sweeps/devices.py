@@ -87,11 +87,11 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
     Raises DeviceError if no device or a named device does not work, and ConfigError if there are more runs than cores.
     """
     infos = list_devices()
-    chosen = [choose(name) for name in devices] if devices is not None else [info for info in infos if not info.fault()]
-    if not chosen:
+    subset = [choose(name) for name in devices] if devices is not None else [info for info in infos if not info.fault()]
+    if not subset:
         raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []
-    for info, core_sets in zip(chosen, split_device_cores(chosen, packing), strict=True):
+    for info, core_sets in zip(subset, split_device_cores(subset, packing), strict=True):
         bits, memory = bits_class(info, infos), info.memory // len(core_sets)
         slot = DeviceSlot(worker, device_query(info, infos), bits, info.text, memory=memory)
         slots += [replace(slot, cores=cores) for cores in core_sets]
@@ -101,7 +101,7 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
 def device_query(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
     """Return a value for `--device` that matches only this device."""
     query = f"{info.platform} {info.name} {info.kind}"
-    matches = [other.index for other in infos if other.matches(query)]
+    matches = [candidate.index for candidate in infos if candidate.matches(query)]
     return f"{query}:{matches.index(info.index)}"
 
 
@@ -126,7 +126,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 def _hash_fixed_run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as temp_folder:
         scene, out = Path(temp_folder, "scene"), Path(temp_folder, "run")
-        settings = [word for setting in SETTINGS for word in ("--set", setting)]
+        settings = [argument for setting in SETTINGS for argument in ("--set", setting)]
         _run_command(device, "data", "synthetic", str(scene), *SCENE_OPTIONS)
         command = "run", str(shipped_pipelines()[PIPELINE])
         arguments = (*command, "--scene", str(scene), "--out", str(out), "--device", device)

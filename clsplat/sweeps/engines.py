@@ -165,7 +165,7 @@ class Dispatcher:
         The device must be in its bits class, and if possible larger than devices whose memory was insufficient.
         """
         allowed = self._allowed_slots(pending, slots)
-        return slot in ([other for other in allowed if other.memory > pending.too_small] or allowed)
+        return slot in ([candidate for candidate in allowed if candidate.memory > pending.too_small] or allowed)
 
     def _allowed_slots(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """Return the devices on which a cell may run.  A started cell stays in its class while it has devices."""
@@ -189,7 +189,7 @@ class Dispatcher:
             raise BitsMismatch(outcome.message)
         retry = replace(pending, too_small=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
-            other.memory > slot.memory for other in self._allowed_slots(retry, self.engine.slots())
+            candidate.memory > slot.memory for candidate in self._allowed_slots(retry, self.engine.slots())
         ):
             LOG.warning("cell %s: %s; trying a larger device", cell.name, outcome.message)
             self._requeue(retry, slot, pending_cells)

@@ -311,12 +311,12 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
     describe.check_unused(state.out)
     cells, done_names = read_cells(experiment, state.out, start)
     lines, refusals = [], Failures("cells")
-    read = cache(read_run_scene)  # read each distinct scene once
+    read_once = cache(read_run_scene)  # read each distinct scene once
     for cell in experiment.cells:
         progress = "done" if cell.name in done_names else "unfinished" if (state.out / cell.name).exists() else ""
         try:
             if progress != "done":
-                describe.describe(cell.pipeline, cells[cell.name], device, start, read)
+                describe.describe(cell.pipeline, cells[cell.name], device, start, read_once)
         except ClsplatError as error:
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {progress}".rstrip())

@@ -4,5 +4,5 @@ import signal
 
 
 def dask_setup(worker: object) -> None:
-    """Ignore Ctrl-C.  Dask calls a function of this name."""
+    """Ignore Ctrl-C in this process.  Dask calls the function with this name in each worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -65,7 +65,7 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
 def _steps(pipeline: dict[str, Any]) -> int | None:
     """Return the total number of training steps of a resolved pipeline; None if the pipeline is damaged."""
     with suppress(KeyError, TypeError, AttributeError, ValueError, OverflowError):
-        return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
+        return int(sum(settings.get("steps", 0) for stage in pipeline["stages"] for settings in stage.values()))
     return None
 
 
@@ -111,8 +111,8 @@ def _format_detail(cell: dict[str, Any]) -> str:
         psnr = f", {cell['psnr']:.2f} dB" if cell.get("psnr") is not None else ""
         return psnr + (f", {cell['seconds']:.0f} s" if cell["seconds"] is not None else "")
     step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
-    more = f": {cell['message']}" if cell.get("message") else ""
+    suffix = f": {cell['message']}" if cell.get("message") else ""
     if cell["state"] == "silent":
         advice = "; run the sweep again to continue it" if cell["silent"] > STALE_AFTER_S else ""
-        more = f", no heartbeat for {cell['silent']} s on {cell.get('host')}{advice}"
-    return step + more
+        suffix = f", no heartbeat for {cell['silent']} s on {cell.get('host')}{advice}"
+    return step + suffix

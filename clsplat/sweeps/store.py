@@ -190,7 +190,7 @@ class CellAttempt:
 
         Damaged checkpoints are skipped.  Raises OutputError.
         """
-        for _, path, other in readable_checkpoints(others):
+        for _, path, source in readable_checkpoints(others):
             target = self.path / CHECKPOINTS / path.name
             with raising_output_error(self.path):
                 target.parent.mkdir(exist_ok=True)
@@ -198,15 +198,15 @@ class CellAttempt:
                     link_or_copy(path, target)
                 except FileNotFoundError:  # the process of that attempt has removed it
                     continue
-                copy_files(other.path, self.path, {*ATTEMPT_FILES, CHECKPOINTS})
+                copy_files(source.path, self.path, {*ATTEMPT_FILES, CHECKPOINTS})
             self._values["from"] = path.name
             self._write()
             return
 
     def message(self, exit_code: int) -> str:
         """Return the reason why the run failed: the message in its status, or the last line that it printed."""
-        if text := read_status(self.path).get("message"):
-            return str(text)
+        if status_message := read_status(self.path).get("message"):
+            return str(status_message)
         lines: list[str] = []
         with suppress(DataError):
             lines = read_file(self.path / ERRORS).decode(errors="replace").strip().splitlines()
@@ -280,7 +280,7 @@ class BitsMismatch(OutputError):
 
 
 class CellFolder:
-    """The folder of a cell in a store."""
+    """The folder of a cell in a store, with its attempts and its result."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -297,13 +297,13 @@ class CellFolder:
         """
         file = self.path / SPEC
         try:
-            existing = read_json(file) if file.exists() else None
+            existing_spec = read_json(file) if file.exists() else None
         except DataError as error:
             LOG.warning("%s; writing it again", error)
-            existing = None
-        if existing is None:
+            existing_spec = None
+        if existing_spec is None:
             write_text(file, json.dumps(spec, indent=1, sort_keys=True) + "\n")
-        elif existing != spec:
+        elif existing_spec != spec:
             raise OutputError(f"{file}: belongs to another cell, or was changed; remove {self.path} to run it again")
 
     def manifest(self) -> dict[str, Any] | None:
@@ -330,7 +330,7 @@ class CellFolder:
         return None
 
     def attempts(self) -> list[CellAttempt]:
-        """Return the existing attempts."""
+        """Return the attempts in the folder of the cell, in no particular order."""
         paths = (self.path / ATTEMPTS).glob("*")
         attempt_paths = [path for path in paths if NAME.fullmatch(path.name)]
         return [CellAttempt(path) for path in attempt_paths if path.is_dir() and not path.is_symlink()]
@@ -342,7 +342,7 @@ class CellFolder:
             make_folder(attempt.path)
             (self.path / FAILED).unlink(missing_ok=True)
         attempt.take_lease(worker, since)
-        attempt.continue_from(other for other in self.attempts() if other.path != attempt.path)
+        attempt.continue_from(candidate for candidate in self.attempts() if candidate.path != attempt.path)
         return attempt
 
     def failures(self, since: float) -> list[CellAttempt]:
@@ -361,7 +361,7 @@ class CellFolder:
         LeaseLost if the attempt was removed because its process was frozen for too long.
         """
         attempt.require_lease()
-        new = attempt.manifest()
+        manifest = attempt.manifest()
         with raising_output_error(attempt.path):
             sync_below(attempt.path)
         with suppress(OSError):
@@ -370,24 +370,24 @@ class CellFolder:
             with suppress(OSError):
                 (self.result / LEASE).unlink()
                 (self.path / FAILED).unlink(missing_ok=True)
-            return new
+            return manifest
         os.listdir(self.path)  # refreshes the NFS cache of the folder
-        published = self.manifest()
-        if published is None:
+        result = self.manifest()
+        if result is None:
             raise OutputError(f"{self.result}: cannot be written; check the permissions and the free space")
-        if published["bits"] != new["bits"]:
+        if result["bits"] != manifest["bits"]:
             raise BitsMismatch(
                 f"{self.path}: the same cell gave different bits on two devices of one bits class: {self.result} on "
-                f"{published.get('device')}, {attempt.path} on {new.get('device')}; one of them computes wrongly: "
+                f"{result.get('device')}, {attempt.path} on {manifest.get('device')}; one of them computes wrongly: "
                 "`clsplat doctor` shows which"
             )
-        return published
+        return result
 
     def give_up(self, exit_code: int, message: str) -> None:
         """Write failed.json: the exit code and the message of the last failure."""
         codes = [attempt.exit_code for attempt in self.attempts() if attempt.exit_code is not None]
-        text = json.dumps({"exit_code": exit_code, "message": message, "exit_codes": codes}, indent=1)
-        write_text(self.path / FAILED, text + "\n")
+        content = json.dumps({"exit_code": exit_code, "message": message, "exit_codes": codes}, indent=1)
+        write_text(self.path / FAILED, content + "\n")
 
     def failure(self) -> dict[str, Any] | None:
         """Return the content of failed.json; None if it is missing or damaged."""

@@ -86,8 +86,8 @@ class Live:
 
         def show_both(progress: Progress) -> None:
             show(progress)
-            if shown := self.state.shown:
-                shown.curves.add(progress)
+            if run := self.state.shown:
+                run.curves.add(progress)
 
         return show_both
 

@@ -88,7 +88,7 @@ class RequestQueue:
             return min(self._requests, key=lambda request: request.pace == "again", default=None)
 
     def deliver(self, request: PreviewRequest, picture: EncodedPicture | None) -> None:
-        """Remove a request from the queue, and pass its picture, or None, to the thread that waits for it."""
+        """Remove a request from the queue, and pass the image, or None, to the thread that waits for it."""
         self._drop(request)
         request.picture = picture
         request.done.set()
@@ -267,7 +267,7 @@ Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussian
 
 
 class Curves:
-    """The loss, PSNR, and number of Gaussians of a run, in the order of steps."""
+    """Curves of the loss, PSNR, and number of Gaussians of a run over its steps."""
 
     def __init__(self, points: list[Point]) -> None:
         self._points = points

@@ -250,14 +250,14 @@ class Handlers:
         return route(request)
 
     def _state(self, request: Request) -> Response:
-        live, shown = self.live, self.live.shown
-        ended = live.ended  # read first, so that a page that receives the end also receives the final state
+        live, run = self.live, self.live.shown
+        has_ended = live.ended  # read first, so that a page that receives the end also receives the final state
         status = live.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if live.status else {}
-        state: dict[str, Any] = {**status, "scene": shown.number if shown else 0, "drawn": live.step}
-        state |= {"paused": live.paused, "ended": ended, "fault": live.error}
-        if shown:
-            state["points"] = shown.curves.after(request.number("after", 0, 1 << 40))
-        live.is_end_sent = live.is_end_sent or ended
+        state: dict[str, Any] = {**status, "scene": run.number if run else 0, "drawn": live.step}
+        state |= {"paused": live.paused, "ended": has_ended, "fault": live.error}
+        if run:
+            state["points"] = run.curves.after(request.number("after", 0, 1 << 40))
+        live.is_end_sent = live.is_end_sent or has_ended
         return Response.json(state)
 
     def _scene(self, request: Request) -> Response:
@@ -268,12 +268,12 @@ class Handlers:
 
         With a `camera`, the query may contain a timestamp, `time`.  The status is 204 if the preview is not ready yet.
         """
-        live, shown = self.live, self._require_scene()
+        live, run = self.live, self._require_scene()
         pace = request.query.get("pace", "")
         if pace not in get_args(Pace):
             raise RequestError(400, f"pace: expected one of {', '.join(get_args(Pace))}")
         if "view" in request.query:
-            view = shown.views[request.number("view", 0, len(shown.views) - 1)]
+            view = run.views[request.number("view", 0, len(run.views) - 1)]
         else:
             view = parse_camera(request.query.get("camera", ""))
             if "time" in request.query:
@@ -286,12 +286,12 @@ class Handlers:
         return Response(200, preview.picture.jpeg, "image/jpeg", {"X-Step": str(preview.picture.step)})
 
     def _picture(self, request: Request, kind: Kind) -> Response:
-        shown = self._require_scene()
-        index = request.number("view", 0, len(shown.views) - 1)
-        if request.query.get("scene") != str(shown.number):  # from an earlier run of a matrix
+        run = self._require_scene()
+        index = request.number("view", 0, len(run.views) - 1)
+        if request.query.get("scene") != str(run.number):  # from an earlier run of a matrix
             raise RequestError(404, "not found")
         try:
-            data = shown.pictures.get(kind, index)
+            data = run.pictures.get(kind, index)
         except DataError as error:
             raise RequestError(404, str(error)) from None
         if data is None:

@@ -118,7 +118,7 @@ class VariantRow:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """Runs to compare, grouped into variants and rows."""
+    """Runs to compare, grouped into variants and table rows."""
 
     runs: list[RunFolder]
 

@@ -110,7 +110,7 @@ def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
 def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
     """Return the divisors of the image size at which any row was evaluated, from the largest images to the smallest."""
     divisors = {downscale for row in rows for downscale in row.downscales(split)}
-    return sorted(divisors, key=lambda text: (float(text), text))
+    return sorted(divisors, key=lambda divisor: (float(divisor), divisor))
 
 
 def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
