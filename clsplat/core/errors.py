@@ -183,7 +183,7 @@ class _Quotes(reprlib.Repr):
         return f"a number of {x.bit_length()} bits" if x.bit_length() > 256 else repr(x)
 
     def repr_dict(self, x: dict[object, object], level: int) -> str:
-        """Show the first keys in their order of insertion; `reprlib` would sort all of them."""
+        """Show the first keys in insertion order; `reprlib` would sort all of them."""
         if level <= 0:
             return f"{{{self.fillvalue}}}"
         items = [f"{self.repr1(key, level - 1)}: {self.repr1(x[key], level - 1)}" for key in islice(x, self.maxdict)]

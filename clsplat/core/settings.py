@@ -70,7 +70,7 @@ class Settings(BaseModel):
         return {key: getattr(self, key) for key in type(self).model_fields}
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
-        """Return the input file or folder that a key names, or None.  `scene` is the folder of the dataset."""
+        """Return the path of an input file or folder in a key's value, or None.  `scene` is the dataset's folder."""
         value = getattr(self, key)
         return Path(value) if isinstance(value, str) and is_input_path(type(self), key) else None
 

@@ -104,7 +104,7 @@ def exported_model(path: Path) -> Path:
 
 
 def run_output(folder: Path, stage: str, default: str) -> Path:
-    """Return the output of the last stage with this name, from a run's metrics.json, or the default file."""
+    """Return the output file of a run's last stage with this name, as listed in metrics.json, or the default file."""
     try:
         name = read_json(folder / METRICS)["files"][stage]
     except (DataError, KeyError, TypeError):  # the run has not finished

@@ -25,7 +25,7 @@ def static_motion(count: int, width: int) -> NDArray[np.float32]:
 
 
 def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the factor on each opacity, [N] in (0, 1], at one time or at one time per Gaussian, [N]."""
+    """Return the factor on each opacity, [N] in (0, 1], at a time or at a different time for each Gaussian, [N]."""
     fields, table = motion_fields(motion.shape[1]), motion.astype(np.float64)
     dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):

@@ -87,7 +87,7 @@ class LocalExecution(Settings):
 
     @property
     def has_store(self) -> bool:
-        """Whether cells are kept in a store."""
+        """Whether the results of cells go to a store."""
         return self.engine != "inline"
 
 
@@ -135,7 +135,7 @@ class Execution(LocalExecution):
 
     @property
     def has_store(self) -> bool:
-        """Whether cells are kept in a store."""
+        """Whether the results of cells go to a store."""
         return self.store is not None or super().has_store
 
     @property
