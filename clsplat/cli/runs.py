@@ -213,7 +213,7 @@ def pipelines(
     copy: Annotated[Path | None, typer.Option(metavar="FILE", help="Copy the pipeline to a new file.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the shipped pipelines, or the keys of one for --set."""
+    """List the shipped pipelines, or the --set keys of a pipeline."""
     if copy is not None:
         if not name:
             raise ConfigError("pipelines: --copy needs the name of a pipeline")

@@ -31,7 +31,7 @@ ENDING, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
 
 
 class Notes(BaseModel):
-    """The metadata of a file."""
+    """The metadata in the file of a field."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 

@@ -125,7 +125,7 @@ class Network:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
 
     def _partials(self, tiles: int) -> Array:
-        """Return the sums of chunks, [chunks, network_parameters]; padding stays zero, as in new arrays."""
+        """Return the array of partial sums, [chunks, network_parameters], in which padding is zero."""
         return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_parameters))
 
     def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
@@ -157,7 +157,7 @@ class Network:
         add: int = 0,
         row: int = 0,
     ) -> None:
-        """Compute the gradient of a layer's inputs, for its weights from `row` on.  add: 1 to add it."""
+        """Compute the gradient of a layer's inputs, for its weights from `row` on.  add: 1 to add to `grad_inputs`."""
         tiles, grad_rows, output_rows = *grad_inputs.shape[:2], grad_outputs.shape[1]
         count = tiles * self._columns * (grad_rows // BLOCK)
         self._program.dense_backward(
@@ -276,7 +276,7 @@ class Encoding:
     def backward(self, grad_position: Array, gradient: Array) -> None:
         """Add the gradient of the grid's entries to `gradient`, [P].
 
-        grad_position: [tiles, grid_rows, SAMPLES], gradient of the grid's features at the last samples.
+        grad_position: [tiles, grid_rows, SAMPLES], gradient of the grid's features at the last `forward`'s samples.
         """
         if not self.shape.grid:
             return

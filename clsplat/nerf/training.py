@@ -64,7 +64,7 @@ class LearnedField(TrainedField):
 
     @classmethod
     def initial(cls, shape: FieldShape, seed: int, background: Array) -> "LearnedField":
-        """Return a field before its first step."""
+        """Return an untrained field for a seed.  background: RGB, [3], in [0, 1]."""
         return cls(Field.initial(shape, seed, background))
 
     @classmethod
@@ -201,7 +201,7 @@ MIB = 2**20
 
 @dataclass(frozen=True)
 class FieldPlan:
-    """The memory that training a field needs on the device, bytes."""
+    """The device memory in bytes that training a field needs."""
 
     parameters: int  # one table of parameters
     features: int  # features and gradients of the samples of one pass
@@ -271,7 +271,7 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
 
 
 def _is_in_cube(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
-    """Return which points, [M, 3], are in a cube."""
+    """Return whether each point, [M, 3], is inside a cube, as [M] booleans."""
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 
 

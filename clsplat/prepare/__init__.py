@@ -1,1 +1,1 @@
-"""Photographs to a scene: features, matches, mapping, undistortion; and the inspection of datasets."""
+"""Convert photographs to a scene (features, matches, mapping, undistortion), and inspect datasets."""

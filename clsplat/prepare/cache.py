@@ -80,7 +80,7 @@ def prepare(
 ) -> Path:
     """Run the steps that have a reason to run, each inside `stage(name)`, and return the folder of the last result.
 
-    Raises OutputError when another process is making one of the results, and any error of a step.
+    Raises OutputError when another process is computing one of the results, and the errors of the steps.
     """
     count = Count("steps of the preparation", len(planned), is_even=False)
     if reused_names := [planned_step.step.stage for planned_step in planned if not planned_step.reason]:
@@ -246,7 +246,7 @@ INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that ar
 
 
 def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return the figures of the steps, by the name of the step.  Steps whose results were removed are left out."""
+    """Return the figures of each step, by the name of the step, without steps whose results were removed."""
     records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}

@@ -51,7 +51,7 @@ CHECKED_SIDE = 64  # px; photographs that are linked are decoded at this size, o
 
 
 def list_photographs(folder: Path, excluded_folder: Path | None = None) -> list[str]:
-    """Return the sorted names of the photographs below a folder, without hidden ones and those in `excluded_folder`.
+    """Return the sorted names of the photographs below a folder, without hidden files and files in `excluded_folder`.
 
     Logs a warning about files in other formats.  Raises DataError when there are too few photographs.
     """

@@ -60,7 +60,7 @@ class Step(Settings):
         return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
-        """Return the warnings that belong to the figures of `make`, which are repeated when its result is reused."""
+        """Return the warnings for the figures of `make`, which are repeated when its result is reused."""
         return []
 
 
@@ -150,8 +150,8 @@ class MapCameras(Step):
     """Maximum number of attempts.  The second accepts smaller angles and fewer matches; the third matches more pairs of
     the unplaced photographs, unless all pairs were matched; the last two find more features."""
     min_track_length: Literal[2, 3] = 3
-    """Number of photographs in which a point must be seen.  COLMAP drops points seen in only two; keeping them gave 2.5
-    times as many points on one scene."""
+    """Number of photographs in which a point must be visible.  COLMAP drops points visible in only two; keeping them
+    gave 2.5 times as many points on one scene."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
@@ -164,7 +164,7 @@ class MapCameras(Step):
 
 
 class Undistort(Step):
-    """Undistort photographs to pinhole images at the size of training."""
+    """Undistort photographs to pinhole images at the training size."""
 
     version: ClassVar[int] = 3  # keeps point tracks, reprojection residuals and exposures
     resumes: ClassVar[bool] = True
@@ -175,7 +175,7 @@ class Undistort(Step):
     long_side: Positive | None = None
     """Longer side of the undistorted images in px; default: that of the photographs."""
     undefined_pixels: UndefinedPixels = "crop"
-    """What to do with pixels that the photograph does not cover: `crop` the image, or keep it whole and `mask` them."""
+    """How to treat pixels that the photograph does not cover: `crop` the image, or keep all of it and `mask` them."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}

@@ -1,4 +1,4 @@
-"""Find what limited the result of a run, from its views, records and cameras, and suggest a command for each."""
+"""Find the limits of a run's result from its views, records and cameras, and suggest a command for each limit."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -44,19 +44,19 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     test_psnr = {
         line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step
     }
-    again, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
+    rerun, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
     stages = run.pipeline["stages"]
     can_mask = run.learned_field is None and not any(module_class(name).masks_objects for name in run.modules)
     has_exposures = color_model(run) is not None or run.learned_field is not None
     limits = [edit["limit"] for edit in run.records.read("densify") if "limit" in edit]
     key = find_limit(stages)
-    growth = (limits[-1], f"{again} --set {key}=null") if limits and key else None
+    growth = (limits[-1], f"{rerun} --set {key}=null") if limits and key else None
     longer = f"{resume} --steps {2 * run.step}"
     sentences = [
-        *advise_on_training_views(metrics, has_exposures, again, run.step if can_mask else None),
-        *advise_on_fit(metrics, is_overfit, growth, again, longer),
-        *advise_on_test_views(test_psnr, again),
-        *advise_on_capture(views, run.original.views, again),
+        *advise_on_training_views(metrics, has_exposures, rerun, run.step if can_mask else None),
+        *advise_on_fit(metrics, is_overfit, growth, rerun, longer),
+        *advise_on_test_views(test_psnr, rerun),
+        *advise_on_capture(views, run.original.views, rerun),
     ]
     if (reason := sky_reason(run)) and any("export" in entry for entry in stages):
         choice, effect = ("sidecar", "leaves it out") if sky_gaussians(run) else ("splats", "adds it")

@@ -28,9 +28,9 @@ class Export(Scheduled):
     """Write the model in the format that the file name ends in, by default a PLY, and read it back.
 
     A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
-    in its name, holds the model as trained, with the filter as property `filter_3D`.  A learned sky is written as
-    distant Gaussians of the model; a file with `_without_sky` in its name holds the model without them, and clsplat
-    renders that with the map of the sky, in a file with `_sky.json` in its name.
+    in its name, contains the model as trained, with the filter as property `filter_3D`.  A learned sky is written as
+    distant Gaussians of the model; a file with `_without_sky` in its name contains the model without them, which
+    clsplat renders with the map of the sky, a file with `_sky.json` in its name.
     """
 
     stage: Literal["export"] = "export"
@@ -82,7 +82,7 @@ class Export(Scheduled):
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)
         if without_sky in files:
-            LOG.info("%s holds the sky as %s distant Gaussians; %s does not", path, f"{COUNT:,}", without_sky.name)
+            LOG.info("%s contains the sky as %s distant Gaussians; %s does not", path, f"{COUNT:,}", without_sky.name)
         elif model.sky:
             LOG.info("sky written to %s, which only clsplat reads", sky_path)
 
@@ -122,7 +122,7 @@ class Cameras(Stage):
 
 
 class Checkpoint(Scheduled):
-    """Save everything that a resumed run needs to give the same bits; also after the last step, to train longer."""
+    """Save the state from which a resumed run gives the same bits; also after the last step, to train longer."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})

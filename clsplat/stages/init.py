@@ -110,14 +110,14 @@ class Init(Stage):
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """Factor of the first sizes."""
+    """Factor of the sizes of the first Gaussians."""
     count: Annotated[int, Field(gt=0)] = 100_000
     """Number of random points; largest number of points on a visual hull."""
     sweep_points: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     times: Literal["uniform", "per_frame"] = "uniform"
-    """Center in time of moving Gaussians: random, or the timestamp at which the dataset says that the point was seen.
-    With `per_frame`, points whose neighbors were seen at all times start static; others start with the spread of their
+    """Center in time of moving Gaussians: random, or the timestamp of the point's observation in the dataset.  With
+    `per_frame`, points whose neighbors were observed at all times start static; others start with the spread of their
     neighbors' timestamps as duration, and with the velocity of the neighbors."""
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation in time, as a fraction of the scene's duration; a long one starts with a static scene."""

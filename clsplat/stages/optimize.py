@@ -37,7 +37,7 @@ MAX_TRAINING_VIEWS = 8  # training views that are measured with the validation v
 
 
 class ValidatedTraining(Training):
-    """Training that keeps its last model, or the best one on the validation views.
+    """Training that keeps its last model, or its best model on the validation views.
 
     With `keep: best`, the validation views (`scene.validation`) and some training views are measured whenever an
     `evaluate` of validation views in `during` runs; without one, 20 times, at least 100 steps apart.

@@ -189,7 +189,7 @@ class VisibleError:
     def palette(
         self, rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
     ) -> tuple[Floats, NDArray[np.int64]]:
-        """Improve a palette; return vectors, [E, 3 K], with less visible errors, and the label of each Gaussian, [N].
+        """Return vectors, [E, 3 K], with less visible errors than a palette's, and the label of each Gaussian, [N].
 
         This is Lloyd's iteration with the quadratic form of each Gaussian as its distance.  nearest: returns for
         points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors do not change.

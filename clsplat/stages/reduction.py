@@ -102,7 +102,7 @@ class PruneLeast(Scheduled):
 
 
 class ReduceSh(Scheduled):
-    """Drop bands of spherical harmonics: all bands above a degree, and the least important of the others.
+    """Drop bands of spherical harmonics: all bands above a degree, and the least important of the remaining bands.
 
     The importance of a Gaussian's band is the mean square of its color over all directions, times the Gaussian's weight
     in the training views.  Bands dropped by `share` are set to zero, which compresses well; later training changes them

@@ -1,4 +1,4 @@
-"""Write a run as one page that opens offline: renders, cameras, metrics, curves, times on the device, settings."""
+"""Write the report of a run, a page that opens offline: renders, cameras, metrics, curves, times, and settings."""
 
 import logging
 import os

@@ -44,7 +44,7 @@ class TrainField(Training):
     rays: Annotated[int, Field(gt=0, le=1 << 20)] = 4096
     """Rays per step."""
     photographs: Annotated[int, Field(gt=0, le=1 << 20)] = 1
-    """Photos per step, with the same number of rays from each."""
+    """Photos per step; each contributes the same number of rays."""
     order: OneOf[Order] = Uniform()
     """Order of the photos."""
     coarse_weight: Annotated[float, Field(ge=0)] = 0.1
@@ -56,7 +56,8 @@ class TrainField(Training):
     warm_up_from: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Fraction of the rate at the first step."""
     epsilon: Annotated[float, Field(gt=0)] = 1e-8
-    """Added to the root of Adam's second moment; smaller gradients, as grids have them, hardly count."""
+    """Added to the square root of Adam's second moment; much smaller gradients, which are common in grids, have little
+    effect."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run at a cadence."""
     log_every: Annotated[int, Field(gt=0)] = 100

@@ -125,7 +125,7 @@ class Video(Stage):
     size: str | None = None
     """WIDTHxHEIGHT, even numbers; default: the training size."""
     times: Timestamp | tuple[Timestamp, Timestamp] | None = None
-    """In a dynamic scene, a timestamp, or those of the first and the last frame; default: the whole duration."""
+    """In a dynamic scene, a timestamp, or the timestamps of the first and last frame; default: the full duration."""
     file: Annotated[str, path_in_run(*encoding.WRITERS)] = "video.webm"
     """Path inside the run folder; .webm, or .mp4 with the extra video."""
 
