@@ -14,14 +14,14 @@ from clsplat.scene.viewpoint import perpendicular, up_direction
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
 COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
-DASHES = (("", ""), ("7 4", "dashed"), ("2 3", "dotted"), ("9 3 2 3", "dash-dotted"))  # stroke-dasharray, in words
+DASHES = (("", ""), ("7 4", "dashed"), ("2 3", "dotted"), ("9 3 2 3", "dash-dotted"))  # stroke-dasharray, description
 MAX_MARKED_POINTS = 12  # lines with more points have no circles
-LEGEND_ROW, LEGEND_LETTERS = 14, 66  # height of a row, px; approximate number of characters per row
+LEGEND_ROW, LEGEND_LETTERS = 14, 66  # height of a row, px; approximate number of letters per row
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a chart: points (x, y), in order, and its name and style."""
+    """A line of a chart: its points (x, y) in order, its name, and its style."""
 
     points: Sequence[tuple[float, float]]
     name: str = ""  # in the legend
@@ -32,17 +32,17 @@ class Line:
 def curve(
     title: str, lines: Sequence[Line], logarithmic: bool = False, ticks: Mapping[float, str] | None = None
 ) -> str:
-    """Draw lines over common axes; return "" if all points have the same x or the same y.
+    """Return a line chart as SVG, or "" if all points have the same x or the same y.
 
-    logarithmic: the y axis, which drops values that are not positive.  ticks: labels on the x axis; default: numbers.
+    logarithmic: use a logarithmic y axis, without values that are not positive.  ticks: labels by x; default: numbers.
     """
-    drawn = [_to_axes(line, logarithmic) for line in lines]
-    drawn = [line for line in drawn if line.points]
-    xs = [x for line in drawn for x, _ in line.points]
-    ys = [y for line in drawn for _, y in line.points]
+    axis_lines = [_to_axes(line, logarithmic) for line in lines]
+    axis_lines = [line for line in axis_lines if line.points]
+    xs = [x for line in axis_lines for x, _ in line.points]
+    ys = [y for line in axis_lines for _, y in line.points]
     if len(set(xs)) < 2 or len(set(ys)) < 2:
         return ""
-    legend = _legend(drawn)
+    legend = _legend(axis_lines)
     top = TOP + LEGEND_ROW * len(legend)
     x_low, x_high = 0.0, max(xs) or 1.0
     y_low, y_high = min(ys), max(ys)
@@ -52,69 +52,69 @@ def curve(
         up = (y - y_low) / (y_high - y_low)
         return LEFT + right * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - BOTTOM - top)
 
-    parts = _start(title)
+    parts = _svg_start(title)
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    counts = not logarithmic and _are_integers(ys)
-    rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, counts)
-    for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows], counts), strict=True):
+    whole_y = not logarithmic and _are_integers(ys)
+    y_ticks = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, whole_y)
+    for tick, label in zip(y_ticks, _tick_labels([10**t if logarithmic else t for t in y_ticks], whole_y), strict=True):
         _, y = pixel(x_low, tick)
-        parts += _row(y, label)
-    steps = _are_integers(xs)
-    columns = _ticks(x_low, x_high, steps)
-    for tick, label in (ticks or dict(zip(columns, _numbers(columns, steps), strict=True))).items():
+        parts += _grid_line(y, label)
+    whole_x = _are_integers(xs)
+    x_ticks = _ticks(x_low, x_high, whole_x)
+    for tick, label in (ticks or dict(zip(x_ticks, _tick_labels(x_ticks, whole_x), strict=True))).items():
         x, _ = pixel(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
-    for i, line in enumerate(drawn):
+    for i, line in enumerate(axis_lines):
         color, (dash, _) = _color(line, i), _dash(line)
-        dashed = f' stroke-dasharray="{dash}"' if dash else ""
+        dash_attribute = f' stroke-dasharray="{dash}"' if dash else ""
         pixels = [pixel(*point) for point in line.points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
-        parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.8"{dashed}/>')
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.8"{dash_attribute}/>')
         if len(pixels) <= MAX_MARKED_POINTS:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{color}"/>' for x, y in pixels]
     return "".join([*parts, "</svg>"])
 
 
 def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
-    """Draw a histogram with `bins` equal intervals from zero; return "" if all values are equal."""
+    """Return a histogram as SVG, with `bins` equal intervals from zero, or "" if all values are equal."""
     if len(set(values)) < 2:
         return ""
-    high = max(values)
+    largest = max(values)
     counts = [0] * bins
     for value in values:
-        counts[min(bins - 1, int(bins * value / high))] += 1
+        counts[min(bins - 1, int(bins * value / largest))] += 1
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
-    parts = _start(title)
-    rows = _ticks(0, max(counts), integers=True)
-    for tick, label in zip(rows, _numbers(rows, integers=True), strict=True):
-        parts += _row(HEIGHT - BOTTOM - tick / max(counts) * height, label)
+    parts = _svg_start(title)
+    y_ticks = _ticks(0, max(counts), integers=True)
+    for tick, label in zip(y_ticks, _tick_labels(y_ticks, integers=True), strict=True):
+        parts += _grid_line(HEIGHT - BOTTOM - tick / max(counts) * height, label)
     for i, count in enumerate(counts):
         if count:
             bar = count / max(counts) * height
             corner = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - bar:.1f}"'
             parts.append(f'<rect {corner} width="{width / bins - 2:.1f}" height="{bar:.1f}" fill="{COLORS[0]}"/>')
-    columns = _ticks(0, high)
-    for tick, label in zip(columns, _numbers(columns), strict=True):
-        x = LEFT + tick / high * width
+    x_ticks = _ticks(0, largest)
+    for tick, label in zip(x_ticks, _tick_labels(x_ticks), strict=True):
+        x = LEFT + tick / largest * width
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{label}</text>')
     return "".join([*parts, "</svg>"])
 
 
-def _start(title: str) -> list[str]:
-    """Return the start of a drawing, with its title."""
+def _svg_start(title: str) -> list[str]:
+    """Return the opening tag and the title of a chart."""
     start = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">'
     return [start, f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>']
 
 
-def _row(y: float, label: str) -> list[str]:
-    """Return a grid line at a tick of the y axis, and its label."""
+def _grid_line(y: float, label: str) -> list[str]:
+    """Return a horizontal grid line at a tick of the y axis, and its label."""
     line = f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>'
     return [line, f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>']
 
 
 def _to_axes(line: Line, logarithmic: bool) -> Line:
-    """Return the finite points of a line, in the coordinates of the axes."""
+    """Return a line with only its finite points; on a logarithmic axis, y becomes log10(y)."""
     points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y)]
     return replace(line, points=[(x, math.log10(y)) for x, y in points if y > 0] if logarithmic else points)
 
@@ -128,19 +128,19 @@ def _dash(line: Line) -> tuple[str, str]:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Return the rows of the legend, with names in the colors of their lines; none for a single line."""
+    """Return the rows of the legend, with each name in the color of its line; no rows for a single line."""
     rows: list[str] = []
-    room = 0
+    free_letters = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):
         if not line.name:
             continue
-        name = line.name + (f" ({word})" if (word := _dash(line)[1]) else "")
-        if len(name) > room:
+        name = line.name + (f" ({style})" if (style := _dash(line)[1]) else "")
+        if len(name) > free_letters:
             rows.append("")
-            room = LEGEND_LETTERS
+            free_letters = LEGEND_LETTERS
         gap = ' dx="12"' if rows[-1] else ""
         rows[-1] += f'<tspan{gap} style="fill:{_color(line, i)}">{html.escape(name)}</tspan>'
-        room -= len(name) + 2
+        free_letters -= len(name) + 2
     return rows
 
 
@@ -164,15 +164,15 @@ def _decade_ticks(low: float, high: float) -> list[float]:
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
-def _numbers(values: Sequence[float], integers: bool = False) -> list[str]:
+def _tick_labels(values: Sequence[float], integers: bool = False) -> list[str]:
     """Return tick labels with enough digits to tell them apart: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
     if integers and any(value % 100 for value in values):
         return [f"{value:,.0f}" for value in values]
-    candidates = [[_number(value, digits) for value in values] for digits in range(3, 10)]
+    candidates = [[_format_number(value, digits) for value in values] for digits in range(3, 10)]
     return next((labels for labels in candidates if len(set(labels)) == len(set(values))), candidates[-1])
 
 
-def _number(value: float, digits: int) -> str:
+def _format_number(value: float, digits: int) -> str:
     for limit, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
             return f"{value / limit:.{digits}g}{suffix}"
@@ -188,9 +188,10 @@ MAX_POINT_DISTANCE = 3.0  # of points from the center of the cameras, relative t
 
 
 def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floating]) -> list[str]:
-    """Draw cameras, and points [N, 3] around them, from above and from the side.
+    """Return SVG plans of cameras, and of points around them, [N, 3]: from above and from the side.
 
-    views: the views of each group, by its name in the legend.  Each camera shows its name on hover.
+    views: groups of views by their name in the legend.  Each camera shows its name on hover.
+    There are no plans for fewer than two cameras.
     """
     views = {name: group for name, group in views.items() if group}
     all_views = [view for group in views.values() for view in group]
@@ -199,9 +200,9 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
     up = up_direction(all_views)
     right = perpendicular(up)
     centers = np.stack([view.position for view in all_views])
-    reach = MAX_POINT_DISTANCE * float(np.abs(centers - centers.mean(axis=0)).max())
+    max_distance = MAX_POINT_DISTANCE * float(np.abs(centers - centers.mean(axis=0)).max())
     sample = points[:: max(1, len(points) // MAX_PLAN_POINTS)].astype(np.float64)
-    nearby = sample[(np.abs(sample - centers.mean(axis=0)) < max(reach, 1e-9)).all(axis=1)]
+    nearby = sample[(np.abs(sample - centers.mean(axis=0)) < max(max_distance, 1e-9)).all(axis=1)]
     planes = {"cameras from above": np.cross(right, up), "cameras from the side": -up}
     return [_plan(title, views, nearby, np.stack([right, down])) for title, down in planes.items()]
 
@@ -209,13 +210,13 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
 def _plan(
     title: str, views: Mapping[str, Sequence[View]], points: NDArray[np.float64], axes: NDArray[np.float64]
 ) -> str:
-    """Draw points, and each camera as a triangle that opens in its view direction.  axes: right and down, [2, 3]."""
+    """Return a plan of points and cameras, drawn as triangles that open forward.  axes: right and down, [2, 3]."""
     centers = {name: np.stack([view.position for view in group]) @ axes.T for name, group in views.items()}
     positions = np.concatenate([points @ axes.T, *centers.values()])
     low, high = positions.min(axis=0), positions.max(axis=0)
-    room = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
-    scale = float((room / np.maximum(high - low, 1e-12)).min())
-    corner = np.array([MARGIN, MARGIN + TITLE]) + (room - scale * (high - low)) / 2
+    available = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
+    scale = float((available / np.maximum(high - low, 1e-12)).min())
+    corner = np.array([MARGIN, MARGIN + TITLE]) + (available - scale * (high - low)) / 2
 
     def pixels(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(corner + scale * (values - low))
@@ -228,8 +229,8 @@ def _plan(
         color = COLORS[i % len(COLORS)]
         parts.append(f'<g fill="{color}" fill-opacity=".75" stroke="{color}">')
         for view, center in zip(group, pixels(centers[name]), strict=True):
-            shape = _triangle(center, axes @ view.world_to_camera[2, :3])
-            parts.append(f'<path d="{shape}"><title>{html.escape(view.name)}</title></path>')
+            triangle = _triangle(center, axes @ view.world_to_camera[2, :3])
+            parts.append(f'<path d="{triangle}"><title>{html.escape(view.name)}</title></path>')
         legend = f'x="{PLAN_WIDTH - MARGIN}" y="{18 + 14 * i}" text-anchor="end" style="fill:{color}"'
         parts.append(f"</g><text {legend}>{len(group)} {html.escape(name)}</text>")
     return "".join([*parts, "</svg>"])

@@ -4,13 +4,13 @@
     blocks    [B, 6] float32: smallest t of x, y, z, then step, of each BLOCK consecutive splats
     positions [6, N] uint8: low bytes of x, y, z, then high bytes; t = smallest + step · (low + 256 high); a position
               is origin + unit · sign(t) (e^|t| - 1), so that precision falls with the distance from the center
-    quats     [N] uint32: index of the largest component in bits 31-30; the others, from x on, 10 bits each
+    quats     [N] uint32: index of the largest component in bits 31-30; the other three in order, 10 bits each
     scales    [3, N], opacity [1, N], colors [3 K, N] uint8: indices; colors by coefficient, then channel
-    motion    [columns, N] float16, if the model moves: the columns of clsplat/formats/splats.py, with the rotation as
-              change of the unit quaternion above, x, y, z, w
+    motion    [columns, N] float16, only of moving models: the columns of clsplat/formats/splats.py, with the rotation
+              as the change of the unit quaternion above, x, y, z, w
 
-All numbers are little-endian.  Splats are sorted into LEVELS parts of decreasing importance, so that the first parts
-show the scene coarsely.  Within a part they follow a space-filling curve, which keeps the blocks small.
+All values are little-endian.  Splats are sorted into LEVELS parts of decreasing importance, so that the first parts
+show a coarse scene.  Within a part, splats follow a space-filling curve, which keeps the blocks small.
 """
 
 import gzip
@@ -31,11 +31,11 @@ BLOCK = 256  # splats
 LEVELS = 8
 MIN_OPACITY = 1 / 255  # fainter Gaussians are never drawn (ALPHA_MIN in cl_kernels/common.h)
 MIN_NORM2 = 1e-12  # shorter quaternions have no direction (QUAT_NORM2_MIN)
-MAX_LOG_RATIO = 9.0  # of scales: flatter Gaussians look the same under the screen filter
+MAX_LOG_RATIO = 9.0  # largest log ratio of scales; flatter Gaussians look the same under the screen filter
 STEPS = 2**14 - 1  # across a block
 RANK_WEIGHT = 0.25  # weight of the rank in the spacing of a table; the rest is by value
-KNEE = 0.5  # of colors of bands above 0: the table is linear below, logarithmic above
-MIN_RANGE = 3.0  # of that table, because steps finer than 0.01 cost bytes and are invisible
+KNEE = 0.5  # color of bands above 0 up to which steps of the table are even; larger steps above
+MIN_RANGE = 3.0  # smallest range of that table; steps finer than 0.01 cost bytes and are invisible
 BITS = 10  # per component of a quaternion
 MAX_HALF = 65504.0  # largest float16
 
@@ -66,28 +66,29 @@ class Packed:
 def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> Packed:
     """Pack a model, with the Gaussians of its sky; the same model gives the same bytes.
 
-    limit: number of splats to keep, the most important ones; None: all; sky_center: see with_sky_splats.
+    limit: maximum number of splats, of which the most important are kept; None keeps all.  sky_center: as in
+    `with_sky_splats`.
     """
-    without_sky = len(model)
+    scene_count = len(model)
     model = with_sky_splats(model, center=sky_center).baked()
-    faint = int((model.opacities <= MIN_OPACITY).sum()) if limit is None or limit >= len(model) else 0
-    order = _order(model, limit)
-    sky = int((order >= without_sky).sum())
+    faint_count = int((model.opacities <= MIN_OPACITY).sum()) if limit is None or limit >= len(model) else 0
+    order = _draw_order(model, limit)
+    sky_count = int((order >= scene_count).sum())
     model = model[order]
     frame = _frame(model.means.astype(np.float64))
     count = len(model)
     logs = model.log_scales.astype(np.float64)
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - MAX_LOG_RATIO)
-    scales, opacity, base = (_table(values) for values in (logs, model.opacities, model.sh_base))
+    scales, opacity, base = (_value_table(values) for values in (logs, model.opacities, model.sh_base))
     rest = _even_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
     tables = np.stack([np.exp(np.minimum(scales, MAX_LOG)), opacity, base, rest]).astype("<f4")
     planes: list[NDArray[Any]] = [tables, *_positions(_logarithmic(model.means, *frame)), _quaternions(model.quats)]
-    columns = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
-    planes += [_codes(table, column) for table, values in columns for column in values.T]
+    pairs = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
+    planes += [_nearest_indices(table, column) for table, values in pairs for column in values.T]
     header = {
         "count": count,
-        "faint": faint,  # Gaussians too faint to draw; without a limit, a valid model loses only these
-        **({"sky": sky} if sky else {}),
+        "faint": faint_count,  # Gaussians too faint to draw; without a limit, a valid model loses only these
+        **({"sky": sky_count} if sky_count else {}),
         "degree": model.sh_degree,
         "near": model.near,
         "variance": model.rendering.screen_variance,
@@ -104,22 +105,22 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
     return Packed(header, gzip.compress(data, 7, mtime=0))
 
 
-def _visible(model: Model) -> NDArray[np.intp]:
-    """Return the indices of the Gaussians that are finite and not too faint."""
+def _visible_indices(model: Model) -> NDArray[np.intp]:
+    """Return the indices of Gaussians that have finite values, a rotation, and enough opacity to be drawn."""
     is_finite = np.logical_and.reduce([np.isfinite(table).all(axis=1) for table in model.tables().values()])
     has_direction = (model.quats.astype(np.float64) ** 2).sum(axis=1) >= MIN_NORM2
     return np.flatnonzero(is_finite & has_direction & (model.opacities > MIN_OPACITY))
 
 
-def _order(model: Model, limit: int | None) -> NDArray[np.intp]:
-    """Return visible indices in LEVELS parts of decreasing importance, in Morton order within each part."""
-    visible = _visible(model)
+def _draw_order(model: Model, limit: int | None) -> NDArray[np.intp]:
+    """Return the indices of visible Gaussians in LEVELS parts of decreasing importance, each part in Morton order."""
+    visible = _visible_indices(model)
     means = model.means[visible].astype(np.float64)
     areas = np.sort(model.log_scales[visible].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
-    ranked = np.argsort(-(areas + np.log(model.opacities[visible].astype(np.float64))), kind="stable")[:limit]
+    by_importance = np.argsort(-(areas + np.log(model.opacities[visible].astype(np.float64))), kind="stable")[:limit]
     points = _logarithmic(means, *_frame(means))
-    borders = [len(ranked) * level // LEVELS for level in range(LEVELS + 1)]
-    parts = [ranked[begin:end] for begin, end in itertools.pairwise(borders)]
+    borders = [len(by_importance) * level // LEVELS for level in range(LEVELS + 1)]
+    parts = [by_importance[begin:end] for begin, end in itertools.pairwise(borders)]
     return np.asarray(visible[np.concatenate([part[morton_order(points[part])] for part in parts])])
 
 
@@ -138,7 +139,7 @@ def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Fl
 
 
 def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
-    """Return the smallest coordinate and the step of each block, [B, 6], and the numbers of steps as bytes, [6, N]."""
+    """Return the smallest coordinates and the step sizes of each block, [B, 6], and the steps as bytes, [6, N]."""
     starts = np.arange(0, len(means), BLOCK)
     low = np.minimum.reduceat(means, starts) if len(means) else np.empty((0, 3))
     high = np.maximum.reduceat(means, starts) if len(means) else np.empty((0, 3))
@@ -153,9 +154,9 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     """Pack the three smaller components of unit quaternions (x, y, z, w), with the largest made positive, [N]."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    largest, others = smallest_three(unit)
-    top = 2**BITS - 1
-    codes = np.rint((others * np.sqrt(0.5) + 0.5) * top).clip(0, top).astype(np.uint32)
+    largest, smaller = smallest_three(unit)
+    max_code = 2**BITS - 1
+    codes = np.rint((smaller * np.sqrt(0.5) + 0.5) * max_code).clip(0, max_code).astype(np.uint32)
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
     packed = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
     return np.asarray(packed, "<u4")
@@ -164,22 +165,22 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
 def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
     """Return the columns of the motion, [columns, N], with rotations relative to the stored quaternions."""
     columns = motion.astype(np.float64)
-    if (turn := motion_fields(motion.shape[1]).get("turn")) is not None:
+    if (rotation := motion_fields(motion.shape[1]).get("turn")) is not None:
         unit = np.roll(quats.astype(np.float64), -1, axis=1)
         largest = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
         norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest < 0, -1.0, 1.0)
-        columns[:, turn] = np.roll(columns[:, turn], -1, axis=1) / norm
+        columns[:, rotation] = np.roll(columns[:, rotation], -1, axis=1) / norm
     return columns.clip(-MAX_HALF, MAX_HALF).astype("<f2").T
 
 
 def _motion_header(columns: int) -> dict[str, int]:
-    """Return the number of columns, the number of powers above the first, and the first column of the rotation."""
-    turn = motion_fields(columns).get("turn")
-    return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": turn.start if turn else 0}
+    """Return the number of columns, of powers of time above the first, and the first column of the rotation or 0."""
+    rotation = motion_fields(columns).get("turn")
+    return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": rotation.start if rotation else 0}
 
 
-def _table(values: NDArray[np.floating]) -> Floats:
-    """Return a table of 256 ascending values, denser where there are more `values`."""
+def _value_table(values: NDArray[np.floating]) -> Floats:
+    """Return a table of 256 ascending values, which are denser where `values` are denser."""
     ordered = np.sort(np.asarray(values, np.float64), axis=None)
     if not len(ordered) or ordered[0] == ordered[-1]:
         return np.full(256, ordered[0] if len(ordered) else 0.0)
@@ -196,7 +197,7 @@ def _even_table(largest: float) -> Floats:
     return np.append(values, values[-1])
 
 
-def _codes(table: Floats, values: NDArray[np.floating]) -> Bytes:
-    """Return the index of the nearest table value for each of the values, in their shape."""
+def _nearest_indices(table: Floats, values: NDArray[np.floating]) -> Bytes:
+    """Return the index of the nearest table value for each value, in the shape of `values`."""
     borders = (table[1:] + table[:-1]) / 2
     return np.searchsorted(borders, values).astype(np.uint8)

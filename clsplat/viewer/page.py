@@ -1,4 +1,4 @@
-"""Write the viewer page: a single file that shows models, opens from the disk, and needs no network."""
+"""Write the viewer page: a single HTML file that shows models and works offline."""
 
 import base64
 import re
@@ -40,7 +40,7 @@ def camera_data(view: View) -> dict[str, Any]:
 
 
 def float32_digits(values: NDArray[np.floating]) -> list[float]:
-    """Return numbers rounded to the digits that float32 needs."""
+    """Return values rounded to nine significant digits, which identify a float32."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
 
@@ -49,16 +49,16 @@ SCRIPTS = (
     *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
     *("panel", "settings", "time", "main"),
 )
-TIMESTAMPS = 31  # number of times if the views of the page have fewer than two
+TIMESTAMPS = 31  # number of timestamps if the views of the page have fewer than two
 MAX_SIZE = 200.0  # MB; browsers need several times this in memory
-MARGIN = 0.97  # of that size, because important splats may compress worse than the average
-MARK = b'<canvas id="frustums"'  # in viewer.html.j2
+MARGIN = 0.97  # fraction of it to fill, because important splats may compress worse than the average
+MARK = b'<canvas id="frustums"'  # in viewer.html.j2; identifies viewer pages
 COLORS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
 class Page:
-    """The contents of a page: models by name, shown with one camera, and the views of a scene."""
+    """The contents of a page: models by name, the initial viewpoint, and the views of a scene."""
 
     title: str
     models: Mapping[str, Packed]
@@ -70,12 +70,12 @@ class Page:
     def text(self) -> str:
         """Return the HTML of the page; the same models and views give the same bytes."""
         names = [view["name"] for view in self.views]
-        first = names.index(self.viewpoint.start.name) if self.viewpoint.start.name in names else -1
+        first_view = names.index(self.viewpoint.start.name) if self.viewpoint.start.name in names else -1
         info = {
             **viewpoint_data(self.viewpoint),
             "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
             "views": self.views,
-            "first": first,
+            "first": first_view,
             "background": COLORS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
             **({"moments": self._timestamps} if self.is_moving else {}),
@@ -105,29 +105,29 @@ class Page:
     @property
     def size(self) -> float:
         """The approximate size of the page, MB."""
-        photographs = sum(len(view["thumbnail"]) + len(view["photograph"] or "") for view in self.views)
-        return (photographs + sum(len(packed.data) * 4 / 3 for packed in self.models.values())) / 1e6 + 0.1
+        photograph_bytes = sum(len(view["thumbnail"]) + len(view["photograph"] or "") for view in self.views)
+        return (photograph_bytes + sum(len(packed.data) * 4 / 3 for packed in self.models.values())) / 1e6 + 0.1
 
     @property
     def max_splats(self) -> int:
-        """The largest number of splats per model for a page below MAX_SIZE."""
-        splats = sum(len(packed.data) * 4 / 3e6 for packed in self.models.values())
-        room = max(0.0, MAX_SIZE - (self.size - splats))
+        """The largest number of splats per model that keeps the page below MAX_SIZE."""
+        splat_size = sum(len(packed.data) * 4 / 3e6 for packed in self.models.values())
+        available = max(0.0, MAX_SIZE - (self.size - splat_size))
         low, high = 0, max(packed.count for packed in self.models.values())
         while low < high:  # a model with fewer splats keeps all of them
             count = (low + high + 1) // 2
             size = sum(len(p.data) * 4 / 3e6 * min(1, count / max(p.count, 1)) for p in self.models.values())
-            low, high = (count, high) if size <= MARGIN * room else (low, count - 1)
+            low, high = (count, high) if size <= MARGIN * available else (low, count - 1)
         return low
 
     def write(self, path: Path) -> None:
         """Write the page.  Raises OutputError if it is too large for browsers, or cannot be written."""
         if self.size > MAX_SIZE:
-            number = self.max_splats
-            splats = f"only the {number:,} most important splats (--splats {number}), or " if number else ""
+            limit = self.max_splats
+            remedy = f"only the {limit:,} most important splats (--splats {limit}), or " if limit else ""
             raise OutputError(
                 f"{path}: the page would have {self.size:.0f} MB, and browsers open at most {MAX_SIZE:.0f} MB; show "
-                f"{splats}fewer photos (--photographs, --photograph-budget)"
+                f"{remedy}fewer photos (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())
 
@@ -153,9 +153,9 @@ def script() -> str:
     return join_scripts(SCRIPTS)
 
 
-def join_scripts(names: Sequence[str], others: Sequence[str] = ()) -> str:
-    """Join scripts of this folder, by name, and the texts of other scripts into one JavaScript function."""
-    parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *others]
+def join_scripts(names: Sequence[str], sources: Sequence[str] = ()) -> str:
+    """Join scripts of this folder, by name, and the sources of other scripts into one JavaScript function."""
+    parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *sources]
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
 
 
@@ -181,13 +181,13 @@ def view_entries(
 ) -> list[dict[str, Any]]:
     """Return the data of every view of a scene, as photographs.js reads it.
 
-    read: returns a photo, RGB at the camera's size.  budget: MB of photos; if they exceed it, only every second, third,
-    … is included.  progress: wraps the iteration over views, such as with a progress bar.
+    read: returns a photo, RGB at the camera's size.  budget: MB of photos; if they exceed it, only every n-th one is
+    included.  progress: wraps the iteration over views, for example in a progress bar.
     """
-    test = {view.name for view in scene.split("test")}
+    test_names = {view.name for view in scene.split("test")}
     views: list[dict[str, Any]] = []
     for view in progress(scene.views):
-        pixels, split = read(view), "test" if view.name in test else "train"
+        pixels, split = read(view), "test" if view.name in test_names else "train"
         is_included = included in ("all", split)
         photograph = data_url(shrink(pixels, LARGEST)) if is_included else None
         thumbnail = data_url(shrink(pixels, THUMBNAIL))
@@ -201,6 +201,6 @@ def view_entries(
 
 
 def omitted_indices(sizes: list[int], budget: int) -> set[int]:
-    """Return the indices to omit so that every n-th one stays and the sum of their sizes is at most `budget`."""
-    every = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
-    return {i for i in range(len(sizes)) if every > len(sizes) or i % every}
+    """Return the indices to omit: every n-th stays, for the smallest n that keeps the sum of sizes within `budget`."""
+    interval = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
+    return {i for i in range(len(sizes)) if interval > len(sizes) or i % interval}

@@ -1,7 +1,7 @@
 """Read camera paths from files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
-camera_path  one entry per frame: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical),
+camera_path  one entry per frame: camera_to_world (16 values, row-major, OpenGL axes), fov (degrees, vertical),
              aspect, render_time (0 to 1, in a dynamic scene)
 """
 
@@ -54,24 +54,24 @@ class CameraPath:
 
 
 def read(path: Path, scene: Path | None = None) -> CameraPath:
-    """Read a camera path, with its poses in the coordinates of the scene in a folder.
+    """Read a camera path, and transform its poses to the coordinates of a scene folder.
 
-    nerfstudio transforms a scene, and writes the transform to a file WORLD, which is expected next to the path; without
-    it, the poses are used unchanged, with a warning.
-    Raises DataError for other files, invalid numbers, and cameras that are not perspective.
+    nerfstudio transforms a scene, and writes the transform to a file, WORLD.  If that file is not next to the path, the
+    poses are used unchanged, and a warning is logged.
+    Raises DataError for other files, invalid values, and cameras that are not perspective.
     """
-    table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
-    if isinstance(table, list):
+    data = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
+    if isinstance(data, list):
         return _read_cameras(path)
-    frames = table.get("camera_path") if isinstance(table, dict) else None
+    frames = data.get("camera_path") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
-    if (kind := table.get("camera_type", "perspective")) != "perspective":
+    if (kind := data.get("camera_type", "perspective")) != "perspective":
         raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective; export the path again")
-    size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
-    move = _world_transform(path, scene)
+    size, fps = _size_and_rate(JsonFrame(path.parent, str(path), data))
+    to_scene = _world_transform(path, scene)
     views = []
     for i, entry in enumerate(frames):
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
@@ -83,8 +83,8 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
             raise DataError(f"{frame.source}: render_time is {time:g}; expected 0 to 1; export the path again")
-        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
-    return CameraPath(views, rate, size)
+        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), to_scene(pose), time=time))
+    return CameraPath(views, fps, size)
 
 
 def _read_cameras(path: Path) -> CameraPath:
@@ -119,11 +119,11 @@ def resample(views: Sequence[View], frames: int) -> list[View]:
     timestamps = [view.time for view in views if view.time is not None]
     has_times = len(timestamps) == len(views)
     times = np.interp(positions, np.arange(len(views)), timestamps).tolist() if has_times else [None] * frames
-    first = views[0].camera
+    camera = views[0].camera
     return [
         View(
             f"frame_{i:05d}",
-            Camera(first.width, first.height, *lens),
+            Camera(camera.width, camera.height, *lens),
             np.column_stack([rotation, -rotation @ center]),
             time=time,
         )
@@ -134,13 +134,13 @@ def resample(views: Sequence[View], frames: int) -> list[View]:
 
 
 def _camera(size: Size, fov: float) -> Camera:
-    """Return a camera with a vertical field of view in rad."""
+    """Return a camera with a vertical field of view, rad."""
     focal = size[1] / 2 / math.tan(fov / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
 def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
-    """Return the frame size, in even numbers, and the frames per second, or defaults if the file has none."""
+    """Return the frame size, rounded down to even sides, and the frames per second; defaults if the file has none."""
     sides, fps = [document.number(key) for key in ("render_width", "render_height")], document.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
     try:
@@ -149,11 +149,11 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
         raise DataError(f"{document.source}: {error}; export the path again") from error
 
 
-def _rows(numbers: Any) -> Any:
-    """Return 16 numbers as four rows; anything else is returned unchanged, for a later check."""
-    if not isinstance(numbers, list) or len(numbers) != 16:
-        return numbers
-    return [numbers[i : i + 4] for i in range(0, 16, 4)]
+def _rows(values: Any) -> Any:
+    """Return 16 values as four rows; anything else is returned unchanged and rejected later."""
+    if not isinstance(values, list) or len(values) != 16:
+        return values
+    return [values[i : i + 4] for i in range(0, 16, 4)]
 
 
 def _world_transform(path: Path, scene: Path | None) -> Any:
@@ -167,21 +167,21 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
         return lambda pose: pose
     matrix, scale = _affine(file)
     rotation, translation = matrix[:, :3], matrix[:, 3]
-    applied = _applied_transform(scene)
+    applied_transform = _applied_transform(scene)
 
     @np.errstate(all="ignore")  # poses that are not finite are rejected later
-    def move(pose: Floats) -> Floats:
+    def to_scene(pose: Floats) -> Floats:
         """Invert x' = scale · (rotation x + translation), nerfstudio's transform."""
         center = -pose[:, :3].T @ pose[:, 3]
-        turned = pose[:, :3] @ rotation @ applied[:, :3].T
-        position = applied[:, :3] @ (rotation.T @ (center / scale - translation)) + applied[:, 3]
-        return np.column_stack([turned, -turned @ position])
+        scene_rotation = pose[:, :3] @ rotation @ applied_transform[:, :3].T
+        position = applied_transform[:, :3] @ (rotation.T @ (center / scale - translation)) + applied_transform[:, 3]
+        return np.column_stack([scene_rotation, -scene_rotation @ position])
 
-    return move
+    return to_scene
 
 
 def _affine(file: Path) -> tuple[Floats, float]:
-    """Read the rotation and translation, [3, 4], and the scale of a file WORLD.  Raises DataError."""
+    """Read the rotation and translation, [3, 4], and the scale from a file WORLD.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
@@ -202,7 +202,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
 
 
 def _applied_transform(scene: Path | None) -> Floats:
-    """Read the transform, [3, 4], that nerfstudio had applied to the poses of a scene's transforms.json."""
+    """Read the transform, [3, 4], that nerfstudio applied to the poses of a scene's transforms.json, or identity."""
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():
         return np.eye(3, 4)

@@ -22,9 +22,9 @@ from clsplat.viewer.video.paths import Size, check_fps, check_size
 
 SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS = 0x18538067, 0x1654AE6B, 0xAE, 0x1254C367, 0x7373, 0x63C0
 PARENTS = {SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS}
-CLUSTER = 0x1F43B675  # the first frames; the tracks come before them
+CLUSTER = 0x1F43B675  # element of the first frames, which follows the tracks
 UIDS = {0x73C5, 0x63C5}  # TrackUID, and TagTrackUID
-HEAD = 1 << 16  # bytes, which hold all UIDs
+HEAD = 1 << 16  # bytes at the start of a file that contain all UIDs
 
 
 def fix_track_ids(path: Path) -> None:
@@ -39,8 +39,8 @@ def fix_track_ids(path: Path) -> None:
 def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
     """Yield the offset and size of each UID in EBML data."""
     while start + 2 <= end:
-        kind, start = _number(data, start, keep_marker=True)
-        size, start = _number(data, start, keep_marker=False)
+        kind, start = _read_integer(data, start, keep_marker=True)
+        size, start = _read_integer(data, start, keep_marker=False)
         if kind == CLUSTER or start > end:
             return
         if kind in UIDS and start + size <= end:
@@ -50,8 +50,8 @@ def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
         start += size
 
 
-def _number(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
-    """Read an EBML variable-length number, with or without its length marker; return it and the offset of its end."""
+def _read_integer(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
+    """Read an EBML variable-length integer, with or without its length marker; return it and the offset of its end."""
     length = 9 - data[start].bit_length() if start < len(data) else 1
     value = int.from_bytes(data[start : start + length], "big")
     return (value if keep_marker else value & ((1 << (7 * length)) - 1)), start + length
@@ -59,15 +59,15 @@ def _number(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
 
 Image = NDArray[np.uint8]
 Write = Callable[[Image], None]  # writes a frame, RGB, [height, width, 3]
-CODEC = "VP80"  # with OpenCV's settings, VP9 gives the same size and PSNR in 4.5 times the time
+CODEC = "VP80"  # with OpenCV's settings, VP9 reaches the same size and PSNR in 4.5 times the time
 QUALITY = "18"  # constant rate factor of H.264: visually almost lossless
-NO_MB_TREE = "0"  # with AVX-512, x264's macroblock tree gives different bits in each run
-BT709 = 1  # FFmpeg's number of the color space
+NO_MB_TREE = "0"  # with AVX-512, x264's macroblock tree is not deterministic
+BT709 = 1  # FFmpeg's code of the color space
 ALTERNATIVE = "or write images with --out DIR, which any encoder reads"
 
 
 def check_file(path: Path) -> None:
-    """Raise ConfigError if a video cannot be written: unknown suffix, no encoder, or the name of a run's file."""
+    """Raise ConfigError if the suffix is unknown, has no encoder, or the name belongs to a file of a run."""
     check_encoder(path)
     check_result_path(path, path.suffix.lower())
 
@@ -85,7 +85,7 @@ def check_encoder(path: Path) -> None:
 def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
     """Yield a function that writes a frame; the complete file is read back at the end of the block.
 
-    size: of a frame, px, even numbers.  Raises OutputError, and keeps an existing file.
+    size: width and height of a frame, px, both even.  Raises OutputError, and then keeps an existing file.
     """
     suffix, count = path.suffix.lower(), 0
     with atomic_path(path, suffix) as temporary:
@@ -99,9 +99,9 @@ def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
             yield write_counted
         if suffix == ".webm":
             fix_track_ids(temporary)
-        if (readable := count_frames(temporary)) != count:
+        if (readable_count := count_frames(temporary)) != count:
             raise OutputError(
-                f"{path}: {readable} of {count} frames can be read back; check the folder and the free space"
+                f"{path}: {readable_count} of {count} frames can be read back; check the folder and the free space"
             )
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -114,17 +114,17 @@ def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -
     """
     check_file(path)
     check_fps(fps)
-    pictures = map(to_8_bits, images)
-    first = next(pictures, None)
+    frames = map(to_8_bits, images)
+    first = next(frames, None)
     if first is None:
         raise ValueError("a video needs at least one image")
     height, width = first.shape[:2]
     count = 0
     with open_video(path, check_size((width, height)), fps) as write:
-        for picture in chain([first], pictures):
-            if picture.shape != (height, width, 3):
-                raise ValueError(f"image {count} has shape {picture.shape}; expected {(height, width, 3)}")
-            write(picture)
+        for frame in chain([first], frames):
+            if frame.shape != (height, width, 3):
+                raise ValueError(f"image {count} has shape {frame.shape}; expected {(height, width, 3)}")
+            write(frame)
             count += 1
     return count
 
@@ -200,14 +200,14 @@ def _av() -> ModuleType:
 def _without_codec_message() -> Iterator[None]:
     """Discard a message of OpenCV's FFmpeg about the codec, which no setting suppresses."""
     try:
-        stderr = os.dup(2)
+        stderr_copy = os.dup(2)
     except OSError:  # closed
         yield
         return
-    with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
+    with open(os.devnull, "wb") as null_device:
+        os.dup2(null_device.fileno(), 2)
     try:
         yield
     finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+        os.dup2(stderr_copy, 2)
+        os.close(stderr_copy)

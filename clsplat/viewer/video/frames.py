@@ -29,25 +29,25 @@ class Canvas:
     painter: Painter
 
     def render_layers(self, view: View, depth: bool = False) -> Layers:
-        """Render a view.  Raises NumericError if the render is not finite."""
-        rendered = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), depth)
-        for values in rendered.arrays:
+        """Render the color, alpha, and optionally depth of a view.  Raises NumericError if they are not finite."""
+        layers = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), depth)
+        for values in layers.arrays:
             require_finite(values, view)
-        return rendered
+        return layers
 
     def picture(self, view: View) -> Image:
-        """Render a view to 8 bits, [height, width, 3]."""
+        """Render a view as 8-bit RGB, [height, width, 3]."""
         return to_8_bits(self.render_layers(view).image)
 
     def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
-        """Return near and far, scene units: quantiles of the depths in a sample of the views."""
+        """Return near and far, scene units: quantiles of the depths in a sample of views, or 1 and 2 without depths."""
         depths = []
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
-            view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
-            small = replace(view, camera=view.camera.downscaled(max(1, longest / PROBE_SIDE)))
-            rendered = self.render_layers(small, depth=True)
-            assert rendered.depth is not None
-            depths.append(rendered.depth[rendered.alpha > OPAQUE])
+            view, long_side = views[i], max(views[i].camera.width, views[i].camera.height)
+            small_view = replace(view, camera=view.camera.downscaled(max(1, long_side / PROBE_SIDE)))
+            layers = self.render_layers(small_view, depth=True)
+            assert layers.depth is not None
+            depths.append(layers.depth[layers.alpha > OPAQUE])
         all_depths = np.concatenate(depths)
         if not len(all_depths):
             return 1.0, 2.0
@@ -55,27 +55,27 @@ class Canvas:
         return float(min(near, far * (1 - MIN_RANGE))), float(far)
 
 
-def layer_image(rendered: Layers, layer: str, depths: tuple[float, float]) -> Image:
-    """Return one of LAYERS as 8 bits, RGB, [height, width, 3]."""
+def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Image:
+    """Return one of LAYERS as 8-bit RGB, [height, width, 3].  depths: near and far, scene units."""
     if layer == "color":
-        return to_8_bits(rendered.image)
+        return to_8_bits(layers.image)
     if layer == "alpha":
-        return np.repeat(to_8_bits(rendered.alpha)[:, :, None], 3, axis=2)
-    assert rendered.depth is not None
-    return depth_image(rendered.depth, rendered.alpha, depths)
+        return np.repeat(to_8_bits(layers.alpha)[:, :, None], 3, axis=2)
+    assert layers.depth is not None
+    return depth_image(layers.depth, layers.alpha, depths)
 
 
-def layer_values(rendered: Layers, layer: str) -> NDArray[np.float32]:
+def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
     """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
-    array = {"color": rendered.image, "depth": rendered.depth, "alpha": rendered.alpha}[layer]
+    array = {"color": layers.image, "depth": layers.depth, "alpha": layers.alpha}[layer]
     assert array is not None
     return array
 
 
 def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
-    """Return depths, [height, width], as colors from red (near) to blue (far), black where the image is empty.
+    """Return depths, [height, width], as colors from red (near) to blue (far), and black where alpha is 0.
 
-    Colors are linear in inverse depth, because differences between near depths matter more to the eye.
+    Colors are linear in inverse depth, because differences between small depths are more visible.
     """
     near, far = depths
     with np.errstate(divide="ignore"):
@@ -85,9 +85,9 @@ def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: 
     return to_8_bits((colors / np.float32(255) * coverage).astype(np.float32))
 
 
-def side_by_side(image: Image, other: Image) -> Image:
-    """Join two images of the same height, left and right."""
-    return np.hstack([image, other])
+def side_by_side(left: Image, right: Image) -> Image:
+    """Join two images of the same height side by side."""
+    return np.hstack([left, right])
 
 
 def letterbox(image: Image, size: tuple[int, int]) -> Image:
@@ -95,8 +95,8 @@ def letterbox(image: Image, size: tuple[int, int]) -> Image:
     width, height = size
     factor = min(width / image.shape[1], height / image.shape[0])
     inner = max(1, min(width, round(image.shape[1] * factor))), max(1, min(height, round(image.shape[0] * factor)))
-    mode = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
     box = np.zeros((height, width, 3), np.uint8)
     left, top = (width - inner[0]) // 2, (height - inner[1]) // 2
-    box[top : top + inner[1], left : left + inner[0]] = cv2.resize(image, inner, interpolation=mode)
+    box[top : top + inner[1], left : left + inner[0]] = cv2.resize(image, inner, interpolation=interpolation)
     return box

@@ -23,7 +23,7 @@ from clsplat.scene.viewpoint import nearest_to_axes, up_direction
 # The input of a camera path: the cameras of the photos, their focus, and the up direction.
 
 Floats = NDArray[np.floating]
-MAX_POINTS = 20_000  # sampled to find near and far
+MAX_POINTS = 20_000  # number of points sampled for near and far
 QUANTILES = 0.05, 0.95  # of the visible depths, for near and far
 PARALLEL = 0.9  # length of the mean view direction above which the axes are too parallel for a focus
 DEPTH_MARGIN = 1.5  # factor for near and far; a focus of parallel axes outside of these bounds is replaced
@@ -39,13 +39,13 @@ class Rig:
 
     @classmethod
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
-        """Return the rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
+        """Return a rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
         if not views:
             raise DataError("a camera path needs the cameras of a scene, but there are none")
         is_outlier = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        step = -(-len(finite) // MAX_POINTS) or 1
-        return cls([view for view, is_far in zip(views, is_outlier, strict=True) if not is_far], finite[::step])
+        stride = -(-len(finite) // MAX_POINTS) or 1
+        return cls([view for view, is_far in zip(views, is_outlier, strict=True) if not is_far], finite[::stride])
 
     @cached_property
     def positions(self) -> Floats:
@@ -69,31 +69,31 @@ class Rig:
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3], or the middle of the visible depths if they are almost parallel.
+        """The point nearest to the optical axes, [3]; if those are almost parallel, the middle of the visible depths.
 
         Raises DataError if most cameras look away from it.
         """
         center = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
         focus = nearest_to_axes(self.positions, self.forwards, center)
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
-        depth = float(np.median(self._depths_of(focus)))
+        depth = float(np.median(self._point_depths(focus)))
         if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < depth < far * DEPTH_MARGIN:
             focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
-        if (self._depths_of(focus) > 0).mean() < MIN_FACING:
+        if (self._point_depths(focus) > 0).mean() < MIN_FACING:
             raise DataError(
                 "the cameras look away from each other, so there is no center to orbit; use the path through"
             )
         return focus
 
-    def _depths_of(self, point: Floats) -> Floats:
+    def _point_depths(self, point: Floats) -> Floats:
         """Return the depth of a point in each view, [V]."""
         return np.asarray(((point - self.positions) * self.forwards).sum(axis=1))
 
     @cached_property
     def depths(self) -> tuple[float, float]:
         """Near and far, scene units: quantiles of the visible depths."""
-        per_view = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
-        depths = np.concatenate(per_view)
+        view_depths = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
+        depths = np.concatenate(view_depths)
         if not len(depths):
             return 1.0, 10.0
         near, far = np.quantile(depths, QUANTILES)
@@ -124,27 +124,27 @@ def unit(vectors: Floats) -> Floats:
 
 Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
-SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between neighbors
+SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between consecutive views
 UP_WEIGHT = 0.1  # of up vectors relative to positions, times the distance
 MAX_VIEWS = 1000  # in a tour, evenly sampled by name
 ROUNDS = 20  # of 2-opt
 
 
 def tour_order(rig: Rig) -> Indices:
-    """Return the indices of the views, [V], in order of names, or from neighbor to neighbor if that tour is shorter."""
+    """Return the indices of the views, [V], sorted by name, or from neighbor to neighbor if that tour is shorter."""
     spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
     features = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
     by_name = by_name[:: -(-len(by_name) // MAX_VIEWS)]
     distances = scipy.spatial.distance.cdist(features[by_name], features[by_name])
-    tours = np.arange(len(by_name)), _shorten(_nearest_neighbors(distances), distances)
+    tours = np.arange(len(by_name)), _shorten(_nearest_neighbor_tour(distances), distances)
     return np.asarray(by_name[min(tours, key=lambda tour: _length(tour, distances))])
 
 
 def smooth(poses: Floats, frames: int, distance: float) -> Floats:
-    """Return evenly spaced samples of a B-spline of degree 5 near the poses, [frames, C].
+    """Return evenly spaced samples of a B-spline of degree 5 near the poses, [frames, 9].
 
-    poses: [V, C], positions, targets at a distance, and up vectors.
+    poses: [V, 9], positions, targets at `distance`, and up vectors.
     """
     weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
     scaled = poses * weights
@@ -160,8 +160,8 @@ def smooth(poses: Floats, frames: int, distance: float) -> Floats:
     return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
-def _nearest_neighbors(distances: Floats) -> Indices:
-    """Return a tour from the first view, each time to the nearest unvisited view."""
+def _nearest_neighbor_tour(distances: Floats) -> Indices:
+    """Return a tour that starts at the first view and continues to the nearest unvisited view each time."""
     tour, unvisited = [0], set(range(1, len(distances)))
     while unvisited:
         candidates = np.array(sorted(unvisited))
@@ -200,20 +200,20 @@ Size = tuple[int, int]  # width, height
 
 
 def check_size(size: str | Size) -> Size:
-    """Return a frame size, given as text such as 640x480 or as numbers.
+    """Parse a frame size: text such as 640x480, or width and height.
 
     Raises ConfigError unless both sides are even, as codecs require, and within bounds.
     """
     if isinstance(size, str):
         match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
-        pair = (int(match[1]), int(match[2])) if match else None
+        sides = (int(match[1]), int(match[2])) if match else None
     else:
-        pair = (size[0], size[1]) if len(size) == 2 and all(isinstance(side, int) for side in size) else None
-    if pair is None or not SIDES[0] <= min(pair) <= max(pair) <= SIDES[1] or pair[0] % 2 or pair[1] % 2:
+        sides = (size[0], size[1]) if len(size) == 2 and all(isinstance(side, int) for side in size) else None
+    if sides is None or not SIDES[0] <= min(sides) <= max(sides) <= SIDES[1] or sides[0] % 2 or sides[1] % 2:
         raise ConfigError(
             f"size {quote(size)}: expected WIDTHxHEIGHT in even numbers from {SIDES[0]} to {SIDES[1]}, such as 640x480"
         )
-    return pair
+    return sides
 
 
 def validate_size(text: str) -> str:
@@ -247,14 +247,14 @@ def even_size(camera: Camera) -> Size:
 
 
 def same_area(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another image size with the same area of view, centered."""
+    """Return a camera of another image size that views an equally large area; its principal point is the center."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
 
 
 def fit_inside(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another image size that contains the whole original image, centered."""
+    """Return a camera of another image size that contains the entire original image, centered."""
     return center_inside(camera, size, fit_scale(camera, size))
 
 
@@ -273,7 +273,7 @@ def fit_scale(camera: Camera, size: Size) -> float:
 
 
 LOG = logging.getLogger("clsplat")
-MAX_GAP = math.radians(100)  # between neighbors on a ring around the focus; wider gaps count as not photographed
+MAX_GAP = math.radians(100)  # between adjacent cameras on a ring around the focus; wider gaps were not photographed
 PERCENTILE = 90  # of the cameras' offsets, for the half axes (Barron et al. 2022)
 FOCUS_DEPTH = 0.75  # of a spiral, from near (0) to far (1) in inverse depth (Mildenhall et al. 2019)
 TURNS = 2  # of a spiral
@@ -290,12 +290,12 @@ def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
     Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
     """
     axes, offsets, height = _ring(rig)
-    half = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
-    if min(half) <= 1e-6 * max(half):
-        half = np.maximum(half, 0.05 * max(half, default=0.0))
-    angles = _sweep(np.arctan2(offsets[:, 1] / half[1], offsets[:, 0] / half[0]), frames)
-    flat = np.stack([half[0] * np.cos(angles), half[1] * np.sin(angles)], axis=1)
-    return _look_at(rig, rig.focus + flat @ axes + height.mean() * rig.up, rig.focus, size)
+    half_axes = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
+    if min(half_axes) <= 1e-6 * max(half_axes):
+        half_axes = np.maximum(half_axes, 0.05 * max(half_axes, default=0.0))
+    angles = _sweep(np.arctan2(offsets[:, 1] / half_axes[1], offsets[:, 0] / half_axes[0]), frames)
+    plane_offsets = np.stack([half_axes[0] * np.cos(angles), half_axes[1] * np.sin(angles)], axis=1)
+    return _look_at(rig, rig.focus + plane_offsets @ axes + height.mean() * rig.up, rig.focus, size)
 
 
 def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
@@ -309,12 +309,12 @@ def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
             math.degrees(gap),
         )
     angles = camera_angles[0] + 2 * np.pi * np.arange(frames) / frames
-    flat = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return _look_at(rig, rig.focus + flat @ axes + np.median(height) * rig.up, rig.focus, size)
+    plane_offsets = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return _look_at(rig, rig.focus + plane_offsets @ axes + np.median(height) * rig.up, rig.focus, size)
 
 
 def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Circle the mean of the cameras in two turns, looking at one point, for forward-facing scenes.
+    """Circle the mean camera position twice, looking at one point, for forward-facing scenes.
 
     Formulas of Local Light Field Fusion (Mildenhall et al. 2019).
     """
@@ -347,9 +347,9 @@ def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
 
 def views(rig: Rig, frames: int, size: Size) -> list[View]:
     """Return at most `frames` of the photos' cameras, evenly spaced, with the intrinsics of the photos."""
-    chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
+    indices = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
     return [
-        replace(rig.views[i], camera=fit_inside(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen
+        replace(rig.views[i], camera=fit_inside(rig.views[i].camera, size), lens=None, mask_path=None) for i in indices
     ]
 
 
@@ -388,28 +388,28 @@ def looking_views(positions: Floats, targets: Floats, ups: Floats, rig: Rig, siz
 
 
 def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
-    """Return two horizontal principal axes, [2, 3], and the cameras' offsets: along them, [V, 2], and up, [V]."""
+    """Return two horizontal principal axes, [2, 3], and the cameras' offsets along them, [V, 2], and along up, [V]."""
     offsets = rig.positions - rig.focus
-    height = offsets @ rig.up
-    flat = offsets - height[:, None] * rig.up
+    heights = offsets @ rig.up
+    flat = offsets - heights[:, None] * rig.up
     _, vectors = np.linalg.eigh(flat.T @ flat + 1e6 * float((flat**2).sum() + 1e-30) * np.outer(rig.up, rig.up))
-    first = vectors[:, 1] * (1.0 if vectors[:, 1] @ offsets[0] >= 0 else -1.0)
-    axes = np.stack([first, np.cross(rig.up, first)])
-    return axes, flat @ axes.T, height
+    main_axis = vectors[:, 1] * (1.0 if vectors[:, 1] @ offsets[0] >= 0 else -1.0)
+    axes = np.stack([main_axis, np.cross(rig.up, main_axis)])
+    return axes, flat @ axes.T, heights
 
 
 def _sweep(angles: Floats, frames: int) -> Floats:
-    """Return the angles of the frames: once around, or back and forth if there is a gap.  angles: of cameras, [V]."""
-    gap, begin = _gap(angles)
-    turn = 2 * np.pi * np.arange(frames) / frames
+    """Return the angle of each frame: a full turn, or back and forth if the cameras leave a gap.  angles: [V], rad."""
+    gap, start = _gap(angles)
+    phase = 2 * np.pi * np.arange(frames) / frames
     if gap < MAX_GAP:
-        return np.asarray(angles[0] + turn)
-    half = np.pi - gap / 2
-    return np.asarray(begin + half + ARC_FRACTION * half * np.sin(turn))
+        return np.asarray(angles[0] + phase)
+    half_arc = np.pi - gap / 2
+    return np.asarray(start + half_arc + ARC_FRACTION * half_arc * np.sin(phase))
 
 
 def _gap(angles: Floats) -> tuple[float, float]:
-    """Return the widest angle without a camera, and the angle of the camera after it."""
+    """Return the widest angle without a camera, and the angle of the camera after it, rad."""
     ring = np.sort(angles % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
     widest = int(gaps.argmax())

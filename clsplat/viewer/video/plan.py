@@ -56,7 +56,7 @@ def with_times(views: Sequence[View], times: Times) -> list[View]:
 
 
 def assign_times(views: Sequence[View], times: Times | None, moves: bool) -> list[View]:
-    """Return views with timestamps: the requested ones, or those of the views, or the full range for a moving model.
+    """Return views with timestamps: the requested ones, the existing ones, or the full range for a moving model.
 
     moves: whether the model moves.  Raises ConfigError if timestamps were requested for a model that does not move.
     """
@@ -142,18 +142,17 @@ class VideoPlan:
 def plan_video(
     request: VideoRequest, scene: Scene | None, points: Floats, moves: bool = False, origin: Floats | None = None
 ) -> VideoPlan:
-    """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it moves.
+    """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene.
 
-    origin: [3] world coordinates of the points' origin, by default that of the scene.
-
-    Raises ConfigError if the path needs a scene and there is none, and for times without motion; DataError if the path
-    is impossible in the scene.
+    moves: whether the model moves; origin: [3] world coordinates of the points' origin, by default that of the scene.
+    Raises ConfigError if the path needs a scene and there is none, or if times are set without motion, and DataError if
+    the path is impossible in the scene.
     """
-    plan = _path(request, scene, points, scene.origin if scene and origin is None else origin)
+    plan = _plan_path(request, scene, points, scene.origin if scene and origin is None else origin)
     return replace(plan, views=assign_times(plan.views, request.times, moves))
 
 
-def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Floats | None) -> VideoPlan:
+def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Floats | None) -> VideoPlan:
     """Plan a video without timestamps."""
     if request.is_file:
         camera_file = camera_path.read(Path(request.path), scene.path if scene else None)
@@ -168,13 +167,13 @@ def _path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Fl
     size = request.size or even_size(rig.camera)
     if SEPARATOR in request.path:
         names = [view.name for view in scene.views]
-        (chosen,) = ViewSelection(names=[request.path.partition(SEPARATOR)[2]]).select(names, [])
-        return VideoPlan(repeat_view(scene.views[chosen], request.frames or FRAMES, size), request.fps or FPS)
+        (index,) = ViewSelection(names=[request.path.partition(SEPARATOR)[2]]).select(names, [])
+        return VideoPlan(repeat_view(scene.views[index], request.frames or FRAMES, size), request.fps or FPS)
     return VideoPlan(PATHS[request.path](rig, request.frames or FRAMES, size), request.fps or FPS)
 
 
 def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
-    """Return the video file of each layer; `video` is that of the color.  Raises ConfigError for invalid names."""
+    """Return the video file of each layer, of which `video` is for the color.  Raises ConfigError for invalid names."""
     files = {
         layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
         for layer in layers
@@ -187,26 +186,26 @@ def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
 def render_video(
     canvas: Canvas, plan: VideoPlan, videos: Mapping[str, Path], side: Side | None, progress: Progress
 ) -> None:
-    """Render the views to videos, one per layer.  side: returns the image to the right of the color."""
-    wide = plan.size[0] * (1 if side is None else 2)
-    check_size((wide, plan.size[1]))
+    """Render the views to videos, one per layer.  side: returns the image to the right of the color layer."""
+    full_width = plan.size[0] * (1 if side is None else 2)
+    check_size((full_width, plan.size[1]))
     depths = canvas.depth_range(plan.views) if "depth" in videos else (0.0, 0.0)
     with ExitStack() as stack:
         writers = {
             layer: stack.enter_context(
-                encoding.open_video(path, (wide if layer == LAYERS[0] else plan.size[0], plan.size[1]), plan.fps)
+                encoding.open_video(path, (full_width if layer == LAYERS[0] else plan.size[0], plan.size[1]), plan.fps)
             )
             for layer, path in videos.items()
         }
         for view in progress(plan.views):
-            rendered = canvas.render_layers(view, "depth" in videos)
+            layers = canvas.render_layers(view, "depth" in videos)
             for layer, write in writers.items():
-                picture = layer_image(rendered, layer, depths)
-                write(side_by_side(picture, side(view)) if side and layer == LAYERS[0] else picture)
+                image = layer_image(layers, layer, depths)
+                write(side_by_side(image, side(view)) if side and layer == LAYERS[0] else image)
 
 
 def resize_view(view: View, size: Size | None = None) -> View:
-    """Return a view at another image size, by default its size rounded down to even sides."""
+    """Return a view at another image size; by default, its own is rounded down to even sides."""
     target = size or even_size(view.camera)
     if target == (view.camera.width, view.camera.height):
         return view
