@@ -26,8 +26,9 @@ def to_8_bits(image: NDArray[np.generic]) -> Image:
 def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB over all channels of unmasked pixels.
 
-    image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits; mask: [height, width].
-    Raises ValueError for other types, for different shapes, and if no pixel counts.
+    image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits.
+    mask: [height, width] bool, True for unmasked pixels.
+    Raises ValueError for other types, for different shapes, and if all pixels are masked.
     """
     image, photograph = _check(image, photograph, mask)
     squared = (image.astype(np.float64) - photograph) ** 2

@@ -20,17 +20,17 @@ from clsplat.core.reading import read_file
 # LPIPS with a network from a local ONNX file, run by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
-SECONDS = 300  # a slow machine reads a network of 60 MB, and runs it on images of up to one megapixel
-_tested: set[tuple[str, int, int]] = set()  # digest, height, and width: networks that run without a crash
+SECONDS = 300  # enough for a slow machine to read a network of 60 MB and to run it on images of one megapixel
+_tested_networks: set[tuple[str, int, int]] = set()  # digest, height and width that ran without a crash
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 
 
 class Lpips:
     """Learned perceptual distance (Zhang et al. 2018); 0 for equal images.
 
-    The file is that of `clsplat data lpips`, or the result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")` with
-    dynamic height and width: two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output.  That
-    network expects values in [-1, 1]; the tables of 3DGS and Mip-Splatting used values in [0, 1] with the same network.
+    The ONNX file is the output of `clsplat data lpips`, or of `torch.onnx.export` for `lpips.LPIPS(net="vgg")` with
+    dynamic height and width.  It has two inputs, `in0` and `in1`, RGB of [1, 3, height, width], and a scalar output.
+    This network expects values in [-1, 1]; 3DGS and Mip-Splatting report its results for values in [0, 1].
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:
@@ -49,7 +49,7 @@ class Lpips:
             raise ConfigError(f"{path}: is not LPIPS; the distance of equal images is {distance:g}, expected 0")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
-        """Return the distance of two images, [height, width, 3]."""
+        """Return the distance of two images, [height, width, 3].  Raises ConfigError if the network rejects them."""
         self._test(*image.shape[:2])
         try:
             for name, pixels in zip(INPUTS, (image, photograph), strict=True):
@@ -69,17 +69,17 @@ class Lpips:
 
     def _test(self, height: int, width: int) -> None:
         """Run the network in a child process, once per size.  Raises DataError if OpenCV crashes."""
-        if (self.digest, height, width) in _tested:
+        if (self.digest, height, width) in _tested_networks:
             return
         seconds = SECONDS * max(1.0, height * width / 1e6)
         module, size = "clsplat.metrics.perceptual", (str(height), str(width))
         if crash := run_module(module, *size, seconds=seconds, stdin=self._data).crash:
-            action = f"{crash} when it runs this network on images of {width}x{height}"
-            raise DataError(f"{self.path}: OpenCV {cv2.__version__} {action}; export the network again")
-        _tested.add((self.digest, height, width))
+            problem = f"{crash} when it runs this network on images of {width}x{height}"
+            raise DataError(f"{self.path}: OpenCV {cv2.__version__} {problem}; export the network again")
+        _tested_networks.add((self.digest, height, width))
 
     def origin(self) -> dict[str, str]:
-        """Return the input range and the network; values are only comparable if both are the same."""
+        """Return the input range and the network, by key of metrics.json.  Values are only comparable if both agree."""
         return {"lpips_input": self.inputs, "lpips_model": f"{self.path.name} sha256:{self.digest[:16]}"}
 
     def _planes(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -104,7 +104,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 @dataclass(frozen=True)
 class Perceptual:
-    """The metrics in addition to PSNR and SSIM."""
+    """The metrics to compute in addition to PSNR and SSIM."""
 
     names: tuple[Metric, ...] = ()
     lpips: Lpips | None = None
@@ -112,13 +112,13 @@ class Perceptual:
     @classmethod
     def open(cls, names: Sequence[Metric], lpips: str | Path | None, lpips_input: InputRange) -> "Perceptual":
         """Load the metrics.  Raises ConfigError for a missing package, DataError for a missing network."""
-        chosen = tuple(name for name in METRICS[2:] if name in names)
-        if "flip" in chosen:
+        extra_names = tuple(name for name in METRICS[2:] if name in names)
+        if "flip" in extra_names:
             _flip_package()
-        return cls(chosen, Lpips(Path(lpips), lpips_input) if lpips is not None else None)
+        return cls(extra_names, Lpips(Path(lpips), lpips_input) if lpips is not None else None)
 
     def measure(self, image: Image, photograph: Image) -> dict[str, float | None]:
-        """Return the values of one view, by name.  image, photograph: [height, width, 3]."""
+        """Return the metrics of one view, by name.  image, photograph: [height, width, 3]."""
         values: dict[str, float | None] = {}
         if "ms_ssim" in self.names:
             values["ms_ssim"] = ms_ssim(image, photograph)
@@ -130,7 +130,7 @@ class Perceptual:
         return values
 
     def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-        """Average values over views, with the keys of metrics.json, and the reasons for missing values."""
+        """Return the means over views, with the keys of metrics.json, and the reasons why values are missing."""
         averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
         if "ms_ssim" in self.names:
             averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
@@ -142,9 +142,9 @@ class Perceptual:
 
 
 def metric_names(names: Sequence[str]) -> list[Metric]:
-    """Return the metrics with these names, in fixed order.  Raises ConfigError for an unknown name."""
-    if unknown := [name for name in names if name not in METRICS]:
-        raise ConfigError(f"unknown metric '{unknown[0]}'; expected one of {', '.join(METRICS)}")
+    """Return the metrics with these names, in the order of METRICS.  Raises ConfigError for an unknown name."""
+    if unknown_names := [name for name in names if name not in METRICS]:
+        raise ConfigError(f"unknown metric '{unknown_names[0]}'; expected one of {', '.join(METRICS)}")
     return [name for name in METRICS if name in names]
 
 
@@ -162,11 +162,11 @@ def ms_ssim_scales(image: Image) -> int:
 def ms_ssim(image: Image, photograph: Image) -> float | None:
     """Return the multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
 
-    For each channel, it is the product over scales of the mean contrast-structure factor (at the coarsest scale times
-    the luminance factor) to the power of the scale's weight; the result is the mean over channels.  Each scale averages
-    2 x 2 pixels of the previous one.  Means are over pixels whose 11 x 11 Gaussian window is inside the image; negative
-    means count as 0.  Images with a side below 176 px have fewer scales, whose weights are renormalized.  Returns None
-    if not even one scale fits.
+    The result is the mean over channels of a product over scales: the mean contrast-structure factor, at the coarsest
+    scale times the luminance factor, to the power of the scale's weight.  Each scale averages 2 x 2 pixels of the
+    previous one.  Means are over pixels whose 11 x 11 Gaussian window is inside the image; negative means count as 0.
+    Images with a side below 176 px have fewer scales, whose weights are renormalized.  Returns None if the image is
+    smaller than the window.
     """
     scales = ms_ssim_scales(image)
     if scales == 0:
@@ -184,7 +184,7 @@ def ms_ssim(image: Image, photograph: Image) -> float | None:
 
 
 def _halve(image: Floats) -> Floats:
-    """Average squares of 2 x 2 pixels, without an odd last row or column."""
+    """Average blocks of 2 x 2 pixels; an odd last row or column is ignored."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     even = image[:height, :width]
     mean: Floats = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
@@ -192,14 +192,14 @@ def _halve(image: Floats) -> Floats:
 
 
 def ssim_map(image: Image, photograph: Image) -> Floats:
-    """Return the structural similarity of every pixel and channel, with zero padding as in training."""
+    """Return the structural similarity of every pixel and channel, [H, W, 3], with zero padding as in training."""
     padding = ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0))
     luminance, structure = _ssim_factors(np.pad(image / 255.0, padding), np.pad(photograph / 255.0, padding))
     return luminance * structure
 
 
 def _ssim_factors(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return luminance and contrast-structure of every pixel with a full window (Wang et al. 2004)."""
+    """Return the luminance and contrast-structure factors of pixels whose window is inside (Wang et al. 2004)."""
     mx, my = _window_mean(x), _window_mean(y)
     variances = _window_mean(x * x) - mx * mx + _window_mean(y * y) - my * my
     covariance = _window_mean(x * y) - mx * my
@@ -214,7 +214,7 @@ def _window_mean(image: Floats) -> Floats:
 
 
 def flip(image: Image, photograph: Image) -> float:
-    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError without its package."""
+    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError if it is not installed."""
     reference, test = (np.ascontiguousarray(pixels, np.float32) / np.float32(255) for pixels in (photograph, image))
     _, mean, _ = _flip_package().evaluate(reference, test, "LDR", applyMagma=False)
     return float(mean)

@@ -24,15 +24,15 @@ from clsplat.scene.view import View, load_mask
 
 # Static parts of a dynamic scene: PSNR of static pixels, and flicker.
 
-STILL = 3.0  # levels; a larger standard deviation is motion, not camera noise
-MAX_CAMERAS = 8  # with sums in memory, 48 bytes per pixel each
+STILL = 3.0  # 8-bit levels; a larger standard deviation is motion, not camera noise
+MAX_CAMERAS = 8  # cameras whose sums are in memory, with 48 bytes per pixel
 MIN_TIMESTAMPS = 2
 FLICKER, PHOTO_FLICKER, STATIC, STATIC_FRACTION = "flicker", "flicker_photographs", "psnr_static", "static_share"
 
 
 @dataclass
 class ImageSums:
-    """Sums over the timestamps of one camera, in integers, so that order does not matter."""
+    """Sums of images over the timestamps of one camera, as integers, so that the order of images does not matter."""
 
     count: int = 0
     total: NDArray[np.uint32] = field(default_factory=lambda: np.zeros((), np.uint32))  # [H, W, 3]
@@ -45,7 +45,7 @@ class ImageSums:
         self.total, self.squares = self.total + values, self.squares + values * values
 
     def deviation(self) -> NDArray[np.float64]:
-        """Return the standard deviation over timestamps, [H, W, 3], levels."""
+        """Return the standard deviation over timestamps, [H, W, 3], in 8-bit levels."""
         mean = self.total / self.count
         return np.asarray(np.sqrt(np.maximum(self.squares / self.count - mean * mean, 0)))
 
@@ -57,12 +57,12 @@ class CameraSums:
     views: list[str] = field(default_factory=list)
     renders: ImageSums = field(default_factory=ImageSums)
     photographs: ImageSums = field(default_factory=ImageSums)
-    counted: Mask | None = None  # marked as static by the file, if any, and unmasked at all timestamps
+    static_mask: Mask | None = None  # pixels that are static by the file, if any, and unmasked at all timestamps
     has_static_file: bool = False
 
 
 class FlickerMeter:
-    """Gathers views by camera to measure flicker; moving cameras and cameras with one timestamp are ignored."""
+    """Measures flicker from sums over the views of each camera; ignores moving cameras and single timestamps."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""
@@ -92,41 +92,41 @@ class FlickerMeter:
         camera.photographs.add(photograph)
         camera.has_static_file |= has_file
         if mask is not None:
-            camera.counted = mask if camera.counted is None else camera.counted & mask
+            camera.static_mask = mask if camera.static_mask is None else camera.static_mask & mask
 
     def flicker(self) -> dict[str, dict[str, float]]:
-        """Return the flicker of each view's camera, by view name; empty for cameras with one timestamp."""
+        """Return the flicker of each view's camera, by view name; cameras with one timestamp have none."""
         flicker = dict[str, dict[str, float]]()
         for camera in self._cameras.values():
             if camera.renders.count < MIN_TIMESTAMPS:
                 continue
-            rendered, captured = camera.renders.deviation(), camera.photographs.deviation()
-            static = np.ones(rendered.shape[:2], bool) if camera.counted is None else camera.counted
+            render, photo = camera.renders.deviation(), camera.photographs.deviation()
+            static = np.ones(render.shape[:2], bool) if camera.static_mask is None else camera.static_mask
             if not camera.has_static_file:
-                static = static & (captured.max(axis=2) <= STILL)
+                static = static & (photo.max(axis=2) <= STILL)
             if static.any():
-                values = {FLICKER: float(rendered[static].mean()), PHOTO_FLICKER: float(captured[static].mean())}
+                values = {FLICKER: float(render[static].mean()), PHOTO_FLICKER: float(photo[static].mean())}
                 flicker |= {name: {**values, STATIC_FRACTION: float(static.mean())} for name in camera.views}
         return flicker
 
 
 def static_pixels(view: View) -> Mask | None:
-    """Return the mask of a view's static pixels, [H, W], or None without a file."""
+    """Return the mask of a view's static pixels, [H, W], or None if no file marks them."""
     if view.static_path is None:
         return None
     return load_mask(replace(view, mask_path=view.static_path, alpha="transparency"))
 
 
-def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+def means(views: Sequence[dict[str, float]]) -> dict[str, float]:
     """Return the mean of each metric over the views that have it, in order of appearance."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
+    names = list(dict.fromkeys(name for view in views for name in view))
+    return {name: float(np.mean([view[name] for view in views if name in view])) for name in names}
 
 
 # PSNR of a render after a color transform fitted to its photograph.
 
 NOTABLE_GAIN = 1.0  # dB; if a color transform increases PSNR by more, the log explains it
-MIN_SLOPE = 1e-3  # of a regression: the image is divided by its slope
+MIN_SLOPE = 1e-3  # smallest slope of a regression by which an image is divided
 # Usable pixels per fitted parameter: p parameters fitted to n independent errors add p / n of their variance to the
 # error elsewhere, here 1 / 64, which is 0.07 dB.
 PIXELS_PER_PARAMETER = 64
@@ -135,10 +135,10 @@ PIXELS_PER_PARAMETER = 64
 class ColorFit(Protocol):
     """A color model that can be fitted to a photograph."""
 
-    parameters_per_channel: ClassVar[int]  # that `fit_matrix` fits
+    parameters_per_channel: ClassVar[int]  # number of parameters that `fit_matrix` fits
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], that fits an image to a photograph.  Both: pixels, [M, 3]."""
+        """Return the matrix, [3, 4], that fits an image to a photograph.  image, photograph: pixels, [M, 3]."""
 
 
 class Gains:
@@ -156,30 +156,30 @@ class Gains:
 def color_metrics(
     image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: ColorFit
 ) -> dict[str, float]:
-    """Return `psnr_color` and `psnr_affine`, dB, of a render and a photograph, [height, width, 3].
+    """Return `psnr_color` and `psnr_affine`, in dB, of a render and a photograph, [height, width, 3].
 
-    mask: pixels that count, [height, width].  `psnr_color` is missing if a half has too few pixels to fit.  NaN in the
-    render counts as black, infinity as white or black.
+    mask: [height, width], True for unmasked pixels.  `psnr_color` is missing if a half of the image has too few pixels
+    to fit.  NaN in the render counts as black, infinity as white or black.
     """
     truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
-    counted = np.ones(truth.shape[:2], bool) if mask is None else mask
-    fitted = fit_colors(finite, photograph, counted, model)
-    corrected = correct_by_regression(finite, truth, counted)
-    color = {} if fitted is None else {"psnr_color": psnr(fitted, photograph, counted)}
-    return {**color, "psnr_affine": psnr(corrected, photograph, counted)}
+    full_mask = np.ones(truth.shape[:2], bool) if mask is None else mask
+    fitted_image = fit_colors(finite, photograph, full_mask, model)
+    corrected = correct_by_regression(finite, truth, full_mask)
+    color = {} if fitted_image is None else {"psnr_color": psnr(fitted_image, photograph, full_mask)}
+    return {**color, "psnr_affine": psnr(corrected, photograph, full_mask)}
 
 
-def mean_color_metrics(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+def mean_color_metrics(views: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Average the results of color_metrics over views, with the keys of metrics.json.
 
-    If some views have no `psnr_color`, `psnr_color_views` counts the others, and `psnr_color_reason` has the reason; if
-    no view has it, `psnr_color` is None.
+    If some views have no `psnr_color`, `psnr_color_views` counts the views that have it, and `psnr_color_reason` is the
+    reason.  If no view has it, `psnr_color` is None.
     """
-    averages, fitted = means(rows), [row for row in rows if "psnr_color" in row]
-    if not averages or len(fitted) == len(rows):
+    averages, fit_count = means(views), sum("psnr_color" in view for view in views)
+    if not averages or fit_count == len(views):
         return averages
-    reason = f"{len(rows) - len(fitted)} of {len(rows)} views have a half with too few pixels to fit colors to"
-    return {"psnr_color": None, **averages, "psnr_color_views": len(fitted), "psnr_color_reason": reason}
+    reason = f"{len(views) - fit_count} of {len(views)} views have a half with too few pixels to fit colors to"
+    return {"psnr_color": None, **averages, "psnr_color_views": fit_count, "psnr_color_reason": reason}
 
 
 def fit_colors(
@@ -189,8 +189,8 @@ def fit_colors(
 
     The fit does not use pixels that are black or white in the photograph.  Returns None if a half has fewer than
     PIXELS_PER_PARAMETER usable pixels per parameter; this depends only on the photograph and the mask, so that models
-    are compared on the same views.  Pixels brighter than white in the image are not used either if enough others
-    remain.
+    are compared on the same views.  The fit also excludes pixels that are brighter than white in the image, if enough
+    others remain.
     """
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
     middle, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
@@ -198,16 +198,16 @@ def fit_colors(
     min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
     if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
         return None
-    for half, other in ((left, right), (right, left)):
-        darker = usable[other] & (image[other] < 1).all(axis=2)
-        fitted_to = darker if np.count_nonzero(darker) >= min_pixels else usable[other]
-        matrix = model.fit_matrix(image[other][fitted_to], truth[other][fitted_to])
+    for half, fit_half in ((left, right), (right, left)):
+        below_white = usable[fit_half] & (image[fit_half] < 1).all(axis=2)
+        fit_mask = below_white if np.count_nonzero(below_white) >= min_pixels else usable[fit_half]
+        matrix = model.fit_matrix(image[fit_half][fit_mask], truth[fit_half][fit_mask])
         corrected[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return corrected
 
 
 def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask) -> NDArray[np.float64]:
-    """Return (image - b) / a of each channel, where a truth + b is fitted to the image (gsplat).
+    """Return (image - b) / a for each channel, where a * truth + b is fitted to the image, as in gsplat.
 
     Noise makes the slope `a` too small, so this is not the least-squares correction of the image.
     """
@@ -247,15 +247,15 @@ HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 def psnr_by_time(
     psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]
 ) -> dict[str, dict[str, float]]:
-    """Return the PSNR of views, dB, by view name, under the key HELD_OUT or OTHERS for the timestamp of the view.
+    """Return the PSNR of each view in dB, by view name and key: HELD_OUT or, if training has its timestamp, OTHERS.
 
-    The result is empty if all timestamps are of one kind, as in static scenes.
+    The result is empty if all views have the same key, as in static scenes.
     """
-    trained_times, times = set(distinct_times(trained)), {view.name: view.time for view in views}
-    kinds = {name: OTHERS if time in trained_times else HELD_OUT for name, time in times.items() if time is not None}
-    if not trained_times or {kinds.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
+    training_times, times = set(distinct_times(trained)), {view.name: view.time for view in views}
+    keys = {name: OTHERS if time in training_times else HELD_OUT for name, time in times.items() if time is not None}
+    if not training_times or {keys.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
         return {}
-    return {name: {kinds[name]: value} for name, value in psnr.items()}
+    return {name: {keys[name]: value} for name, value in psnr.items()}
 
 
 LOG = logging.getLogger("clsplat")
@@ -300,7 +300,7 @@ def render_floats(painter: Painter, camera: DeviceCamera, response: Any = None) 
 
 
 def require_finite(image: NDArray[np.float32], view: View) -> None:
-    """Raise NumericError if a render has values that are not finite."""
+    """Raise NumericError if a render has values that are infinite or NaN."""
     if not np.isfinite(image).all():
         raise NumericError(
             f"view '{view.name}': the render is not finite, since values of the model are too large for float32; "
@@ -318,7 +318,7 @@ def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> f
     return float(sums.get().sum(dtype=np.float64)) / (3 * camera.width * camera.height)
 
 
-EMPTY_PSNR, EMPTY_ALPHA = 20.0, 0.01  # dB and mean alpha; below both, the render is almost empty, unlike the photo
+EMPTY_PSNR, EMPTY_ALPHA = 20.0, 0.01  # dB and mean alpha; below both, the render is almost empty but the photo is not
 
 
 def measure(
@@ -331,13 +331,13 @@ def measure(
     counted: Iterable[View] | None = None,
     trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:
-    """Measure every view; return its metrics.
+    """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  finite: raise NumericError
     for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
     views wrapped by a progress counter; trained: the training views, for metrics by timestamp.
     """
-    results, flicker_meter, empty = list[ViewMetrics](), FlickerMeter(views), list[str]()
+    results, flicker_meter, empty_names = list[ViewMetrics](), FlickerMeter(views), list[str]()
     for view in views if counted is None else counted:
         photograph = photographs.get(view)
         if photograph.empty:
@@ -349,20 +349,20 @@ def measure(
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted_pixels()
         color = color_metrics(floats, image, mask, colors) if colors else {}
-        still = flicker_meter.add(view, rendered, image, mask)
+        static_psnr = flicker_meter.add(view, rendered, image, mask)
         if mask is None:
             similarity = device_ssim(painter.workspace, photograph, rendered)
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
         extra = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, extra, color, still))
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, extra, color, static_psnr))
         if results[-1].psnr < EMPTY_PSNR and painter.render_layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
-            empty.append(view.name)
-    if empty:
+            empty_names.append(view.name)
+    if empty_names:
         LOG.warning(
             "almost nothing is drawn in %d of %s, such as %s; check that the model fits the cameras, and model.near",
-            *(len(empty), pluralize(len(views), "view"), quote(empty[0])),
+            *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}
     moments = psnr_by_time(psnrs, views, trained)
@@ -373,7 +373,7 @@ def measure(
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
-    """Average metrics over views, with the keys of metrics.json.  Raises DataError without views."""
+    """Average metrics over views, with the keys of metrics.json.  Raises DataError if there are no views."""
     if not results:
         raise DataError("no view can be measured, since masks exclude all pixels; fix the masks")
     return {

@@ -139,7 +139,7 @@ def test_network_that_crashes_opencv_ends_no_process(network, monkeypatch):
     path = network()
     ends = iter([ChildResult(-11, ""), ChildResult(0, ""), ChildResult(-11, "")])
     monkeypatch.setattr(perceptual_metrics, "run_module", lambda *words, **values: next(ends))
-    monkeypatch.setattr(perceptual_metrics, "_tested", set())
+    monkeypatch.setattr(perceptual_metrics, "_tested_networks", set())
     crash = r"distance.onnx: OpenCV .* crashes with SIGSEGV when it runs this network on images of"
     with pytest.raises(DataError, match=f"{crash} 64x64"):
         Lpips(path, "0..1")

@@ -1,4 +1,4 @@
-"""Check the bilateral grid, color matrices and camera responses: images, their gradients, and updates of tables."""
+"""Check bilateral grids, color matrices and camera responses: images, their gradients, and updates of tables."""
 
 from dataclasses import replace
 from typing import Any
@@ -50,10 +50,10 @@ def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: 
     exact = image[:3].astype(np.float64)
     luminance = np.einsum("a,ahw->hw", LUMINANCE, exact)
     level = luminance * (grid.shape[2] - 1)
-    near = np.abs(level - np.rint(level)) < MARGIN
-    near |= (np.abs(luminance) < MARGIN) | (np.abs(luminance - 1) < MARGIN)
-    near |= (np.abs(unclamped_grid_colors(exact, grid) - 1) < MARGIN).any(axis=0)
-    image[:, near] = 0.1 / max(grid.shape[2] - 1, 1)
+    is_near = np.abs(level - np.rint(level)) < MARGIN
+    is_near |= (np.abs(luminance) < MARGIN) | (np.abs(luminance - 1) < MARGIN)
+    is_near |= (np.abs(unclamped_grid_colors(exact, grid) - 1) < MARGIN).any(axis=0)
+    image[:, is_near] = 0.1 / max(grid.shape[2] - 1, 1)
     return image
 
 
@@ -85,14 +85,14 @@ def check_grid(
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
         actual = photograph_grid(grids, grad_grid)
-        yield compare_max(kernel, f"gradient by the grid, {label}", actual, expected_grid, SUM, floor=floor)
+        yield compare_max(kernel, f"gradient of the grid, {label}", actual, expected_grid, SUM, floor=floor)
     if channels > 3:
         yield match("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
         yield match("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
-    """Compare the smoothness of a grid and three updates of it, which leave the other grids unchanged."""
+    """Compare the smoothness of a grid, and three updates of it, which do not change the other grids."""
     label, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = random_grids(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
@@ -141,8 +141,8 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     label = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
     image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
-    near = np.abs(np.einsum("ab,bhw->ahw", matrix[:, :3], image[:3]) + matrix[:, 3, None, None] - 1).min(axis=0)
-    image[:, near < MARGIN] = 0
+    near_white = np.abs(np.einsum("ab,bhw->ahw", matrix[:, :3], image[:3]) + matrix[:, 3, None, None] - 1).min(axis=0)
+    image[:, near_white < MARGIN] = 0
     gradient = rng.normal(size=image.shape).astype(np.float32)
     camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("colored", "grad_colored"):
@@ -161,7 +161,7 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     yield match("colors_backward", f"gradient outside the image, {label}", blank_image(camera, grad), 0.0)
     floor, actual_matrix = float(np.sqrt(gradient.size)), wait_for_matrix()
     yield compare_max(
-        "colors_backward", f"gradient by the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
+        "colors_backward", f"gradient of the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
     )
     if channels > 3:
         yield match("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
@@ -187,21 +187,22 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     for name in ("response", "grad_response"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = to_planes(device, camera, image), to_planes(device, camera, gradient)
-    actual = respond(workspace, camera, planes, row).get()
+    colors = respond(workspace, camera, planes, row).get()
     grad_image = respond(workspace, camera, planes, row, uploaded).get()
     sums = workspace.array("response sums", (20, camera.rows)).get()
     exact, upstream = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.apply_response(exact, row, center)
-    yield compare_max(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield match(kernel, f"pixels outside the image, {label}", blank_image(camera, actual[:3]), 0.0)
+    yield compare_max(kernel, f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield match(kernel, f"pixels outside the image, {label}", blank_image(camera, colors[:3]), 0.0)
     expected, grad_row = appearance.apply_response_backward(exact, row, center, upstream)
     largest = max(float(np.abs(expected).max()), 1.0)
     yield compare_max(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield compare_max(kernel, f"gradient by the numbers, {label}", row_gradient(row, sums), grad_row, SUM, floor=floor)
+    actual = row_gradient(row, sums)
+    yield compare_max(kernel, f"gradient of the parameters, {label}", actual, grad_row, SUM, floor=floor)
     if channels > 3:
-        yield match(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield match(kernel, f"fourth plane, {label}", colors[3], planes.get()[3])
         yield match(kernel, f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 

@@ -33,16 +33,16 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
 
 
 def check_blend(device: Device, case: Case, label: str, sort: Sort = "radix") -> Results:
-    """Compare the image and the transmittance of a scene; both are zero outside the image."""
+    """Compare the image and the transmittance of a scene; the padding of both is zero."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
     outside = np.concatenate([image, transmittance[None]])
     outside[:, :height, :width] = 0
     yield match("blend_forward", f"pixels outside the image, {label}", outside, 0.0)
-    expected, left, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
-    yield from check_image("blend_forward", f"image, {label}", image[:, :height, :width], expected)
+    truth, true_transmittance, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
+    yield from check_image("blend_forward", f"image, {label}", image[:, :height, :width], truth)
     actual = transmittance[None, :height, :width]
-    yield from check_image("blend_forward", f"transmittance, {label}", actual, left[None])
+    yield from check_image("blend_forward", f"transmittance, {label}", actual, true_transmittance[None])
 
 
 def sum_pixels(
@@ -87,7 +87,7 @@ def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 def make_dim(parameters: dict[str, NDArray[Any]]) -> None:
-    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, and 40 more still contribute."""
+    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, but 40 more still contribute."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -3.7
 
@@ -123,7 +123,7 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("blend_backward", "sum_records")
 def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
-    width, height = 48, 32  # whole tiles: the plane of texture is known beyond the image's edge
+    width, height = 48, 32  # multiples of all tile sizes, so that the texture covers the padding
     case = safe_case(rng, 40, width, height, MARGIN)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     texture = np.where(rng.random((height, width)) < 0.9, rng.uniform(0, 0.5, (height, width)), -1).astype(np.float32)
@@ -158,11 +158,15 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
         from_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
         black, channel = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
-        from_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
+        from_transmittance = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
         mean2d, conic = sums_to_gradients(splats, sums.get()[:, :count].T.astype(np.float64))
-        yield compare("blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_left.mean2d, GRADIENT)
-        yield compare("blend_backward", f"conics, {label}", conic, from_image.conic + from_left.conic, GRADIENT)
-        opacity = (from_image.opacity + from_left.opacity) * splats.opacity
+        yield compare(
+            "blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_transmittance.mean2d, GRADIENT
+        )
+        yield compare(
+            "blend_backward", f"conics, {label}", conic, from_image.conic + from_transmittance.conic, GRADIENT
+        )
+        opacity = (from_image.opacity + from_transmittance.opacity) * splats.opacity
         yield compare("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
 
 
@@ -194,14 +198,14 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("blend_forward", "blend_backward")
 def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 150, 50, 70)
-    case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and more tiles than a mask holds
+    case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and more tiles than a mask has bits
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
     image, sums = render(device, case).image.get(), sum_pixels(device, case, weights)
     yield match("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
-    again = sum_pixels(device, case, weights, sort="bitonic")
-    yield match("sort_tiles", "sums over pixels, against the radix sort", again, sums)
-    banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
-    yield match("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
+    bitonic_sums = sum_pixels(device, case, weights, sort="bitonic")
+    yield match("sort_tiles", "sums over pixels, against the radix sort", bitonic_sums, sums)
+    band_sums = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
+    yield match("blend_backward", "sums over pixels, against bands of tiles", band_sums, sums)
     yield match("blend_backward", "sums over pixels, a second time", sum_pixels(device, case, weights), sums)
 
 
@@ -213,8 +217,11 @@ Floats = NDArray[Any]
 def differentiate(
     device: Device, case: Case, weights: Floats, budget: RenderLimits | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return values for the loss Σ weights · (image, inverse depth): image, [4, H, W], sums over pixels,
-    [N, PIXEL_SUMS], sums of inverse depths, [N], and the gradient of the means, [N, 3]."""
+    """Render colors and inverse depth, and differentiate the loss Σ weights · (image, inverse depth).
+
+    Return the image, [4, H, W], sums over pixels, [N, PIXEL_SUMS], sums of inverse depths, [N], and the gradient of the
+    means, [N, 3].  weights: [4, H, W].
+    """
     rasterizer, model, camera = Rasterizer(device, "radix", budget), case.model(device), case.device_camera(device)
     frame, (width, height) = rasterizer.forward(model, camera, device.upload(BACKGROUND), "inverse_depth"), case.size
     planes = np.zeros((4, camera.rows, camera.stride), np.float32)
@@ -227,7 +234,7 @@ def differentiate(
 
 
 def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Results:
-    """Compare image, sums and gradients with the reference."""
+    """Compare the inverse depth, the sums over pixels and the gradients.  weights: as in `differentiate`."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
     image, m, depths, means = differentiate(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
@@ -244,8 +251,8 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
     yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
     upstream = mean2d, conic, opacity, from_image.color
-    numbers = case.degree, case.variance, case.compensate
-    truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
+    settings = case.degree, case.variance, case.compensate
+    truth = ref.project_backward(case.gaussians(), case.camera(), *settings, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]
     yield compare("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
 
@@ -256,13 +263,13 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
         case, label = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         weights = rng.normal(size=(4, height, width)).astype(np.float32)
         yield from check_depth(device, case, weights, label)
-        plain = Rasterizer(device, "radix").forward(
+        color_frame = Rasterizer(device, "radix").forward(
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
         image, *sums = differentiate(device, case, weights)
-        yield match("blend_forward", f"colors, {label}", image[:3], plain.image.get()[:, :height, :width])
-        for actual, banded in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
-            yield match("sum_inverse_depths", f"against bands of tiles, {label}", banded, actual)
+        yield match("blend_forward", f"colors, {label}", image[:3], color_frame.image.get()[:, :height, :width])
+        for actual, by_bands in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
+            yield match("sum_inverse_depths", f"against bands of tiles, {label}", by_bands, actual)
 
 
 @CHECKS.add("inverse_depth_loss")
@@ -294,28 +301,31 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_layer(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Results:
-    """Compare the composite, the loss and the gradients; the sign of T does not matter."""
+    """Compare the composite, the loss and the gradients; the sign of the transmittance does not matter."""
     camera, workspace = make_camera(device, width, height), Workspace(device)
-    layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
-    left = rng.random((height, width)).astype(np.float32)
+    layer, image = (rng.random((count, height, width)).astype(np.float32) for count in (3, channels))
+    transmittance = rng.random((height, width)).astype(np.float32)
     gradient = rng.normal(size=image.shape).astype(np.float32)
-    signed = np.where(rng.random(left.shape) < 0.5, -1, 1) * left
-    planes = {"image": to_planes(device, camera, layer), "transmittance": to_planes(device, camera, signed[None])}
+    signed_transmittance = np.where(rng.random(transmittance.shape) < 0.5, -1, 1) * transmittance
+    planes = {
+        "image": to_planes(device, camera, layer),
+        "transmittance": to_planes(device, camera, signed_transmittance[None]),
+    }
     frame, label, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
     actual = lay_over(workspace, frame, to_planes(device, camera, image), scale)
     composite, behind = actual.image.get(), actual.behind.get()
     inside = np.s_[..., :height, :width]
-    exact = left.astype(np.float64)
+    exact = transmittance.astype(np.float64)
     yield compare_max("lay_over", f"sum, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
     loss, grad_left = ref.layer_cover(exact, scale)
     yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
     yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for output in (composite, behind):
         yield match("lay_over", f"pixels outside the image, {label}", blank_image(camera, output), 0.0)
-    grad_both = to_planes(device, camera, gradient)
-    look_behind(workspace, frame, grad_both)
+    actual_gradient = to_planes(device, camera, gradient)
+    look_behind(workspace, frame, actual_gradient)
     expected = ref.gradient_behind(exact, gradient)
-    yield compare_max("look_behind", f"derivatives, {label}", grad_both.get()[inside], expected, 1e-6, floor=1.0)
+    yield compare_max("look_behind", f"derivatives, {label}", actual_gradient.get()[inside], expected, 1e-6, floor=1.0)
 
 
 @CHECKS.add("lay_over", "look_behind")

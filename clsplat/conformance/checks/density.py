@@ -57,24 +57,26 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         view = ViewGradients(frame, comparison, [], device.upload(planes))
         for _ in range(2):
             stats.add(view, device.upload(planes[:2]))
-        radius, half = frame.radius.get()[:count], np.array([width / 2, height / 2])
-        seen, sums = radius > 0, planes[:, :count].T.astype(np.float64)
+        radius, half_size = frame.radius.get()[:count], np.array([width / 2, height / 2])
+        is_visible, sums = radius > 0, planes[:, :count].T.astype(np.float64)
         splats = frame.splats.get()[:count].astype(np.float64)
         (x, y), conic = splats[:, :2].T, splats[:, SPLAT_XX : SPLAT_XX + 3]
         column, row = np.clip(x, 0, width - 1).astype(int), np.clip(y, 0, height - 1).astype(int)
         columns = {
             ("screen_grad", "accumulate_norm"): ref.screen_gradient(sums[:, :2], width, height),
-            ("screen_grad_abs_sum", "accumulate_sum"): sums[:, ABS_X : ABS_X + 2] @ half,
+            ("screen_grad_abs_sum", "accumulate_sum"): sums[:, ABS_X : ABS_X + 2] @ half_size,
             ("rendered_texture", "sample_magnitude"): sobel_magnitude(image)[row, column],
             ("screen_radius", "accumulate_radius"): radius,
             ("blend_weight", "accumulate_pixel_sum"): sums[:, WEIGHT],
             ("gain", "accumulate_gain"): width * height * ref.screen_gain(sums[:, :2], conic),
             ("view_error", "accumulate_error"): np.full(count, error),
         }
-        yield match("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
+        yield match("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * is_visible)
         for (name, kernel), values in columns.items():
             actual = gaussians.get(f"stats/{name}")[:, 0]
-            expected = 2 * values * (seen | (name == "view_error"))  # view_error also counts for unseen Gaussians
+            expected = (
+                2 * values * (is_visible | (name == "view_error"))
+            )  # view_error also counts for invisible Gaussians
             yield compare_max(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
 
 
@@ -98,7 +100,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
-    """Return the tables of random Gaussians on both sides of each threshold, and the Gaussians after an edit."""
+    """Return tables of random Gaussians on both sides of each threshold, and these Gaussians after an edit."""
     case = random_case(rng, count)
     p = case.parameters
     sizes = EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))
@@ -110,48 +112,48 @@ def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dic
     for name, table in gaussians.tables.items():
         if name.startswith("adam/"):
             gaussians.set(name, rng.uniform(1, 2, (count, table.components)))
-    seen = rng.integers(0, 4, (count, 1)).astype(np.float32)
-    gaussians.set("stats/screen_grad", seen * rng.choice([5e-5, 1e-3], (count, 1)))
-    gaussians.set(SEEN, seen)
-    before = {name: gaussians.get(name) for name in gaussians.tables}
+    view_counts = rng.integers(0, 4, (count, 1)).astype(np.float32)
+    gaussians.set("stats/screen_grad", view_counts * rng.choice([5e-5, 1e-3], (count, 1)))
+    gaussians.set(SEEN, view_counts)
+    initial = {name: gaussians.get(name) for name in gaussians.tables}
     edit = Edit(gaussians, stats, SceneScale(EXTENT), STEP, SEED)
     densify(edit, RULES, Rasterizer(device, "radix").tiler)
-    return before, gaussians
+    return initial, gaussians
 
 
 @CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "share_opacity", "gather_rows")
 def edits(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        before, gaussians = _run_edit(device, rng, count)
-        size, opacity = np.exp(before["log_scales"]).max(axis=1), 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
-        gradient = ref.mean_gradient(before["stats/screen_grad"][:, 0], before[SEEN][:, 0])
-        action = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=True)
-        rows = np.select([action == ref.PRUNE, action == ref.KEEP], [0, 1], 2)
+        initial, gaussians = _run_edit(device, rng, count)
+        size, opacity = np.exp(initial["log_scales"]).max(axis=1), 1 / (1 + np.exp(-initial["logit_opacity"][:, 0]))
+        gradient = ref.mean_gradient(initial["stats/screen_grad"][:, 0], initial[SEEN][:, 0])
+        actions = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=True)
+        rows = np.select([actions == ref.PRUNE, actions == ref.KEEP], [0, 1], 2)
         source = np.repeat(np.arange(count), rows)
         label = f"an edit of {count} Gaussians"
         yield Deviation("mark_rule", f"rows after {label}", abs(gaussians.count - len(source)), 0, counts=True)
         if gaussians.count != len(source):
             continue
-        after = {name: gaussians.get(name) for name in gaussians.tables}
-        yield match("list_rows", f"rows after {label}", after["sh_rest"], before["sh_rest"][source])
-        split = action[source] == ref.SPLIT
-        second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
-        fresh = split | ((action[source] == ref.CLONE) & second)
+        final = {name: gaussians.get(name) for name in gaussians.tables}
+        yield match("list_rows", f"rows after {label}", final["sh_rest"], initial["sh_rest"][source])
+        is_split = actions[source] == ref.SPLIT
+        is_second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
+        is_fresh = is_split | ((actions[source] == ref.CLONE) & is_second)
         moment = "adam/means/moment1"
-        expected = np.where(fresh[:, None], 0, before[moment][source])
-        yield match("list_rows", f"moments after {label}", after[moment], expected)
-        means, scales = before["means"].astype(np.float64)[source], before["log_scales"].astype(np.float64)[source]
-        logits = before["logit_opacity"].astype(np.float64)[source]
-        cloned = action[source] == ref.CLONE
-        logits[cloned] = ref.shared_logit(logits[cloned], 2)
-        yield compare_max("share_opacity", f"opacities after {label}", after["logit_opacity"], logits, SUM, floor=1)
-        for i in np.flatnonzero(split):
+        expected = np.where(is_fresh[:, None], 0, initial[moment][source])
+        yield match("list_rows", f"moments after {label}", final[moment], expected)
+        means, scales = initial["means"].astype(np.float64)[source], initial["log_scales"].astype(np.float64)[source]
+        logits = initial["logit_opacity"].astype(np.float64)[source]
+        is_cloned = actions[source] == ref.CLONE
+        logits[is_cloned] = ref.shared_logit(logits[is_cloned], 2)
+        yield compare_max("share_opacity", f"opacities after {label}", final["logit_opacity"], logits, SUM, floor=1)
+        for i in np.flatnonzero(is_split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
-            rotation = ref.rotation_matrix(before["quats"][source[i]].astype(np.float64))
+            rotation = ref.rotation_matrix(initial["quats"][source[i]].astype(np.float64))
             means[i] += rotation @ (np.exp(scales[i]) * noise)
-        scales[split] -= np.log(1.6)
-        yield compare("spawn_children", f"means after {label}", after["means"], means, SUM)
-        yield compare_max("spawn_children", f"scales after {label}", after["log_scales"], scales, SUM, floor=1)
+        scales[is_split] -= np.log(1.6)
+        yield compare("spawn_children", f"means after {label}", final["means"], means, SUM)
+        yield compare_max("spawn_children", f"scales after {label}", final["log_scales"], scales, SUM, floor=1)
 
 
 @CHECKS.add("mark_chosen")
@@ -161,11 +163,11 @@ def choices(device: Device, rng: np.random.Generator) -> Results:
         edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), STEP, SEED)
         copies, old_rows, shrink = np.ones(count), np.ones(count), np.ones(count)
         for factor in (0.5, 0.25):
-            chosen, numbers = rng.random(count) < 0.7, rng.integers(0, 5, count)
-            edit.choose(chosen, numbers, 3, factor)
-            acts = chosen & ((numbers == 0) | (copies == 1))
-            copies[acts], old_rows[acts] = numbers[acts], np.minimum(numbers, 3)[acts]
-            shrink[acts & (copies > 0)] = factor
+            mask, copy_counts = rng.random(count) < 0.7, rng.integers(0, 5, count)
+            edit.choose(mask, copy_counts, 3, factor)
+            is_changed = mask & ((copy_counts == 0) | (copies == 1))
+            copies[is_changed], old_rows[is_changed] = copy_counts[is_changed], np.minimum(copy_counts, 3)[is_changed]
+            shrink[is_changed & (copies > 0)] = factor
         for name, expected in (("copies", copies), ("old_rows", old_rows), ("shrink", shrink)):
             yield match("mark_chosen", f"{name} of {count} Gaussians", getattr(edit, name).get(), expected)
 
@@ -179,22 +181,22 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
             scale2 = np.exp(2 * oracle.log_scales)
             ratio = np.prod(np.sqrt(scale2 / (scale2 + oracle.filter_variance[:, None])), axis=1)
             expected = oracle.logit_opacity.copy()
-            capped = ratio / (1 + np.exp(-expected)) > 0.3
-            expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
+            is_above = ratio / (1 + np.exp(-expected)) > 0.3
+            expected[is_above] = ref.reset_logit(expected[is_above], ratio[is_above], 0.3)
             actual = gaussians.get("logit_opacity")[:, 0]
             yield compare_max("cap_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("add_noise")
 def noise(device: Device, rng: np.random.Generator) -> Results:
-    rate, below = 40.0, 0.3
+    rate, threshold = 40.0, 0.3
     for count in COUNTS:
         case = random_case(rng, count)
         case.parameters["logit_opacity"][:] = rng.uniform(-3, 1, (count, 1))
         gaussians, p = case.model(device).gaussians, {k: v.astype(np.float64) for k, v in case.parameters.items()}
-        add_noise(gaussians, rate, below, SEED, STEP)
+        add_noise(gaussians, rate, threshold, SEED, STEP)
         opacity = 1 / (1 + np.exp(-p["logit_opacity"][:, 0]))
-        gate = np.where(opacity > below + 0.1, 0, rate / (1 + np.exp(-100 * (below - opacity))))
+        gate = np.where(opacity > threshold + 0.1, 0, rate / (1 + np.exp(-100 * (threshold - opacity))))
         offsets = np.zeros((count, 3))
         for i in range(count):
             axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
@@ -205,11 +207,11 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.
 
-SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, width, height: whole and partial tiles
+SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, width, height: complete and partial tiles
 
 
 def black_photograph(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
-    """Return a black photograph at the camera of a scene."""
+    """Return a black photograph taken by the camera of a case."""
     camera = case.device_camera(device)
     colors = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
     return Photograph(camera, colors, None if mask is None else device.upload(mask[None].astype(np.uint8)))
@@ -223,10 +225,10 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
         photographs = [black_photograph(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
-        actual, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
+        actual, repetition = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
         label = f"blend weights of {count} Gaussians"
         yield compare_max("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
-        yield match("blend_backward", f"{label}, a second time", again, actual)
+        yield match("blend_backward", f"{label}, a second time", repetition, actual)
         actual = sensitivities(_render_views(device, case, photographs, background), count)
         squares = np.sum([_falloff_squares(case, background, mask) for mask in masks], axis=0)
         yield compare("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
@@ -235,7 +237,7 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
 def _render_views(
     device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]
 ) -> Iterator[RenderedView]:
-    """Yield the views of photographs, rendered by a new rasterizer and model."""
+    """Yield the views of photographs, which a new rasterizer renders from a new model."""
     rasterizer = Rasterizer(device, "radix")
     return RenderedView.render_all(rasterizer, case.model(device), photographs, device.upload(background))
 
@@ -243,16 +245,16 @@ def _render_views(
 def _falloff_squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
     """Return (dI/dG)² summed over the channels and the pixels of a mask, [N]."""
     width, height = case.size
-    counted, total = np.ones((height, width)) if mask is None else mask, np.zeros(len(case.project().opacity))
+    weights, total = np.ones((height, width)) if mask is None else mask, np.zeros(len(case.project().opacity))
     for channel in range(3):
-        gradient = counted * (np.arange(3) == channel)[:, None, None]
+        gradient = weights * (np.arange(3) == channel)[:, None, None]
         total += ref.falloff_squares(case.project(), width, height, background.astype(np.float64), gradient)
     return total
 
 
 @CHECKS.add("most_alike")
 def most_alike_labels(device: Device, rng: np.random.Generator) -> Results:
-    """Compare labels; values are integers, so that all products are exact."""
+    """Compare the labels of the most similar vectors.  Values are integers, so that all products are exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins

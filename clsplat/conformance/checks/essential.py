@@ -1,4 +1,4 @@
-"""Check the kernels that every training step uses, once each, on one small scene: it takes two seconds."""
+"""Check each kernel that every training step uses, on a small scene, in about two seconds."""
 
 import numpy as np
 
@@ -17,9 +17,9 @@ def rendering(device: Device, rng: np.random.Generator) -> Results:
     yield from projection.check_record(device, case, label)
     yield from tiles.check_list(device, case, "radix", label)
     yield from blending.check_blend(device, case, label)
-    crowded = safe_case(rng, 300, 14, 14, change=blending.make_dim)
-    yield from blending.check_blend(device, crowded, "300 that cover each other")
-    for scene, name in ((case, label), (crowded, "300 that cover each other")):
+    dense_case, dense_label = safe_case(rng, 300, 14, 14, change=blending.make_dim), "300 overlapping Gaussians"
+    yield from blending.check_blend(device, dense_case, dense_label)
+    for scene, name in ((case, label), (dense_case, dense_label)):
         weights = rng.normal(size=(3, *scene.size[::-1])).astype(np.float32)
         sums = blending.sum_pixels(device, scene, weights)
         yield from blending.check_sum(scene, sums, weights, name)

@@ -29,17 +29,17 @@ def make_camera(device: Device, width: int, height: int) -> DeviceCamera:
 
 
 def to_planes(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Array:
-    """Upload an image, [C, height, width], as planes of whole tiles, zero outside."""
+    """Upload an image, [C, height, width], as planes, which are zero-padded to complete tiles."""
     planes = np.zeros((len(image), camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = image
     return device.upload(planes)
 
 
 def blank_image(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
-    """Return the planes with the image itself set to zero."""
-    border = planes.copy()
-    border[..., : camera.height, : camera.width] = 0
-    return border
+    """Return a copy of the planes in which the image is zero, and the padding unchanged."""
+    padding = planes.copy()
+    padding[..., : camera.height, : camera.width] = 0
+    return padding
 
 
 def make_comparison(device: Device, x: NDArray[Any], y: NDArray[Any]) -> Comparison:
@@ -118,19 +118,18 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
         camera, workspace, label = make_camera(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("photograph", (3, camera.rows, camera.stride)).fill(9)
         colors = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
-        counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
+        mask_plane = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
         actual = colors.get()
         yield compare_max("unpack_pixels", f"colors, {label}", actual[:, :height, :width], pixels / 255, 1e-6)
         yield match("unpack_pixels", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
-        yield match("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
-        apply_mask(workspace, camera, colors, counted)
-        yield match("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
-        visibility, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
-        uploaded = device.upload(np.ascontiguousarray(visibility)), device.upload(before), device.upload(after)
-        masked = colors.get()
-        change_background(workspace, camera, colors, *uploaded)
-        truth = masked.astype(np.float64)
-        truth[:, :height, :width] += visibility / 255 * (after - before.astype(np.float64))[:, None, None]
+        yield match("unpack_pixels", f"mask, {label}", mask_plane.get()[:, :height, :width], mask)
+        apply_mask(workspace, camera, colors, mask_plane)
+        yield match("apply_mask", f"masked colors, {label}", colors.get(), actual * mask_plane.get())
+        transparency, old_color, new_color = pixels[:1], *rng.random((2, 3)).astype(np.float32)
+        inputs = device.upload(np.ascontiguousarray(transparency)), device.upload(old_color), device.upload(new_color)
+        truth = colors.get().astype(np.float64)
+        change_background(workspace, camera, colors, *inputs)
+        truth[:, :height, :width] += transparency / 255 * (new_color - old_color.astype(np.float64))[:, None, None]
         yield compare_max("change_background", f"colors, {label}", colors.get(), truth, 1e-6, floor=1.0)
 
 
@@ -141,8 +140,8 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
             image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
             mask = None if fraction is None else rng.random((height, width)) < fraction
             camera, workspace = make_camera(device, width, height), Workspace(device)
-            counted = None if mask is None else to_planes(device, camera, mask[None])
-            planes = Planes(workspace, camera, to_planes(device, camera, image), counted)
+            mask_plane = None if mask is None else to_planes(device, camera, mask[None])
+            planes = Planes(workspace, camera, to_planes(device, camera, image), mask_plane)
             actual = Blur(sigma=sigma).apply(planes, step=1).colors.get()
             expected = ref.blur(image.astype(np.float64), sigma, mask)
             label = f"sigma {sigma:g}, {width} x {height} px"
@@ -153,25 +152,25 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
 def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, fraction: float | None, taps: NDArray[Any]
 ) -> Results:
-    """Compare a photograph after the Haar filter, and the gradient of the filter."""
+    """Compare an image after the Haar filter, and the gradient of the filter's taps; `fraction` of pixels count."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if fraction is None else rng.random((height, width)) < fraction
     camera, workspace = make_camera(device, width, height), Workspace(device)
     label = f"{width} x {height} px, h = {taps}"
     for name in ("haar", "haar sums"):
         workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
-    counted = None if mask is None else to_planes(device, camera, mask[None])
-    numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
-    planes = Planes(workspace, camera, to_planes(device, camera, image), counted)
-    actual, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
+    mask_plane = None if mask is None else to_planes(device, camera, mask[None])
+    scalars = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
+    planes = Planes(workspace, camera, to_planes(device, camera, image), mask_plane)
+    actual, exact = apply_filter(planes, scalars).colors.get(), image.astype(np.float64)
     expected = ref.haar_filter(exact, taps, mask)
     yield compare_max("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
     yield match("haar_forward", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
-    derivatives = filter_gradients(planes, numbers, to_planes(device, camera, gradient))()
+    derivatives = filter_gradients(planes, scalars, to_planes(device, camera, gradient))()
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
-    grad_both = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
+    grad_scalars = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield compare_max("haar_backward", label, actual, grad_both, SUM, floor=size)
+    yield compare_max("haar_backward", label, actual, grad_scalars, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")
@@ -196,12 +195,12 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
         camera, workspace, label = make_camera(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("texture", (camera.rows, camera.stride)).fill(9)
         expected = sobel_magnitude(image)
-        for counted in (None, mask):
-            uploaded = None if counted is None else to_planes(device, camera, counted[None])
-            actual = unmasked_gradient(workspace, camera, to_planes(device, camera, image), uploaded).get()
-            if counted is not None:
-                expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
-            kernel = "image_gradient" if counted is None else "hide_masked"
+        for pixel_mask in (None, mask):
+            mask_plane = None if pixel_mask is None else to_planes(device, camera, pixel_mask[None])
+            actual = unmasked_gradient(workspace, camera, to_planes(device, camera, image), mask_plane).get()
+            if pixel_mask is not None:
+                expected = np.where(ndimage.minimum_filter(pixel_mask, 3, mode="nearest"), expected, -1)
+            kernel = "image_gradient" if pixel_mask is None else "hide_masked"
             yield compare_max(kernel, f"texture, {label}", actual[:height, :width], expected, 1e-6, floor=1)
             yield match(kernel, f"texture outside the image, {label}", blank_image(camera, actual), 0.0)
 
@@ -212,7 +211,7 @@ SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside 
 def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, fraction: float | None
 ) -> Results:
-    """Compare residuals, their histogram, and masks; `fraction` of the pixels count."""
+    """Compare residuals, their histogram, and masks; `fraction` of the pixels count, all if it is None."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
     counted = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
@@ -225,9 +224,9 @@ def check_transient(
     label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
     yield compare_max("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
-    others = actual.get()[0].copy()
-    others[:height, :width][counted] = -1
-    yield match("measure_residuals", f"pixels that do not count, {label}", others, -1.0)
+    excluded_pixels = actual.get()[0].copy()
+    excluded_pixels[:height, :width][counted] = -1
+    yield match("measure_residuals", f"pixels that do not count, {label}", excluded_pixels, -1.0)
     histogram = ref.residual_histogram(values[counted].astype(np.float64))
     yield match("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):

@@ -1,4 +1,4 @@
-"""Check fields: cones of pixels, samples, encodings, the network, composited colors, and updates."""
+"""Check NeRF fields: cones of pixels, samples, encodings, the network, composited colors, and updates."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,13 +39,13 @@ EDGES = 2e-6  # bound on distances, relative to the largest
 
 @dataclass(frozen=True)
 class GridLevel:
-    """A level of a grid, and the position of its entries among the parameters."""
+    """A level of a grid, and the index of its first entry in the parameters."""
 
     level: ref.HashLevel
     first: int
 
     def entries(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the level's entries, [entries, FEATURES]."""
+        """Return the level's entries, [entries, FEATURES], from the parameters of the field."""
         values = parameters[self.first : self.first + FEATURES * self.level.entries]
         return values.reshape(-1, FEATURES).astype(np.float64)
 
@@ -64,7 +64,7 @@ class FieldCase:
 
     @classmethod
     def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
-        """Return a case with random rays.  keys: changed keys of SHAPE."""
+        """Return a case with random rays.  keys: keys of SHAPE to change, and their values."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
         parameters = shape.initial_parameters(int(rng.integers(100)))
         for layer in shape.layers:
@@ -75,52 +75,53 @@ class FieldCase:
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
-        cast, levels = field.levels.sample_rays(camera, draw, rays), field.levels
+        batch, levels = field.levels.sample_rays(camera, draw, rays), field.levels
         pixels = ref.draw_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
-        filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
+        padded_pixels = np.concatenate([pixels, np.repeat(pixels[-1:], batch.count - rays)])
         planes = to_planes(device, camera, photograph)
-        return cls(
-            shape, levels, parameters, photograph, planes, cast, ref.cones(scene.camera(), filled, shape.scene_units)
-        )
+        cones = ref.cones(scene.camera(), padded_pixels, shape.scene_units)
+        return cls(shape, levels, parameters, photograph, planes, batch, cones)
 
     @property
-    def on_device(self) -> Array:
+    def device_parameters(self) -> Array:
+        """A new copy of the parameters on the device."""
         return self.levels.workspace.device.upload(self.parameters)
 
     def units(self, samples: int, kind: int) -> NDArray[np.float64]:
-        """Return the random numbers for the edges of each ray."""
+        """Return the random numbers for the edges of each ray, [rays, samples + 1]."""
         draw = self.rays.draw or Draw(0, 0, 0)
         count = self.rays.count
         rays = range(draw.first, draw.first + count)
         return np.stack([ref.random_units(ray, samples + 1, kind, draw.seed, draw.step) for ray in rays])
 
     def target_colors(self) -> NDArray[np.float64]:
-        """Return the photograph's colors of the rays that count, [counted, 3]."""
+        """Return the photograph's colors of the rays, without padding, [rays, 3]."""
         pixels = self.rays.pixels.get()
         return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
 
     def encode(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return encoded positions and directions of samples, [S, features]."""
+        """Return the encoded positions and the encoded directions of samples, both [S, features]."""
         means, variances = ref.frustums(self.cones, edges.astype(np.float64))
         sines = ref.encode_frustums(means, variances, self.shape.degrees)
         direction = ref.encode_directions(self.cones, self.shape.direction_degrees)
         features = [
-            grid.level.forward(grid.entries(self.parameters), *self.places(edges)) for grid in self.grid_levels()
+            grid.level.forward(grid.entries(self.parameters), *self.grid_positions(edges))
+            for grid in self.grid_levels()
         ]
         position = np.concatenate([*features, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
         return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
 
-    def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions of samples in the grid's cube, [S, 3], and their variances, [S]."""
+    def grid_positions(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the positions of samples in the grid's cube, [S, 3], and their variances, [S]."""
         assert self.shape.grid is not None
         means, variances = (table.reshape(-1, 3) for table in ref.frustums(self.cones, edges.astype(np.float64)))
         return ref.grid_positions(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
 
     def grid_levels(self) -> list[GridLevel]:
-        """Return the levels of the grid; an empty list without a grid."""
+        """Return the levels of the grid; an empty list if the field has no grid."""
         table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.network_parameters
         return [
-            GridLevel(ref.HashLevel(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
+            GridLevel(ref.HashLevel(cells, entries), first + FEATURES * offset) for cells, offset, entries, _ in table
         ]
 
 
@@ -142,7 +143,9 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _check_edge(case: FieldCase, label: str) -> Results:
-    coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
+    coarse, fine = (
+        (level.edges.get(), level.weights.get()) for level in case.levels.render(case.device_parameters, case.rays)
+    )
     shape, (edges, weights) = case.shape, coarse
     coarse_units, fine_units = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
     is_drawn = case.rays.draw is not None
@@ -160,20 +163,20 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
     """Compare the encoded positions and directions, the inputs of the network."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0))
-        level = next(case.levels.render(case.on_device, case.rays))
+        level = next(case.levels.render(case.device_parameters, case.rays))
         position, direction = case.encode(level.edges.get())
-        (table, first), (seen, row) = (
+        (table, row), (direction_table, direction_row) = (
             rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.direction)
         )
-        actual = read_rows(table, first, case.shape.position_rows)
+        actual = read_rows(table, row, case.shape.position_rows)
         yield compare_max("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
         yield match("encode_frustums", f"padding of blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
-        actual = read_rows(seen, row, case.shape.direction_rows)
+        actual = read_rows(direction_table, direction_row, case.shape.direction_rows)
         yield compare_max("encode_directions", f"{count} rays", actual[:, : direction.shape[1]], direction, 2e-6, 1.0)
         yield match("encode_directions", f"padding of blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
 
 
-# A grid of features: positions of samples in it, features, and gradients of its entries.
+# A grid of features: the positions of samples in the grid, their features, and the gradients of its entries.
 
 GRID: dict[str, Any] = {
     "levels": 3,
@@ -185,7 +188,7 @@ GRID: dict[str, Any] = {
 }
 CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, range of positions, keys of the grid
     *((tiles, (-0.1, 1.1), {}) for tiles in (1, 2, 17)),
-    (2, (0.0, 1.0), {"levels": 1, "coarsest": 1, "finest": 1, "entries": 16}),  # one cell, all of its corners
+    (2, (0.0, 1.0), {"levels": 1, "coarsest": 1, "finest": 1, "entries": 16}),  # a single cell, all of its corners
     (2, (-0.1, 1.1), {"entries": 16}),  # all levels use the hash
     (2, (-0.1, 1.1), {"entries": 8192}),  # no level uses the hash
     (2, (1.1, 2.0), {}),  # no sample in the cube
@@ -195,22 +198,22 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, range
 
 @CHECKS.add("grid_places", "grid_forward", "grid_backward")
 def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
-    """Compare positions of samples in a grid, the features there, and the gradients of its entries."""
+    """Compare the positions of samples in a grid, their features, and the gradients of the grid's entries."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
-        level = next(case.levels.render(case.on_device, case.rays))
-        means, variances = case.places(level.edges.get())
+        level = next(case.levels.render(case.device_parameters, case.rays))
+        means, variances = case.grid_positions(level.edges.get())
         actual = read_rows(case.levels.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield compare_max("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
         yield compare_max("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
-    for tiles, ends, keys in CASES:
+    for tiles, bounds, keys in CASES:
         case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
-        yield from _check_grid(device, rng, case, _random_positions(rng, tiles, ends))
+        yield from _check_grid(device, rng, case, _random_positions(rng, tiles, bounds))
 
 
-def _random_positions(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
-    """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means are on faces of cells."""
-    means = rng.uniform(*ends, (tiles, 3, SAMPLES))
+def _random_positions(rng: np.random.Generator, tiles: int, bounds: tuple[float, float]) -> NDArray[np.float32]:
+    """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES], with a sixth of the means on faces of cells."""
+    means = rng.uniform(*bounds, (tiles, 3, SAMPLES))
     faces = np.where(rng.random(means.shape) < 1 / 6, np.rint(4 * means) / 4, means)
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
 
@@ -225,7 +228,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
     assert shape.grid is not None
     label = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
     encoding.grid_positions(tiles).set(positions)
-    encoding.read_grid(case.on_device, tiles)
+    encoding.read_grid(case.device_parameters, tiles)
     table, first = case.levels.network.position(tiles)
     features = read_rows(table, first, shape.grid_rows)
     grad_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
@@ -235,24 +238,24 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
         encoding.parts, sums = parts, device.zeros(shape.parameters)
         encoding.backward(device.upload(grad_features), sums)
         gradients.append(sums.get())
-    actual, *others = gradients
-    for parts, gradient in zip((1, 3), others, strict=True):
-        yield match("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
-    by_sample = _flatten_samples(grad_features)
+    actual, *split_gradients = gradients
+    for parts, gradient in zip((1, 3), split_gradients, strict=True):
+        yield match("grid_backward", f"sums in {parts} parts, {label}", gradient, actual)
+    sample_gradients = _flatten_samples(grad_features)
     means, variances = np.split(_flatten_samples(positions), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
         expected = grid.level.forward(grid.entries(case.parameters), means, variances)
         yield compare_max("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
-        expected, grad_entries = grid.level.backward(by_sample[:, rows], means, variances), grid.entries(actual)
+        expected, grad_entries = grid.level.backward(sample_gradients[:, rows], means, variances), grid.entries(actual)
         yield compare("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
-        untouched = np.all(expected == 0, axis=1)
-        yield match("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[untouched], 0.0)
+        is_zero = np.all(expected == 0, axis=1)
+        yield match("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[is_zero], 0.0)
     yield match("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
 
 
-# A field: its network, colors of rays, all gradients, images and updates.
+# A field: its network, the colors of rays, the gradients of all parameters, images, and updates.
 
 FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *((count, {}) for count in RAYS),
@@ -266,13 +269,13 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *("composite_forward", "composite_backward"),
 )
 def fields(device: Device, rng: np.random.Generator) -> Results:
-    """Compare colors of rays and the gradients of all parameters, through both levels."""
+    """Compare the colors of rays, and the gradients of all parameters through the coarse and fine samples."""
     for count, keys in FIELDS_CASES:
         case = FieldCase.sample(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
         grad_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
-        parameters = case.on_device
+        parameters = case.device_parameters
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
             comparison = _Comparison.from_level(case, level, scale)
             yield from comparison.deviations(f"{count} rays, {level.samples} samples")
@@ -283,7 +286,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
             expected.append(grad_weights)
             for number, grid in enumerate(case.grid_levels()):
                 grad_features = grad_position[:, FEATURES * number : FEATURES * (number + 1)]
-                grad_entries[number] += grid.level.backward(grad_features, *case.places(level.edges.get()))
+                grad_entries[number] += grid.level.backward(grad_features, *case.grid_positions(level.edges.get()))
         for number, (grid, truth) in enumerate(zip(case.grid_levels(), grad_entries, strict=True)):
             label = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
@@ -293,22 +296,22 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
 
 def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], label: str) -> Results:
     gradient = gradient[: shape.network_parameters]
-    used = np.zeros(shape.network_parameters, bool)
+    is_used = np.zeros(shape.network_parameters, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
-        grad_weights, grad_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
+        grad_weights, grad_biases = (sum(level[number][index] for level in expected) for index in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
             yield compare(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), GRADIENT)
         yield compare("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), GRADIENT)
-        table = used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
+        table = is_used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
         table[np.ix_(layer.inputs, range(layer.outputs))] = True
-        used[layer.first_bias : layer.first_bias + layer.outputs] = True
-    yield match("dense_sums", f"padding of blocks, {label}", gradient[~used], 0.0)
+        is_used[layer.first_bias : layer.first_bias + layer.outputs] = True
+    yield match("dense_sums", f"padding of blocks, {label}", gradient[~is_used], 0.0)
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """A level, computed in float64 to compare with the device."""
+    """The reference's results for coarse or fine samples, in float64, and the results of the device."""
 
     level: SampleLevel
     scale: float
@@ -339,42 +342,43 @@ class _Comparison:
         )
         for name, actual, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
             yield compare_max("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
-        weights, left = self.composite.weights()
-        for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
+        weights, transmittance = self.composite.weights()
+        for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, transmittance)):
             yield compare_max("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
         yield compare_max("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
-    def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
+    def backward(self, ray_count: int) -> tuple[ref.Weights, NDArray[np.float64]]:
+        """Return the gradients of the weights and of the encoded positions, without rays of padding."""
         grad_colors = 2 * self.scale * self.differences
-        grad_colors[counted:] = 0
+        grad_colors[ray_count:] = 0
         grad_raw, grad_densities = self.composite.backward(grad_colors)
         return self.network.backward(self.weights, self.inputs, grad_raw.reshape(-1, 3), grad_densities.reshape(-1, 1))
 
 
 @CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """Check that an image has each pixel at its position, and zeros outside."""
+    """Check that each pixel of an image is at its position, and that the padding is zero."""
     case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
-    field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
+    field = Field(case.shape, case.device_parameters, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
-    *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))
+    *_, fine = case.levels.render(case.device_parameters, case.levels.cast(case.rays.camera, device.upload(pixels)))
     expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
     expected[:, :HEIGHT, :WIDTH] = fine.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
-    yield match("place_colors", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
+    yield match("place_colors", f"an image of {WIDTH} x {HEIGHT} px", field.paint(case.rays.camera).get(), expected)
 
 
 @CHECKS.add("dense_update")
 def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """Compare three updates by Adam from gradients of all magnitudes."""
-    learned = LearnedField.initial(SHAPE, 0, device.upload(BACKGROUND))
+    """Compare three Adam updates from gradients of all magnitudes."""
+    field = LearnedField.initial(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters
     values, moment1, moment2 = SHAPE.initial_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
-    for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
+    for step, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
-        learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
+        field.update(device.upload(gradient), AdamStep(0.01, epsilon), step)
         exact = gradient.astype(np.float64)
-        values, moment1, moment2 = adam_step(values, exact, moment1, moment2, number, 0.01, epsilon=epsilon)
-    actual = learned.tables()
+        values, moment1, moment2 = adam_step(values, exact, moment1, moment2, step, 0.01, epsilon=epsilon)
+    actual = field.tables()
     yield compare_max("dense_update", "parameters", actual["parameters"][:, 0], values, 1e-4, 0.01)
     yield compare_max("dense_update", "first moments", actual["moment1"][:, 0], moment1, 1e-4, 1e-12)
     yield compare_max("dense_update", "second moments", actual["moment2"][:, 0], moment2, 1e-4, 1e-24)

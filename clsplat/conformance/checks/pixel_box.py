@@ -1,4 +1,4 @@
-"""Check the box filter, which integrates splats over each pixel: records, images, sums, gradients, updates."""
+"""Check the box filter, which integrates splats over each pixel: records, images, sums, gradients, and updates."""
 
 from typing import Any
 
@@ -74,9 +74,8 @@ def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case.parameters["log_scales"][:10] += 1.5
     weights = rng.normal(size=(3, 130, 150)).astype(np.float32)
     image = render(device, case).image.get()
-    yield match(
-        "sort_tiles", "pixels over their box, by the other sort", render(device, case, "bitonic").image.get(), image
-    )
+    bitonic_image = render(device, case, "bitonic").image.get()
+    yield match("sort_tiles", "pixels with the box filter, against the radix sort", bitonic_image, image)
     sums = sum_pixels(device, case, weights)
-    banded = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
-    yield match("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)
+    band_sums = sum_pixels(device, case, weights, budget=RenderLimits(250, 3))
+    yield match("blend_backward", "sums over pixels with the box filter, against bands of tiles", band_sums, sums)

@@ -45,7 +45,7 @@ LONG_FILTERS: dict[str, dict[str, float]] = {
     "mip": {"variance": 0.1, "compensate": 1.0},
     "box": {"variance": 0.0, "pixel_box": 1.0},
 }
-LONG = 1e-3  # largest error in the gradient of a long splat, relative to the largest gradient
+LONG_GRADIENT = 1e-3  # largest error in the gradient of a long splat, relative to the largest gradient
 
 
 def project_records(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -61,65 +61,69 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     kernel = "project_forward"
     records, keys, radius = project_records(device, case)
     truth, (width, height) = case.project(), case.size
-    # the kernel also culls splats that no pixel of the image can see: they must be outside or too faint
-    rendered = records[:, 5] > 0
+    # the kernel also culls splats that reach no pixel of the image: they must be outside of it or too faint
+    is_rendered = records[:, 5] > 0
     x, y = truth.mean2d.T
-    unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
+    may_be_culled = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
     yield count_true(
-        kernel, f"which splats are drawn, {label}", (rendered & ~truth.visible) | (truth.visible & ~rendered & ~unseen)
+        kernel,
+        f"which splats are drawn, {label}",
+        (is_rendered & ~truth.visible) | (truth.visible & ~is_rendered & ~may_be_culled),
     )
-    rendered &= truth.visible
-    record = records[rendered]
-    yield compare_max(kernel, f"means, {label}", record[:, :2], truth.mean2d[rendered], PROJECTION, floor=50)
+    is_rendered &= truth.visible
+    record = records[is_rendered]
+    yield compare_max(kernel, f"means, {label}", record[:, :2], truth.mean2d[is_rendered], PROJECTION, floor=50)
     conic = record_covariances(record) if case.pixel_box else record[:, 2:5]
-    size = np.maximum(np.linalg.norm(truth.conic[rendered], axis=1), 1e-30)
-    error = np.linalg.norm(conic - truth.conic[rendered], axis=1) / size
+    size = np.maximum(np.linalg.norm(truth.conic[is_rendered], axis=1), 1e-30)
+    error = np.linalg.norm(conic - truth.conic[is_rendered], axis=1) / size
     yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
-    yield compare_max(kernel, f"opacities, {label}", record[:, 5], truth.opacity[rendered], PROJECTION)
-    yield compare_max(kernel, f"colors, {label}", record[:, 6:9], truth.color[rendered], PROJECTION, floor=1)
-    yield compare_max(kernel, f"depths, {label}", keys[rendered].view(np.float32), truth.depth[rendered], DEPTH)
+    yield compare_max(kernel, f"opacities, {label}", record[:, 5], truth.opacity[is_rendered], PROJECTION)
+    yield compare_max(kernel, f"colors, {label}", record[:, 6:9], truth.color[is_rendered], PROJECTION, floor=1)
+    yield compare_max(kernel, f"depths, {label}", keys[is_rendered].view(np.float32), truth.depth[is_rendered], DEPTH)
     if not case.pixel_box:
-        power_min = -np.log(255 * truth.opacity[rendered])
+        power_min = -np.log(255 * truth.opacity[is_rendered])
         yield compare_max(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
-    hidden = records[:, 5] <= 0
-    yield count_true(kernel, f"culled splats, {label}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
+    is_culled = records[:, 5] <= 0
+    yield count_true(
+        kernel, f"culled splats, {label}", (keys[is_culled] != CULLED) | (records[is_culled] != 0).any(axis=1)
+    )
     # ceil() may jump by a pixel where the radius is close to an integer
     yield count_true(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
     yield count_true(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
-    yield count_true(kernel, f"extents, {label}", _wrong_extents(record, truth, rendered))
+    yield count_true(kernel, f"extents, {label}", _wrong_extents(record, truth, is_rendered))
 
 
 def record_covariances(record: NDArray[Any]) -> NDArray[Any]:
     """Return covariances, [N, 3], from the fields of records for the box filter."""
-    k, s, t, swapped = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
+    k, s, t, is_swapped = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
     xx, xy, yy = t**2 + k**2 * s**2, k * s**2, s**2
-    return np.stack([np.where(swapped > 0, yy, xx), xy, np.where(swapped > 0, xx, yy)], axis=1)
+    return np.stack([np.where(is_swapped > 0, yy, xx), xy, np.where(is_swapped > 0, xx, yy)], axis=1)
 
 
-def _wrong_extents(record: NDArray[Any], truth: ref.Splats, rendered: NDArray[Any]) -> NDArray[Any]:
-    """Return which extents miss pixels where alpha is 1/255 or more, or are much larger than needed."""
-    reach2 = 2 * np.log(255 * truth.opacity[rendered])
-    a, b, c = truth.conic[rendered].T
+def _wrong_extents(record: NDArray[Any], truth: ref.Splats, is_rendered: NDArray[Any]) -> NDArray[Any]:
+    """Return a mask of the extents that miss pixels with an alpha of 1/255 or more, or that are much too large."""
+    reach2 = 2 * np.log(255 * truth.opacity[is_rendered])
+    a, b, c = truth.conic[is_rendered].T
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
-    if truth.pixel_box:  # of the covariance, a pixel wider
+    if truth.pixel_box:  # from the covariance, half a pixel wider on each side
         half_x, half_y = 0.5 + np.sqrt(reach2 * a), 0.5 + np.sqrt(reach2 * c)
-    right = np.ones(len(record), bool)
+    is_right = np.ones(len(record), bool)
     for low, high, center, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
-        mean = truth.mean2d[rendered, center]
-        right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
-        right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
-    return ~right
+        mean = truth.mean2d[is_rendered, center]
+        is_right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
+        is_right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
+    return ~is_right
 
 
 def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of the parameters from the same sums over each Gaussian's pixels."""
+    """Compare the gradients of the parameters for the same sums over each Gaussian's pixels."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(model, camera, device.zeros(3))
     gaussians, truth = model.gaussians, case.project()
-    rendered = frame.splats.get()[:, 5] > 0
+    is_rendered = frame.splats.get()[:, 5] > 0
     pixel_sums = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
-    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * rendered
+    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * is_rendered
     gradients = rasterizer.gradients(model, frame, device.upload(pixel_sums))
     expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
     for name, array in gradients.arrays.items():
@@ -142,10 +146,9 @@ def check_long_splats(device: Device, case: Case, rng: np.random.Generator, labe
     for name in ("means", "quats", "log_scales"):
         value = gradients.arrays[name].get()[:, : gaussians.count].T
         error = np.abs(value - expected[name]).max(axis=1) / np.abs(expected[name]).max()
-        yield Deviation("project_backward", f"the worst gradient of {name}, {label}", float(error.max()), LONG)
-        yield Deviation(
-            "project_backward", f"the median gradient of {name}, {label}", float(np.median(error)), LONG / 10
-        )
+        yield Deviation("project_backward", f"the worst gradient of {name}, {label}", float(error.max()), LONG_GRADIENT)
+        median, median_label = float(np.median(error)), f"the median gradient of {name}, {label}"
+        yield Deviation("project_backward", median_label, median, LONG_GRADIENT / 10)
 
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -166,7 +169,7 @@ def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[s
 
 
 def undrawable_case(rng: np.random.Generator) -> Case:
-    """Return 40 Gaussians; the first nine are behind the camera, huge, faint, or NaN."""
+    """Return a case of 40 Gaussians, of which the first nine are behind the camera, huge, faint, or NaN."""
     case = random_case(rng, 40)
     p, pose = case.parameters, case.view.world_to_camera
     p["means"][0] = (np.array([0, 0, -3]) - pose[:, 3]) @ pose[:, :3]
@@ -182,7 +185,7 @@ def undrawable_case(rng: np.random.Generator) -> Case:
 
 
 def wide_angle_case(rng: np.random.Generator) -> Case:
-    """Return Gaussians all over a view of 170 degrees."""
+    """Return a case of Gaussians spread over a field of view of 170 degrees."""
     case = random_case(rng, 40)
     camera, pose, (width, height) = case.view.camera, case.view.world_to_camera, case.size
     camera = replace(camera, fx=0.045 * width, fy=0.045 * width)
@@ -194,10 +197,10 @@ def wide_angle_case(rng: np.random.Generator) -> Case:
 
 
 def clamped_case(rng: np.random.Generator) -> Case:
-    """Return wide Gaussians whose rays are beyond the limits at which the linear projection is clamped."""
+    """Return a case of large Gaussians with rays beyond the limits at which the linear projection is clamped."""
     case = random_case(rng, 30)
-    depth, far = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
-    in_camera = np.stack([far * depth, 0.2 * depth, depth], axis=1)
+    depth, slope = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
+    in_camera = np.stack([slope * depth, 0.2 * depth, depth], axis=1)
     rotation, translation = case.view.world_to_camera[:, :3], case.view.world_to_camera[:, 3]
     case.parameters["means"][:] = (in_camera - translation) @ rotation
     case.parameters["log_scales"][:] = np.log(0.6) + rng.normal(0, 0.2, (30, 3))
@@ -228,18 +231,18 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
 def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Results:
     """Hide Gaussians in training views; compare each view's image with an image of only the other Gaussians."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
-    left_out = rng.random((views, count)) < 0.5
-    hide(model.gaussians, left_out)
+    hidden_masks = rng.random((views, count)) < 0.5
+    hide(model.gaussians, hidden_masks)
     rasterizer, background = Rasterizer(device, "radix"), device.upload(np.full(3, 0.25, np.float32))
     for view in sorted({0, min(HIDDEN_VIEWS, views) - 1, views - 1}):
         label = f"hidden Gaussians of {count}, view {view} of {views}"
         frame = rasterizer.forward(model, replace(camera, view=view), background)
-        actual, hidden = frame.image.get().copy(), left_out[view]
+        actual, hidden = frame.image.get().copy(), hidden_masks[view]
         yield match("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
         yield match("project_forward", f"depths of {label}", frame.depth_key.get()[:count][hidden], CULLED)
         yield match("project_forward", f"radii of {label}", frame.radius.get()[:count][hidden], 0.0)
-        others = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
-        expected = rasterizer.forward(others.model(device), camera, background).image.get()
+        visible_case = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
+        expected = rasterizer.forward(visible_case.model(device), camera, background).image.get()
         yield match("project_forward", f"image without {label}", actual, expected)
 
 
@@ -264,7 +267,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare gradients of long splats, whose terms would cancel in other formulas, from sums over a blended image."""
+    """Compare the gradients of long splats for sums over a blended image; in other formulas, their terms cancel."""
     for aspect in ASPECTS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)
@@ -301,32 +304,32 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
         )
         pose = case.camera().world_to_camera
         z = case.parameters["means"].astype(np.float64) @ pose[2, :3] + pose[2, 3]
-        painted = frame.splats.get()[:, 6:9]
+        colors = frame.splats.get()[:, 6:9]
         expected = np.stack([z, np.ones(count), np.zeros(count)], axis=1)
-        yield compare_max("paint_depth", f"depths, {count} Gaussians", painted, expected, DEPTH, floor=1)
+        yield compare_max("paint_depth", f"depths, {count} Gaussians", colors, expected, DEPTH, floor=1)
 
 
 # poses.cl: gradients of the pose and the focal length of a camera.
 
 
 def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of the pose from the same sums over each Gaussian's pixels."""
+    """Compare the gradients of the pose and the focal length for the same sums over each Gaussian's pixels."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)
-    rendered = frame.splats.get()[:, 5] > 0
-    pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * rendered
+    is_rendered = frame.splats.get()[:, 5] > 0
+    pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * is_rendered
     actual = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
     m, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
     grad_mean2d, grad_conic = sums_to_gradients(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
-    numbers = case.degree, case.variance, case.compensate
-    expected = ref.pose_gradient(case.gaussians(), case.camera(), *numbers, truth, *upstream)
+    settings = case.degree, case.variance, case.compensate
+    expected = ref.pose_gradient(case.gaussians(), case.camera(), *settings, truth, *upstream)
     rotation = case.camera().rotation
     values = {"shift": rotation @ actual[:3], "turn": rotation @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
-        yield compare("pose_gradient", f"derivative by the {name}, {label}", value[None], exact[None], CONIC)
+        yield compare("pose_gradient", f"gradient of the {name}, {label}", value[None], exact[None], CONIC)
 
 
 @CHECKS.add("pose_gradient")

@@ -18,11 +18,11 @@ from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
 SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # width, height, texels per side
-NEAR = 2e-6  # bound on a texel's weight: positions are differences of numbers up to 512
+WEIGHT = 2e-6  # bound on the error of a texel's weight; its position is a difference of values up to 512
 
 
 def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
-    """Return a camera with a wide lens in a random direction."""
+    """Return a case whose camera has a wide lens and looks in a random direction."""
     case = random_case(rng, 1, width, height)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     pose = np.column_stack([rotation * np.linalg.det(rotation), case.view.world_to_camera[:, 3]])
@@ -39,10 +39,10 @@ class SkyView:
         self.directions = ref.rays(case.camera(), width, height)
         self.texels = rng.random((side, side, 3)).astype(np.float32)
         self.sky = DeviceSky(device.upload(flatten_map(self.texels)), side)
-        self.free = rng.random((side, side)) < 0.95
-        self.learned = device.upload(self.free.reshape(1, -1).astype(np.float32))
-        self.left = rng.random((height, width)).astype(np.float32)
-        self.transmittance = self.planes(np.where(rng.random(self.left.shape) < 0.5, -1, 1) * self.left[None])
+        self.free_mask = rng.random((side, side)) < 0.95  # texels that are trained
+        self.free = device.upload(self.free_mask.reshape(1, -1).astype(np.float32))
+        self.magnitude = rng.random((height, width)).astype(np.float32)  # of the transmittance
+        self.transmittance = self.planes(np.where(rng.random(self.magnitude.shape) < 0.5, -1, 1) * self.magnitude[None])
         self.skies = Skies(device, Workspace(device))
 
     def planes(self, image: NDArray[Any]) -> Array:
@@ -63,36 +63,35 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
-    expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
-    actual = planes.get()
-    yield compare_max("sky_forward", f"image, {label}", view.crop(actual), expected, 5 * NEAR, floor=1.0)
+    sky_colors = ref.sky_image(view.texels.astype(np.float64), view.directions)
+    expected, actual = image.astype(np.float32) + view.magnitude * sky_colors, planes.get()
+    yield compare_max("sky_forward", f"image, {label}", view.crop(actual), expected, 5 * WEIGHT, floor=1.0)
     yield match("sky_forward", f"pixels outside the image, {label}", blank_image(view.camera, actual), 0.0)
     grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
-    all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
-    shown = view.skies.runs(view.camera, side).shown.get()
-    rows = all_texels.reshape(-1, 3)
-    yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, rows[shown], SUM)
-    yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, rows[shown], SUM)
-    hidden = np.delete(rows, shown, axis=0)
-    yield match("sky_gather", f"texels outside the view, {label}", hidden, 0.0)
+    transmittance = view.magnitude.astype(np.float64)
+    expected = ref.sky_gradient(side, view.directions, transmittance, gradient.astype(np.float64)).reshape(-1, 3)
+    visible = view.skies.runs(view.camera, side).shown.get()
+    yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, expected[visible], SUM)
+    yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, expected[visible], SUM)
+    yield match("sky_gather", f"texels outside the view, {label}", np.delete(expected, visible, axis=0), 0.0)
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare the loss of Gaussians that cover the sky; no pixel is close to the threshold on differences."""
+    """Compare the loss of Gaussians that cover the sky; no pixel is close to the threshold on color differences."""
     view, label, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
-    far = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
-    photograph = (sky + far * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
+    distance = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
+    photograph = (sky + distance * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
     scale = weight / (width * height)
     behind, sums = view.skies.cover(
-        view.sky, view.learned, view.camera, view.planes(photograph), view.transmittance, difference, scale
+        view.sky, view.free, view.camera, view.planes(photograph), view.transmittance, difference, scale
     )
-    learned = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
-    chosen, actual = ref.sky_mask(sky, np.where(learned, 9, photograph), difference), behind.get()
-    loss, grad_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
+    has_fixed_texel = ref.sky_image(1.0 - view.free_mask[..., None], view.directions)[0] > 0
+    is_sky, actual = ref.sky_mask(sky, np.where(has_fixed_texel, 9, photograph), difference), behind.get()
+    loss, grad_transmittance = ref.sky_cover(is_sky, view.magnitude.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
-        expected = view.left * grad_left
-        yield compare_max(kernel, f"T dL/dT, {label}", view.crop(actual), expected, NEAR, floor=scale)
+        expected = view.magnitude * grad_transmittance
+        yield compare_max(kernel, f"T dL/dT, {label}", view.crop(actual), expected, WEIGHT, floor=scale)
     yield match("sky_cover", f"T dL/dT outside the image, {label}", blank_image(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])
     yield compare_max("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
@@ -115,21 +114,21 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
     """Compare three updates; texels outside the view stay unchanged."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
-    shown = view.skies.runs(view.camera, side).shown.get()
+    visible = view.skies.runs(view.camera, side).shown.get()
     moments = {name: device.zeros((width, texels)) for name, width in (("moment1", 3), ("moment2", 3), ("biases", 2))}
-    moments["free"], free = view.learned, view.free.ravel()[shown]
-    expected = flatten_map(view.texels)[:, shown].astype(np.float64)
-    first, second = np.zeros_like(expected), np.zeros_like(expected)
-    before, pixels = view.sky.texels.get(), 3 * 9 * 7
-    for updates in (1, 2, 3):
-        gradient = (rng.normal(size=expected.shape) / pixels).astype(np.float32)
+    moments["free"], is_free = view.free, view.free_mask.ravel()[visible]
+    expected = flatten_map(view.texels)[:, visible].astype(np.float64)
+    moment1, moment2 = np.zeros_like(expected), np.zeros_like(expected)
+    initial, size = view.sky.texels.get(), 3 * 9 * 7
+    for step in (1, 2, 3):
+        gradient = (rng.normal(size=expected.shape) / size).astype(np.float32)
         view.skies.update(view.sky, view.camera, device.upload(gradient), moments, 0.01)
-        total = pixels * gradient.astype(np.float64)
-        new, first, second = ref.adam_step(expected, total, first, second, updates, 0.01, epsilon=1.0)
-        expected = np.where(free, new, expected)
+        total = size * gradient.astype(np.float64)
+        updated, moment1, moment2 = ref.adam_step(expected, total, moment1, moment2, step, 0.01, epsilon=1.0)
+        expected = np.where(is_free, updated, expected)
     actual = view.sky.texels.get()
-    yield compare_max("sky_update", "colors of texels", actual[:, shown], expected, 1e-6, floor=1.0)
-    for name, moment in (("moment1", first), ("moment2", second)):
-        yield compare_max("sky_update", f"{name} of texels", moments[name].get()[:, shown], moment, 1e-5, floor=0.1)
-    hidden = np.setdiff1d(np.arange(texels), shown)
-    yield match("sky_update", "texels outside the view", actual[:, hidden], before[:, hidden])
+    yield compare_max("sky_update", "colors of texels", actual[:, visible], expected, 1e-6, floor=1.0)
+    for name, moment in (("moment1", moment1), ("moment2", moment2)):
+        yield compare_max("sky_update", f"{name} of texels", moments[name].get()[:, visible], moment, 1e-5, floor=0.1)
+    hidden = np.setdiff1d(np.arange(texels), visible)
+    yield match("sky_update", "texels outside the view", actual[:, hidden], initial[:, hidden])

@@ -1,4 +1,4 @@
-"""Check scans, sorts and tile lists; results are exact."""
+"""Check prefix sums, sorts and tile lists, whose results are exact."""
 
 from dataclasses import replace
 from typing import Any
@@ -24,14 +24,14 @@ def make_tiler(device: Device, sort: Sort = "radix") -> Tiler:
 
 
 def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
-    """Compare an exclusive prefix sum, which saturates at the largest number."""
+    """Compare an exclusive prefix sum, which saturates at the largest uint32."""
     offsets = make_tiler(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
     return match("scan_offsets", f"sums of {len(values)} values", offsets, expected)
 
 
 def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
-    """Compare a stable sort of keys below 2^bits."""
+    """Compare a stable sort of keys, all of them below 2^bits."""
     sorted_keys, order = make_tiler(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
     yield match("radix_scatter", f"positions of {len(keys)} keys of {bits} bits", order.get(), expected)
@@ -39,7 +39,10 @@ def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
 
 
 def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
-    """Sort tiles of these lengths by depth keys below `max_key`, ties by pair."""
+    """Compare a sort of the pairs in tiles, by depth key and then by index.
+
+    lengths: number of pairs in each tile; max_key: bound on the depth keys, exclusive.
+    """
     tiles, pairs = len(lengths), sum(lengths)
     pair_tile = rng.permutation(np.repeat(np.arange(tiles), lengths)).astype(np.uint32)
     depth_key = rng.integers(0, max_key, pairs).astype(np.uint32)
@@ -67,8 +70,8 @@ def radix_sort(device: Device, rng: np.random.Generator) -> Results:
         for bits in (9, 32):
             keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
             yield from check_radix(device, keys, bits)
-    for orderly in (np.full(3000, 7), np.arange(3000)[::-1]):
-        yield from check_radix(device, orderly.astype(np.uint32), 12)
+    for special_keys in (np.full(3000, 7), np.arange(3000)[::-1]):
+        yield from check_radix(device, special_keys.astype(np.uint32), 12)
 
 
 @CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
@@ -88,7 +91,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
-    """Check that each tile lists the splats that reach it once, front to back, and few others."""
+    """Check that each tile lists every splat that reaches it exactly once, front to back, and few others."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
@@ -104,12 +107,13 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     sorted_order = np.lexsort((ordered, keys[ordered], tile))
     kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
     yield match(kernel, f"order in tiles, {label}", sorted_order, np.arange(lists.pairs))
-    listed = np.zeros((tiles, count), int)
-    np.add.at(listed, (tile, ordered), 1)
-    yield count_true("emit_pairs", f"pairs listed twice, {label}", listed > 1)
-    strongest, bounded = _strongest(frame, case)
-    yield count_true("emit_pairs", f"missing pairs, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
-    yield count_true("emit_pairs", f"superfluous pairs, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
+    list_counts = np.zeros((tiles, count), int)
+    np.add.at(list_counts, (tile, ordered), 1)
+    yield count_true("emit_pairs", f"pairs listed twice, {label}", list_counts > 1)
+    max_alpha, is_decisive = _max_alpha(frame, case)
+    yield count_true("emit_pairs", f"missing pairs, {label}", (max_alpha >= 1.0001 / 255) & (list_counts == 0))
+    is_superfluous = is_decisive & (max_alpha <= 0.95 / 255) & (list_counts > 0)
+    yield count_true("emit_pairs", f"superfluous pairs, {label}", is_superfluous)
     pairs = np.bincount(splats, minlength=count)
     tile_count = lists.tile_count.get()[:count]
     yield match("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, tile_count)
@@ -117,27 +121,28 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     yield match("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(tile_count))
 
 
-def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the largest alpha of each record in each tile, [T, N], and whether it decides which pairs are allowed.
+def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the largest alpha of each record in each tile, and whether it decides if the pair is allowed, both [T, N].
 
-    Tiles at the edge of the image, and splats thinner than a few pixels, may be listed although they reach no pixel.
+    It does not for tiles at the edge of the image and for splats thinner than a few pixels, whose pairs may be listed
+    although they reach no pixel.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera
     (width, height), tile = case.size, camera.tile
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    strongest = np.zeros((camera.tiles, len(records)))
-    inside = np.zeros(camera.tiles, bool)
+    max_alpha = np.zeros((camera.tiles, len(records)))
+    is_complete = np.zeros(camera.tiles, bool)
     for n, record in enumerate(records):
         dx, dy = record[0] - x, record[1] - y
         power = -0.5 * (record[2] * dx**2 + record[4] * dy**2) - record[3] * dx * dy
         alpha = record[5] * np.exp(np.minimum(power, 0))
         for t in range(camera.tiles):
             row, column = divmod(t, camera.tiles_x)
-            part = alpha[row * tile : (row + 1) * tile, column * tile : (column + 1) * tile]
-            strongest[t, n] = part.max()
-            inside[t] = part.shape == (tile, tile)
-    thin = np.minimum(records[:, 12] - records[:, 11], records[:, 10] - records[:, 9]) < 4
-    return strongest, inside[:, None] & ~thin
+            tile_alpha = alpha[row * tile : (row + 1) * tile, column * tile : (column + 1) * tile]
+            max_alpha[t, n] = tile_alpha.max()
+            is_complete[t] = tile_alpha.shape == (tile, tile)
+    is_thin = np.minimum(records[:, 12] - records[:, 11], records[:, 10] - records[:, 9]) < 4
+    return max_alpha, is_complete[:, None] & ~is_thin
 
 
 # Splats that reach more tiles than a mask has bits; the items of a group share the work on their rectangles.
@@ -149,7 +154,10 @@ UNTOUCHED = 0xDEADBEEF
 
 
 def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Return Gaussians of half the image's longer side, and some of a tenth; columns, rows: tiles."""
+    """Return a case of Gaussians as large as half of the image's longer side, every third only a tenth of it.
+
+    columns, rows: size of the image, in tiles.
+    """
     tile = int(device.tuning["TILE"])
     width, height, side = columns * tile, rows * tile, max(columns, rows) * tile
     case = random_case(rng, count, side, side)
@@ -164,7 +172,7 @@ def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_large(device: Device, rng: np.random.Generator) -> Results:
-    """Compare lists of images with many rows, of rectangles at the limits of a mask, and of wrong counts."""
+    """Check the lists of images with many rows of tiles, of splats that reach about 32 tiles, and of wrong counts."""
     for columns, rows in (TALL, *MASK_SIZED):
         case, label = large_case(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
         yield from check_list(device, case, "radix", label)
@@ -172,37 +180,37 @@ def check_large(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_wrong_counts(device: Device, case: Case) -> Results:
-    """Check that each splat lists exactly as many tiles as were counted, even if the count is wrong, each once."""
+    """Check that each splat lists as many tiles as its count says, each at most once, even if the count is wrong."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
-    number, camera = len(case.parameters["means"]), frame.camera
-    box = rasterizer.workspace.array("tile_box", number, np.uint32)
-    actual = frame.lists.tile_count.get()[:number].astype(int)
+    gaussian_count, camera = len(case.parameters["means"]), frame.camera
+    box = rasterizer.workspace.array("tile_box", gaussian_count, np.uint32)
+    actual = frame.lists.tile_count.get()[:gaussian_count].astype(int)
     large = (box.get() >> 24 == 33) & (actual > 0)
     for surplus in SURPLUS:
-        count = np.where(large, np.maximum(1, actual + surplus), 0)
-        first = np.concatenate([[0], np.cumsum(count)])
+        counts = np.where(large, np.maximum(1, actual + surplus), 0)
+        first = np.concatenate([[0], np.cumsum(counts)])
         arrays = [device.upload(np.full(first[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(
             groups=1,
             splats=frame.splats,
             tile_box=box,
-            tile_count=device.upload(count.astype(np.uint32)),
+            tile_count=device.upload(counts.astype(np.uint32)),
             first_pair=device.upload(first[:-1].astype(np.uint32)),
             pair_tile=arrays[0],
             pair_splat=arrays[1],
             tiles_x=camera.tiles_x,
             row_begin=0,
             row_end=camera.tiles_y,
-            run=number,
-            count=number,
+            run=gaussian_count,
+            count=gaussian_count,
         )
         tile, splat = (array.get() for array in arrays)
         label = f"large Gaussians counted with {surplus:+d} tiles"
-        owner = np.repeat(np.arange(number), count)
+        owner = np.repeat(np.arange(gaussian_count), counts)
         yield match("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
         yield count_true("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
         yield match("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
-        twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
-        yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, twice), 0, counts=True)
+        duplicate_count = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, counts - camera.tiles).sum())
+        yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, duplicate_count), 0, counts=True)

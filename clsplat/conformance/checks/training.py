@@ -76,7 +76,7 @@ def _random_pixel_sums(
 
 
 def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare one fused update: moments with the reference's gradients, values with the device's own moments."""
+    """Compare one fused update: moments with the reference's gradients, and values with the device's moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -89,13 +89,13 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
         yield compare(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
         yield compare(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
         step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
-        before = case.parameters[name].astype(np.float64)
+        initial = case.parameters[name].astype(np.float64)
         floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
-        yield compare_max(kernel, f"{name}, {label}", gaussians.get(name), before - step, 3e-7, floor)
+        yield compare_max(kernel, f"{name}, {label}", gaussians.get(name), initial - step, 3e-7, floor)
 
 
 def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare the fifth update, of visible rows only, by each kernel from the same gradients and earlier moments."""
+    """Compare the fifth update, of visible rows only, by each kernel, from the same gradients and moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -107,25 +107,27 @@ def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label:
         gaussians, adam = model.gaussians, Adam(model.gaussians)
         frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
         gradients = rasterizer.gradients(model, frame, pixel_sums)
-        seen = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
+        is_visible = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
         adam.updates = dict.fromkeys(PARAMETERS, 4)
         expected: dict[str, NDArray[Any]] = {}
         for name in PARAMETERS:
             for table, values in zip(moment_tables(name), moments[name], strict=True):
                 gaussians.set(table, values)
             tables = name, *moment_tables(name)
-            before, moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in tables)
+            initial, moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in tables)
             gradient = gradients[name].get()[:, :count].T.astype(np.float64)
-            after = ref.adam_step(before, gradient, moment1, moment2, 5, rates[name], seen=seen)
-            expected |= dict(zip(tables, after, strict=True))
+            updated = ref.adam_step(initial, gradient, moment1, moment2, 5, rates[name], seen=is_visible)
+            expected |= dict(zip(tables, updated, strict=True))
         if kernel == "adam_step":
             adam.step(model, frame, gradients, rates, rows="seen")
         else:
             adam.update(model, frame, pixel_sums, rates, rows="seen")
         for table, truth in expected.items():
             actual = gaussians.get(table)
-            yield match(kernel, f"{table} of rows not seen, {label}", actual[~seen], truth[~seen])
-            yield compare_max(kernel, f"{table} of rows seen, {label}", actual[seen], truth[seen], 3 * SUM, floor=0.1)
+            yield match(kernel, f"{table} of invisible rows, {label}", actual[~is_visible], truth[~is_visible])
+            yield compare_max(
+                kernel, f"{table} of visible rows, {label}", actual[is_visible], truth[is_visible], 3 * SUM, floor=0.1
+            )
 
 
 def put_every_fifth_behind(case: Case) -> Case:
@@ -177,9 +179,9 @@ def check_penalty(
     value, gradient = oracle(case.parameters[parameter].astype(np.float64))
     kernel, label = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
     yield compare_max(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), SUM, floor=1e-7)
-    added = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
+    actual_gradient = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
     floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
-    yield compare_max(kernel, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)
+    yield compare_max(kernel, f"gradient, {label}", actual_gradient, 3 * gradient, 1e-4, floor)
 
 
 @CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity", "opacity_pressure")
@@ -234,11 +236,11 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
         actual = case.model(device).gaussians.not_finite()
-        differing = {"quats", "sh_rest"} ^ set(actual)
-        yield Deviation("count_not_finite", f"tables with {value}", len(differing), 0, counts=True)
+        wrong_names = {"quats", "sh_rest"} ^ set(actual)
+        yield Deviation("count_not_finite", f"tables with {value}", len(wrong_names), 0, counts=True)
 
 
-# Deferred updates of harmonics, which wait until a view sees their Gaussians.
+# Deferred updates of harmonics, which are done when their Gaussians are visible again.
 
 DEFERRED_COUNTS = (1, 15, 17, 65, 150)
 CULLED = 0xFFFFFFFF
@@ -247,7 +249,7 @@ STEPS = 8
 
 
 def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
-    """Return the rows that a view sees, [N]: few, and in few of the blocks of 16."""
+    """Return a random mask of rows that are visible in a view, [N]: few rows, in few of the blocks of 16."""
     blocks = rng.random(-(-count // 16)) < 0.4
     return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
 
@@ -257,7 +259,7 @@ def train(
 ) -> dict[str, NDArray[np.float32]]:
     """Update a model once for each view, and return the harmonics and their moments.
 
-    seen: [N] rows in the view; gradients: [N, components] of the harmonics.
+    seen: for each view, the mask of visible rows, [N]; gradients: those of the harmonics, [N, components].
     """
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)
@@ -273,30 +275,30 @@ def train(
         loss_gradients["sh_rest"].set(planes)
         if deferred:
             deferred.catch_up(view_frame.depth_key)
-        others = set(gaussians.trained) - {"sh_rest"}
-        adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), others, rows)
+        excluded = set(gaussians.trained) - {"sh_rest"}
+        adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), excluded, rows)
     return {name: gaussians.get(name) for name in Deferred.names}
 
 
 def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Results:
     """Compare deferred updates with the reference, and with the bits of immediate updates."""
     case = random_case(rng, count)
-    before = case.parameters["sh_rest"]
+    initial = case.parameters["sh_rest"]
     seen = [seen_rows(rng, count) for _ in range(STEPS)]
-    gradients = [rng.normal(size=before.shape).astype(np.float32) * mask[:, None] for mask in seen]
-    values, moment1, moment2 = before.astype(np.float64), np.zeros(before.shape), np.zeros(before.shape)
+    gradients = [rng.normal(size=initial.shape).astype(np.float32) * mask[:, None] for mask in seen]
+    values, moment1, moment2 = initial.astype(np.float64), np.zeros(initial.shape), np.zeros(initial.shape)
     for step, gradient in enumerate(gradients, 1):
         rate = Rates().at(step, extent=2.0)["sh_rest"]
         values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
     actual = train(device, case.model(device), seen, gradients, "deferred")
-    at_once = train(device, case.model(device), seen, gradients, "all")
-    max_change = max(float(np.abs(values - before).max(initial=0)), 1e-6)
+    immediate = train(device, case.model(device), seen, gradients, "all")
+    max_change = max(float(np.abs(values - initial).max(initial=0)), 1e-6)
     yield compare_max("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
     for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
         yield compare_max("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
     for name in Deferred.names:
-        bits, expected_bits = actual[name].view(np.uint32), at_once[name].view(np.uint32)
+        bits, expected_bits = actual[name].view(np.uint32), immediate[name].view(np.uint32)
         yield match("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
 
 
@@ -313,7 +315,7 @@ def averages(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_average(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare the average of three steps; the last of several rows is new after the first step."""
+    """Compare the average of three steps.  If there are several rows, the last is new after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
     adam.attach_average(gaussians)
@@ -336,7 +338,7 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
         yield compare_max("take_average", f"average of {name}, {count} Gaussians", actual, expected, SUM, floor=1)
 
 
-# dropout.cl, and the projection of the Gaussians that it keeps.
+# dropout.cl, and the projection of the remaining Gaussians.
 
 SEED, STEP = 0x9E3779B9, 700
 DROPOUT = DropoutMask(0.3, SEED, STEP)
@@ -349,13 +351,13 @@ def check_dropout(device: Device, case: Case, rng: np.random.Generator, label: s
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Results:
-    """Hide some Gaussians in a view and drop others; compare the records without both."""
+    """Hide some Gaussians in a view, and drop others; check that neither have records."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
-    left_out = rng.random((2, count)) < 0.5
-    hide(model.gaussians, left_out)
+    hidden_masks = rng.random((2, count)) < 0.5
+    hide(model.gaussians, hidden_masks)
     actual = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
     expected, _, _ = project_records(device, case)
-    expected[left_out[1]] = 0
+    expected[hidden_masks[1]] = 0
     yield match("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)
 
 

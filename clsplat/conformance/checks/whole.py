@@ -1,4 +1,4 @@
-"""Check a whole training, the memory and the speed of a device."""
+"""Check a short training run, and the memory and speed of a device."""
 
 import time
 from dataclasses import asdict
@@ -38,7 +38,7 @@ BENCH = (256, 256, 20_000)  # width, height, Gaussians
 
 
 def _render_photograph(device: Device, case: Case) -> Photograph:
-    """Return a photograph of the scene as the device renders it, in 8 bits."""
+    """Render a scene on the device and return the 8-bit image as a photograph."""
     camera = case.device_camera(device)
     frame = Rasterizer(device, "radix").forward(case.model(device), camera, device.zeros(3))
     image = frame.image.get()[:, : camera.height, : camera.width]
@@ -48,23 +48,23 @@ def _render_photograph(device: Device, case: Case) -> Photograph:
 def train(
     device: Device, case: Case, start: dict[str, NDArray[Any]], steps: int
 ) -> tuple[list[float], dict[str, NDArray[Any]]]:
-    """Train `start` on the render of a scene, with one density edit; return the losses and all tables."""
+    """Train Gaussians, from `start`, on a render of a scene, with one density edit; return the losses and tables."""
     photograph = _render_photograph(device, case)
     model = Case(start, case.view).model(device)
     gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")
     adam, stats = Adam(gaussians), SplatStats(gaussians)
     losses = [L1(weight=0.8), Dssim(weight=0.2)]
     trainer = StepTrainer(rasterizer, model, adam, stats, device.zeros(3), losses, Rates(sh_base=0.03))
-    values: list[float] = []
+    loss_values: list[float] = []
     start_time = time.monotonic()
     for step in range(1, steps + 1):
-        values.append(trainer.step(photograph, step).loss)
+        loss_values.append(trainer.step(photograph, step).loss)
         if step == STEPS // 2:
             edit = Edit(gaussians, stats, SceneScale(4.0), step, seed=0)
             densify(edit, [Clone(gradient_above=1e-3), SplitLarge(gradient_above=1e-3), PruneFaint()], rasterizer.tiler)
-        if time.monotonic() - start_time > MAX_TRAINING_S and len(values) < steps:
+        if time.monotonic() - start_time > MAX_TRAINING_S and len(loss_values) < steps:
             break
-    return values, {name: gaussians.get(name) for name in gaussians.tables}
+    return loss_values, {name: gaussians.get(name) for name in gaussians.tables}
 
 
 @CHECKS.add()
@@ -73,29 +73,30 @@ def training(device: Device, rng: np.random.Generator) -> Results:
     start = {name: table.copy() for name, table in case.parameters.items()}
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
     start["sh_base"] *= 0  # gray
-    values, tables = train(device, case, start, STEPS)
-    repeated, again_tables = train(device, case, start, len(values))
-    count, label = len(tables["means"]), f"{len(values)} steps"
-    yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
-    yield match("training", f"losses of {label}, a second time", np.array(repeated), np.array(values[: len(repeated)]))
+    losses, tables = train(device, case, start, STEPS)
+    losses2, tables2 = train(device, case, start, len(losses))
+    count, label = len(tables["means"]), f"{len(losses)} steps"
+    yield Note("training", {"steps": len(losses), "losses": [losses[0], losses[-1]], "gaussians": count})
+    yield match("training", f"losses of {label}, a second time", np.array(losses2), np.array(losses[: len(losses2)]))
     for name, table in tables.items():
-        if table.shape != again_tables[name].shape:
-            difference, row_label = abs(len(again_tables[name]) - count), f"rows of {name} after {label}, a second time"
+        if table.shape != tables2[name].shape:
+            difference, row_label = abs(len(tables2[name]) - count), f"rows of {name} after {label}, a second time"
             yield Deviation("training", row_label, difference, 0, counts=True)
         else:
-            bits = again_tables[name].view(np.uint32), table.view(np.uint32)
+            bits = tables2[name].view(np.uint32), table.view(np.uint32)
             yield match("training", f"{name} after {label}, a second time", *bits)
-    finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
-    yield Deviation("training", f"values that are not finite after {label}", finite, 0, counts=True)
-    if len(values) == STEPS:
-        yield Deviation("training", f"the loss after {label}, relative to the first one", values[-1] / values[0], 0.7)
+    nonfinite_count = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
+    yield Deviation("training", f"values that are not finite after {label}", nonfinite_count, 0, counts=True)
+    if len(losses) == STEPS:
+        yield Deviation("training", f"the loss after {label}, relative to the first loss", losses[-1] / losses[0], 0.7)
 
 
 @SPEED.add()
 def memory(device: Device, rng: np.random.Generator) -> Results:
-    """Allocate buffers of growing size up to the largest allowed, write each, and read samples.
+    """Allocate buffers of growing size, up to the largest that the device allows; write each and read samples.
 
-    A failed allocation is not counted as a failure: other programs may use memory, which OpenCL does not report.
+    A failed allocation is not a failure of the check, since other programs may use memory, which OpenCL does not
+    report.
     """
     max_allocation, free = device.info.allocation, available_memory()
     budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free is None else free))
@@ -121,7 +122,7 @@ def memory(device: Device, rng: np.random.Generator) -> Results:
 def _check_buffer(device: Device, size: int) -> Results:
     buffer = device.empty(size // 4)
     buffer.fill(1.5)
-    Array(device, buffer.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not show up at the other end
+    Array(device, buffer.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not appear at the other end
     indices = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
     actual = np.array([buffer.get_item(i) for i in indices])
     expected = np.where(np.arange(len(actual)) == 0, 2.5, 1.5)
@@ -145,9 +146,9 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Results:
     yield compare_max("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
     items = 2 * program.peak_copy.group[0]
     values = rng.normal(size=items * max(lanes, 4)).astype(np.float32)
-    copied = device.zeros(len(values))
-    program.peak_copy(items=items, values=device.upload(values), copied=copied)
-    yield match("peak_copy", "copied values", copied.get(), values)
+    dst = device.zeros(len(values))
+    program.peak_copy(items=items, values=device.upload(values), copied=dst)
+    yield match("peak_copy", "copied values", dst.get(), values)
 
 
 @SPEED.add()

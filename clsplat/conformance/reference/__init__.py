@@ -1,4 +1,4 @@
-"""Compute 3D Gaussian splatting and its gradients in float64 NumPy, written to be read, not to be fast.
+"""Compute 3D Gaussian splatting and its gradients in float64 NumPy; the code is simple, not fast.
 
 Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).
 

@@ -1,6 +1,6 @@
 """Apply bilateral grids, color matrices and camera responses, and compute their gradients.
 
-Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: differences of matrices [E | b] from the identity.
+Images are [3, H, W].  A grid, [3, 4, nz, ny, nx], contains the differences of matrices [E | b] from the identity.
 """
 
 import itertools
@@ -14,14 +14,14 @@ WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
 
 
 def apply_color_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
-    """Return min(1, c + A [c; 1]) for every pixel, A the grid interpolated at its position and luminance."""
+    """Return min(1, c + A [c; 1]) for every pixel; A is the grid, interpolated at its position and luminance."""
     return np.minimum(unclamped_grid_colors(image, grid), 1)
 
 
 def color_grid_backward(
     image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to image and grid; clamped values pass none."""
+    """Return the gradients of sum(gradient * output) with respect to image and grid, zero through clamped values."""
     passed = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
     grad_image, grad_grid, with_one = passed.copy(), np.zeros(grid.shape), _append_one(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
@@ -49,7 +49,7 @@ def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def center_grids(grids: NDArray[Any]) -> NDArray[Any]:
-    """Subtract from grids, [photographs, 3, 4, nz, ny, nx], the mean over photographs and positions at each level."""
+    """Subtract the mean over photographs and positions at each level.  grids: [photographs, 3, 4, nz, ny, nx]."""
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
 
@@ -64,7 +64,10 @@ def unclamped_grid_colors(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[An
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
-    """Yield the nodes around each pixel, (k, j, i) each [H, W], their weights, and the gradients of the level."""
+    """Yield the nodes around each pixel, their weights, and the derivatives of the weights by the level.
+
+    Nodes are (k, j, i), and all arrays [H, W].
+    """
     _, _, nz, ny, nx = grid.shape
     _, height, width = image.shape
     y, x = np.mgrid[:height, :width]
@@ -78,7 +81,7 @@ def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDA
         yield tuple(nodes), np.prod(weights, axis=0), slope
 
 
-# The colors of one photograph: an affine map of an image's colors, clamped at white.
+# The colors of a photograph: an affine transform of a render's colors, clamped at white.
 
 
 def apply_color_matrix(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
@@ -89,7 +92,7 @@ def apply_color_matrix(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any
 def color_matrix_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to image and matrix; clamped values pass none."""
+    """Return the gradients of sum(gradient * output) with respect to image and matrix, zero through clamped values."""
     passed = np.where(_transform(image, matrix) < 1, gradient, 0)
     grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
     with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
@@ -97,7 +100,7 @@ def color_matrix_backward(
 
 
 def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
-    """Return the matrix of a gain and a white balance, [3, 4]; green is such that the luminance follows `exposure`."""
+    """Return the matrix of a gain and a white balance, [3, 4]; green compensates for the luminance of red and blue."""
     luminance = np.array([0.299, 0.587, 0.114])  # BT.601
     green = -(luminance[0] * red + luminance[2] * blue) / luminance[1]
     return np.column_stack([np.diag(np.exp(exposure + np.array([red, green, blue]))), np.zeros(3)])
@@ -108,11 +111,11 @@ def _transform(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(np.einsum("ab,bhw->ahw", matrix[:, :3], image) + matrix[:, 3, None, None])
 
 
-# The response of a camera to light, 17 numbers: center [2], a, b, c, and four of the curve of each channel.
+# The response of a camera to light, 17 parameters: center [2], a, b, c, and four for the curve of each channel.
 
 
 def apply_response(image: NDArray[Any], row: NDArray[Any], center: tuple[float, float]) -> NDArray[Any]:
-    """Return f(v x) for every pixel x; center: the principal point, px."""
+    """Return f(v x) for every pixel x, with the curve f and the vignetting v.  center: the principal point, in px."""
     light = image * _falloff(image, row, center)[0]
     return np.stack([_curve(light[i], _slopes(row, i)) for i in range(3)])
 
@@ -120,7 +123,7 @@ def apply_response(image: NDArray[Any], row: NDArray[Any], center: tuple[float, 
 def apply_response_backward(
     image: NDArray[Any], row: NDArray[Any], center: tuple[float, float], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to the image and the 17 numbers."""
+    """Return the gradients of sum(gradient * output) with respect to the image and the 17 parameters."""
     falloff, q, offset = _falloff(image, row, center)
     light, grad_light, grad_row = image * falloff, np.zeros(image.shape), np.zeros(17)
     for i in range(3):
@@ -141,7 +144,10 @@ def apply_response_backward(
 def _falloff(
     image: NDArray[Any], row: NDArray[Any], center: tuple[float, float]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return v, q, and the offset of each pixel from the center, [2, H, W], in half diagonals."""
+    """Return the vignetting v, [H, W], the squared radius q, [H, W], and the offset from the center, [2, H, W].
+
+    Lengths are in half diagonals of the image.
+    """
     _, height, width = image.shape
     half = np.hypot(width, height) / 2
     y, x = np.mgrid[:height, :width] + 0.5
@@ -157,7 +163,7 @@ def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the quarter of [0, 1] that contains or is nearest to each value, and the offset in that quarter."""
+    """Clamp values to [0, 1]; return the quarter of [0, 1] that contains each, and the offset in that quarter."""
     inside = np.clip(x, 0, 1)
     quarter = np.minimum((4 * inside).astype(int), 3)
     return quarter, inside - quarter / 4

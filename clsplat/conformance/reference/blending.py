@@ -1,6 +1,6 @@
-"""Blend one splat at a time over all pixels, without tiles, and compute the gradient.
+"""Blend one splat after another over all pixels, without tiles, and compute the gradient.
 
-Kerbl et al. 2023, eq. 3.  `grad_x` is dL/dx; H, W image.
+Kerbl et al. 2023, eq. 3.  `grad_x` is dL/dx; H and W are the size of the image.
 """
 
 from collections.abc import Iterator
@@ -37,7 +37,10 @@ def density(x: Floats) -> Floats:
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
-    """Return the mass Z of a normal distribution within ½ of `dy`, and its mean and variance there; dy >= 0."""
+    """Return the mass of a normal distribution within ½ of `dy`, and the mean and variance of this part.
+
+    dy: at least 0, in px; s: standard deviation, in px.
+    """
     below, above = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored, where Φ is small and exact
     mass = np.maximum(cdf(above) - cdf(below), 1e-30)
     if 0.5 / s < UNIFORM:
@@ -51,7 +54,7 @@ def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
 
 
 def box_response(covariance: Floats, dx: Floats, dy: Floats) -> Floats:
-    """Return the mean of e^(-dᵀ V⁻¹ d / 2) over the pixel at (dx, dy) px, V = [xx, xy, yy] px²."""
+    """Return the mean of e^(-dᵀ V⁻¹ d / 2) over the pixel at (dx, dy) px.  covariance: V as [xx, xy, yy] px²."""
     xx, xy, yy = covariance
     if xx > yy:
         return box_response(np.array([yy, xy, xx]), dy, dx)
@@ -67,7 +70,7 @@ def box_response(covariance: Floats, dx: Floats, dy: Floats) -> Floats:
 
 
 def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats, ...]:
-    """Return the derivatives with respect to dx, dy, xx, xy, yy by central differences on one side of xx = yy."""
+    """Return the derivatives with respect to dx, dy, xx, xy, yy, by central differences."""
 
     def change(size: float, **unit: float) -> Floats:
         values = []
@@ -89,7 +92,7 @@ def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats,
 
 
 class BlendStep(NamedTuple):
-    """The blending of one splat over all pixels; every array is [H,W]."""
+    """The blending of one splat over all pixels; every array is [H, W]."""
 
     splat: int
     dx: NDArray[Any]
@@ -97,13 +100,13 @@ class BlendStep(NamedTuple):
     falloff: NDArray[Any]  # e^-σ
     alpha: NDArray[Any]
     before: NDArray[Any]  # transmittance in front of the splat
-    tried: NDArray[Any]  # the pixel has not stopped before
-    candidate: NDArray[Any]  # tried and not too faint
-    blended: NDArray[Any]  # candidate and does not make the pixel stop
+    tried: NDArray[Any]  # whether the pixel had not stopped before
+    candidate: NDArray[Any]  # whether it was tried, and the splat is not too faint
+    blended: NDArray[Any]  # whether it is a candidate that does not stop the pixel
 
 
 def depth_order(splats: Splats) -> NDArray[Any]:
-    """Return visible splats front to back, ties by index."""
+    """Return the indices of visible splats front to back, ties by index."""
     order = np.argsort(splats.depth, kind="stable")
     return order[splats.visible[order]]
 
@@ -116,7 +119,7 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
     for i in depth_order(splats):
         a, b, c = splats.conic[i]
         dx, dy = splats.mean2d[i, 0] - pixel_x, splats.mean2d[i, 1] - pixel_y
-        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy  # with the pixel's box only its sign counts
+        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy  # only its sign matters for the pixel's box
         falloff = box_response(splats.conic[i], dx, dy) if splats.pixel_box else np.exp(-sigma)
         alpha = np.minimum(thresholds.alpha_max, splats.opacity[i] * falloff)
         after = transmittance * (1 - alpha)
@@ -160,7 +163,7 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
 def contribution(
     splats: Splats, width: int, height: int, mask: NDArray[Any] | None = None, thresholds: Thresholds = Thresholds()
 ) -> NDArray[Any]:
-    """Return blend weights summed over the pixels of a view that count, [N]; `mask`: [H,W], None: all count."""
+    """Return blend weights summed over the unmasked pixels of a view, [N].  mask: [H, W], or None for all pixels."""
     weights = blend_weights(splats, width, height, thresholds)
     return np.sum(weights if mask is None else weights * mask, axis=(1, 2))
 
@@ -173,9 +176,9 @@ def alpha_gradients(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
-    """Yield each splat front to back with dL/dalpha, [H,W], in the prefix form; it is zero where alpha is capped.
+    """Yield the blending of each splat, front to back, with dL/dalpha, [H, W], which is zero where alpha is capped.
 
-    grad_image: [3,H,W].
+    grad_image: [3, H, W].
     """
     image, final, _ = blend(splats, width, height, background, thresholds)
     through_background = (background_planes(background) * grad_image).sum(axis=0)
@@ -186,8 +189,8 @@ def alpha_gradients(
         behind = behind - color * np.where(step.blended, alpha * before, 0)
         grad_alpha = np.sum((color * before - behind / (1 - alpha)) * grad_image, axis=0)
         grad_alpha -= final / (1 - alpha) * through_background
-        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
-        yield step, np.where(step.blended & ~capped, grad_alpha, 0)
+        is_capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
+        yield step, np.where(step.blended & ~is_capped, grad_alpha, 0)
 
 
 def blend_backward(
@@ -198,7 +201,7 @@ def blend_backward(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> SplatGradients:
-    """Return the gradients of the splats; grad_image: as in `alpha_gradients`."""
+    """Return the gradients of the splats.  grad_image: [3, H, W]."""
     n = len(splats.opacity)
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
@@ -229,7 +232,7 @@ def falloff_squares(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """Return (dL/dG)² summed over pixels, [N], where alpha is the opacity times G."""
+    """Return (dL/dG)² summed over pixels, [N], where G is the falloff: alpha is the opacity times G."""
     squares = np.zeros(len(splats.opacity))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         squares[step.splat] = np.sum((splats.opacity[step.splat] * grad_alpha) ** 2)
@@ -237,16 +240,16 @@ def falloff_squares(
 
 
 class Margin(NamedTuple):
-    """Smallest relative distances to decisions that float32 might make differently; inf if there are none."""
+    """Smallest relative distances to thresholds that float32 may cross; infinity if nothing is compared."""
 
     alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
     cap: float  # |o e^-σ / alpha_max - 1|: the image is continuous there, its gradient is not
-    depth: float  # relative gap between neighbors in the depth order
+    depth: float  # relative gap between consecutive splats in the depth order
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Return the distance of blending from its thresholds, so that a test can choose a scene without flips."""
+    """Return the distances of blending from its thresholds, with which tests find scenes that float32 blends alike."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.splat] * step.falloff
@@ -283,12 +286,12 @@ def render(
     thresholds: Thresholds = Thresholds(),
     pixel_box: float = 0.0,
 ) -> RenderOutput:
-    """Project and blend Gaussians."""
+    """Project and blend Gaussians.  Arguments are as in `project`; background: [3] or [3, H, W]."""
     splats = project(gaussians, camera, degree, near, variance, compensate, thresholds, pixel_box)
     return RenderOutput(*blend(splats, camera.width, camera.height, background, thresholds), splats)
 
 
-# The blended inverse depth, its gradient, and the loss against known depths of some pixels.
+# The blended inverse depth, its gradient, and the loss against measured depths of some pixels.
 
 BLACK = np.zeros(3)
 
@@ -307,17 +310,20 @@ def inverse_depth(splats: Splats, width: int, height: int, thresholds: Threshold
 def inverse_depth_backward(
     splats: Splats, width: int, height: int, grad: Floats, thresholds: Thresholds = Thresholds()
 ) -> tuple[SplatGradients, Floats]:
-    """Return the gradients of the splats, zero for colors, and dL/dz, [N]; grad: dL/dD, [H,W]."""
+    """Return the gradients of the splats, zero for colors, and dL/dz, [N].  grad: dL/dD, [H, W]."""
     planes = np.stack([grad, *np.zeros((2, *grad.shape))])
-    actual = blend_backward(_color_by_inverse_depth(splats), width, height, BLACK, planes, thresholds)
-    grad_depth = -actual.color[:, 0] * _color_by_inverse_depth(splats).color[:, 0] ** 2
-    return actual._replace(color=0 * actual.color), grad_depth
+    grads = blend_backward(_color_by_inverse_depth(splats), width, height, BLACK, planes, thresholds)
+    grad_depth = -grads.color[:, 0] * _color_by_inverse_depth(splats).color[:, 0] ** 2
+    return grads._replace(color=0 * grads.color), grad_depth
 
 
 def inverse_depth_loss(
     plane: Floats, positions: tuple[Floats, Floats], targets: Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the terms q |D - 1/z| at positions (rows, columns), [K], and the gradient of their sum, [H,W]."""
+    """Return the terms weight * |D - target|, [K], and the gradient of their sum, [H, W].
+
+    plane: D, [H, W]; positions: rows and columns of the pixels; targets: inverse depths, [K].
+    """
     difference = plane[positions] - targets
     gradient = np.zeros(plane.shape)
     gradient[positions] = weights * np.sign(difference)
@@ -328,7 +334,7 @@ def inverse_depth_loss(
 
 
 def overlay(layer: NDArray[Any], transmittance: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """Return the composite of a layer, [3, H, W] on black, and an image behind it."""
+    """Return the composite of a layer on black, [3, H, W], and an image behind it; further planes are unchanged."""
     return np.concatenate([layer + transmittance * image[:3], image[3:]])
 
 
@@ -338,5 +344,5 @@ def gradient_behind(transmittance: NDArray[Any], gradient: NDArray[Any]) -> NDAr
 
 
 def layer_cover(transmittance: NDArray[Any], scale: float) -> tuple[float, NDArray[Any]]:
-    """Return the loss, scale times the sum of 1 - T, and its gradient with respect to T."""
+    """Return the loss, `scale` times the sum of 1 - T, and its gradient with respect to the transmittance T."""
     return scale * float((1 - transmittance).sum()), np.full_like(transmittance, -scale)

@@ -1,6 +1,6 @@
-"""Image losses and metrics, with gradients with respect to x.
+"""Compute image losses and metrics, and their gradients with respect to x.
 
-Images are [C,H,W]: x is the render, y the target.
+Images are [C, H, W]: x is the render, y the photograph.
 """
 
 import math
@@ -21,7 +21,7 @@ def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Return the sum of |gradient (x - y)|, for the gradient of any losses with respect to x."""
+    """Return the sum of |gradient * (x - y)|, with the gradient of the losses with respect to x."""
     return float(np.abs(gradient * (x - y)).sum())
 
 
@@ -36,13 +36,13 @@ def psnr(x: NDArray[Any], y: NDArray[Any]) -> float:
 
 
 def ssim_taps() -> NDArray[Any]:
-    """Return the 11 weights of the window, which sum to one."""
+    """Return the 11 weights of the window, whose sum is 1."""
     weights = np.exp(-(np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
 
 
 def window_mean(image: NDArray[Any]) -> NDArray[Any]:
-    """Return the weighted mean over 11x11 pixels, zeros outside the image: one term per offset."""
+    """Return the weighted mean over 11 x 11 pixels, with zeros outside the image, as a sum over offsets."""
     taps = ssim_taps()
     _, height, width = image.shape
     padded = np.pad(image, ((0, 0), (SSIM_RADIUS, SSIM_RADIUS), (SSIM_RADIUS, SSIM_RADIUS)))
@@ -83,7 +83,7 @@ def dssim(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
-    """Return MS-SSIM (Wang et al. 2003) over complete windows, one at a time; weights are divided by their sum."""
+    """Return MS-SSIM (Wang et al. 2003) over complete windows, with weights that are divided by their sum."""
     weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])[:scales]
     window = np.outer(ssim_taps(), ssim_taps())
     channels, products = len(x), np.ones(len(x))
@@ -108,18 +108,19 @@ def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
     return float(products.mean())
 
 
-# A Gaussian blur of the pixels that count, one offset at a time.
+# A Gaussian blur of unmasked pixels, as a sum over offsets.
 
 
 def blur(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Return the Gaussian mean within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma: px."""
+    """Return the Gaussian mean within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma in px."""
     return masked_mean(image, math.ceil(3 * sigma), 1 / (2 * sigma * sigma), mask)
 
 
 def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Return means, weighted by exp(-falloff d²), of the pixels that count within `reach`; else the pixel itself.
+    """Return means of the unmasked pixels within `reach`, weighted by exp(-falloff d²), [3, H, W].
 
-    image: [3, H, W]; mask: [H, W] bool; reach: px along each axis; falloff: px⁻².
+    A pixel without such pixels is unchanged.  image: [3, H, W]; mask: [H, W] bool; reach: px along each axis; falloff:
+    px⁻².
     """
     _, height, width = image.shape
     counts = np.ones((height, width)) if mask is None else mask.astype(np.float64)
@@ -134,13 +135,13 @@ def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[A
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), image)
 
 
-# One level of the Haar transform and its inverse, with a separate high-pass analysis filter, as matrices of lines.
+# One level of the Haar transform and its inverse, with a separate high-pass analysis filter, as matrix products.
 
 LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
 
 
 def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
-    """Return the matrix, [length, length], of analysis with the high-pass filter `taps` and synthesis with Haar's."""
+    """Return the matrix, [length, length], of an analysis with the high-pass filter `taps` and a Haar synthesis."""
     analysis, synthesis = np.zeros((length, length)), np.zeros((length, length))
     for pair in range(length // 2):
         columns = slice(2 * pair, 2 * pair + 2)
@@ -150,8 +151,9 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
 
 
 def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Analyze and synthesize along both axes; odd sizes repeat the last line, masked pixels are their block's mean.
+    """Analyze and synthesize an image along both axes.
 
+    Images of odd size repeat the last line.  Masked pixels are replaced by the mean of their 2 x 2 block.
     image: [3, H, W]; taps: [2]; mask: [H, W] bool.
     """
     _, height, width = image.shape
@@ -178,18 +180,18 @@ def haar_gradient(
     return np.array([(gradient * slope).sum() for slope in slopes])
 
 
-# Residuals of an image, their histogram, and the pixels that count without the large residuals.
+# Residuals of an image, their histogram, and a mask that excludes large residuals.
 
 BINS, MIN_RESIDUAL = 96, 2.0**-12  # eighths of octaves, up to 1
 
 
 def residuals(image: NDArray[Any], photograph: NDArray[Any]) -> NDArray[Any]:
-    """Return the mean over the channels of the absolute difference."""
+    """Return the absolute difference, averaged over channels, [H, W]."""
     return np.asarray(np.abs(image - photograph).mean(axis=0))
 
 
 def residual_histogram(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the number of residuals per bin; an octave is divided into eight parts of equal width."""
+    """Return the number of residuals per bin, [BINS]; each octave has eight bins of equal width."""
     histogram = np.zeros(BINS, np.int64)
     for value in values.ravel():
         octave = math.floor(math.log2(value / MIN_RESIDUAL)) if value > 0 else -1
@@ -201,10 +203,13 @@ def residual_histogram(values: NDArray[Any]) -> NDArray[np.int64]:
 def mask_transients(
     values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
 ) -> NDArray[np.bool_]:
-    """Return which pixels count: pixels below the threshold, and pixels in whose box at least half are below it."""
-    kept = counted & (values < threshold)
-    below = kept.copy()
-    for y, x in zip(*np.nonzero(counted & ~below), strict=True):
+    """Return a mask of the pixels that count, [H, W].
+
+    A residual is below the threshold, or at least half of the residuals in the box around it are.
+    """
+    mask = counted & (values < threshold)
+    is_below = mask.copy()
+    for y, x in zip(*np.nonzero(counted & ~is_below), strict=True):
         box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-        kept[y, x] = 2 * below[box].sum() >= counted[box].sum()
-    return kept
+        mask[y, x] = 2 * is_below[box].sum() >= counted[box].sum()
+    return mask

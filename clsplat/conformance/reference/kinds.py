@@ -12,7 +12,7 @@ RADIUS_TILE = 16  # px, tile of the original visibility test; kernels may use ot
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The thresholds of blending (Kerbl et al. 2023).  `SMOOTH` skips nothing, so that the image is differentiable."""
+    """The thresholds of blending (Kerbl et al. 2023).  `SMOOTH` skips nothing and has differentiable images."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
@@ -24,7 +24,7 @@ SMOOTH = Thresholds(alpha_min=0.0, transmittance_min=0.0)
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Pinhole camera; `fx, fy, cx, cy` in px."""
+    """A pinhole camera; `fx, fy, cx, cy` are in px."""
 
     world_to_camera: NDArray[Any]  # [3,4]
     fx: float
@@ -56,7 +56,7 @@ class RawGaussians:
     log_scales: NDArray[Any]  # [N,3]
     logit_opacity: NDArray[Any]  # [N]
     sh: NDArray[Any]  # [N,K,3]
-    filter_variance: NDArray[Any] = field(default_factory=lambda: np.zeros(0))  # [N] scene units²; zeros when not given
+    filter_variance: NDArray[Any] = field(default_factory=lambda: np.zeros(0))  # [N] scene units²; default: zeros
     opacity_factor: float = 1.0  # factor on all opacities, from a step's dropout
 
     def __post_init__(self) -> None:
@@ -68,14 +68,14 @@ class RawGaussians:
 
 @dataclass
 class Splats:
-    """Projected Gaussians.  Rows that are not visible are zero, except for their radius."""
+    """Projected Gaussians.  Rows that are not visible are zero, but may have a radius."""
 
     mean2d: NDArray[Any]  # [N,2] px
     conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance; of the covariance if `pixel_box`
     opacity: NDArray[Any]  # [N] after both filters
     color: NDArray[Any]  # [N,3]
     depth: NDArray[Any]  # [N] z
-    radius: NDArray[Any]  # [N] px, a whole number; 0: not visible to density control; independent of opacity
+    radius: NDArray[Any]  # [N] px, an integer, independent of opacity; 0: not visible to density control
     visible: NDArray[Any]  # [N] bool: blended
     pixel_box: bool = False  # whether splats are integrated over each pixel's box (blending.py)
 

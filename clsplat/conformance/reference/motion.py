@@ -1,8 +1,8 @@
-"""Compute moving Gaussians at one time, and the gradient of their motion, one Gaussian at a time.
+"""Compute moving Gaussians at a timestamp, and the gradient of their motion, one Gaussian after another.
 
-A row of motion: velocity [3], time center, log of the duration, then acceleration [3] and jerk [3] where the degree is
-2 or 3, then the time derivative of the quaternion [4] where Gaussians rotate.  FreeTimeGS (Wang et al. 2025), Spacetime
-Gaussians (Li et al. 2024).
+A row of motion contains the velocity [3], time center, and log of the duration; the acceleration [3] and jerk [3] for
+degree 2 or 3; and the time derivative of the quaternion [4] if Gaussians rotate.  FreeTimeGS (Wang et al. 2025),
+Spacetime Gaussians (Li et al. 2024).
 """
 
 from typing import Any
@@ -33,7 +33,10 @@ def move_gaussians(
     degree: int,
     turns: bool,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return means, [N,3], quaternions, [N,4], and logits, [N], at a time; invisible Gaussians have infinite means."""
+    """Return means, [N, 3], quaternions, [N, 4], and logits, [N], at a time; absent Gaussians have infinite means.
+
+    turns: whether Gaussians rotate.
+    """
     means, quats, logits = means.copy(), quats.copy(), logit_opacity.copy()
     for n, row in enumerate(motion):
         dt, factor = time - row[3], presence(row, time)
@@ -59,9 +62,10 @@ def move_gaussians_backward(
     degree: int,
     turns: bool,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return dL/d(motion), [N,W], and dL/d(logit_opacity), [N], from the gradients at a time.
+    """Return dL/d(motion), [N, W], and dL/d(logit_opacity), [N], from the gradients at a time.
 
-    Gradients of means and quaternions at the center are those at the time.  Invisible Gaussians have zeros.
+    The gradients of means and quaternions are the same at the time center as at the time.  Those of absent Gaussians
+    are zero.
     """
     grad_motion, grad_center = np.zeros_like(motion), np.zeros_like(logit_opacity)
     for n, row in enumerate(motion):

@@ -19,13 +19,13 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 
 @dataclass(frozen=True)
 class DenseNetwork:
-    """Layers in order: `depth` layers of the trunk, density, bottleneck, condition, color.
+    """A network with `depth` layers of the trunk, then the density, bottleneck, condition and color layers.
 
-    The layer after `skip` reads the position again.
+    The encoded position is also an input of the layer after `skip`.
     """
 
     depth: int
-    skip: int | None  # layer whose outputs the position joins
+    skip: int | None  # layer to whose outputs the position is appended
 
     def forward(self, weights: Weights, position: Floats, direction: Floats) -> tuple[Floats, Floats, Inputs]:
         """Return raw colors and raw densities, [S, outputs], and the inputs of each layer."""
@@ -44,7 +44,7 @@ class DenseNetwork:
     def backward(
         self, weights: Weights, inputs: Inputs, grad_colors: Floats, grad_densities: Floats
     ) -> tuple[Weights, Floats]:
-        """Return the gradients of weights and encoded position, [S, features], from those of the raw outputs."""
+        """Return the gradients of the weights and of the encoded position, [S, features]."""
         density, bottleneck, condition, color = weights[self.depth :]
         width = bottleneck[0].shape[1]
         grad_hidden = (grad_colors @ color[0].T) * (inputs[-1] > 0)
@@ -53,10 +53,10 @@ class DenseNetwork:
         grad_x = grad_densities @ density[0].T + grad_bottleneck @ bottleneck[0].T
         grad_position = np.zeros_like(inputs[0])
         for i in reversed(range(self.depth)):
-            after = inputs[i + 1]  # with the position, where it joins
+            outputs = inputs[i + 1]  # followed by the position if i is `skip`
             if i == self.skip:
                 grad_position += grad_x[:, weights[i][0].shape[1] :]
-            grad_layer = grad_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
+            grad_layer = grad_x[:, : weights[i][0].shape[1]] * (outputs[:, : weights[i][0].shape[1]] > 0)
             grad_outputs.insert(0, grad_layer)
             grad_x = grad_layer @ weights[i][0].T
         return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, grad_outputs, strict=True)], grad_position + grad_x
@@ -64,7 +64,7 @@ class DenseNetwork:
 
 @dataclass(frozen=True)
 class Composite:
-    """Rays of samples: raw colors [R, N, 3], raw densities [R, N], lengths of the samples [R, N]; background [3]."""
+    """The samples of rays: raw colors [R, N, 3], raw densities [R, N], lengths [R, N]; and the background [3]."""
 
     raw_colors: Floats
     raw_densities: Floats
@@ -89,7 +89,7 @@ class Composite:
         return np.asarray((weights * self.samples[0]).sum(axis=1) + (1 - weights.sum(axis=1)) * self.background)
 
     def backward(self, grad_colors: Floats) -> tuple[Floats, Floats]:
-        """Return the gradients of the raw colors and densities from those of the colors of the rays, [R, 3]."""
+        """Return the gradients of the raw colors and raw densities.  grad_colors: gradients of rays' colors, [R, 3]."""
         (colors, _), (weights, transmittance) = self.samples, self.weights()
         sigmoid = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
         grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * sigmoid * (1 - sigmoid)
@@ -112,8 +112,10 @@ def draw_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDAr
 
 
 def cones(camera: PinholeCamera, pixels: NDArray[np.int64], unit: float = 1.0) -> Floats:
-    """Return origin in units of the field, direction with depth 1, radius at distance 1, and length of the direction,
-    [R, 8]."""
+    """Return the cones of pixels, [R, 8].
+
+    Columns: origin in units of the field, direction with depth 1, radius at distance 1, and length of the direction.
+    """
     x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
     y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
     rotation, translation = camera.world_to_camera[:, :3], camera.world_to_camera[:, 3]
@@ -130,7 +132,7 @@ def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Float
 
 
 def coarse_edges(near: float, far: float, samples: int, offsets: Floats | None = None) -> Floats:
-    """Return the edges of a ray's coarse samples, [samples + 1]; offsets: [samples + 1] in (0, 1], for training."""
+    """Return the edges of a ray's coarse samples, [samples + 1].  offsets: in (0, 1], random for training, or None."""
     edges = np.linspace(near, far, samples + 1)
     if offsets is None:
         return edges
@@ -157,7 +159,7 @@ def fine_edges(edges: Floats, weights: Floats, samples: int, offsets: Floats | N
 def frustums(rays: Floats, edges: Floats) -> tuple[Floats, Floats]:
     """Return the means and the diagonals of the covariances of conical frustums, each [R, N, 3].
 
-    These are integrals of powers of the distance over the frustum, unlike the stable form in the kernels (equation 7).
+    The reference integrates powers of the distance over the frustum; kernels use the stable form (equation 7).
     """
     origins, directions, radii = rays[:, None, :3], rays[:, None, 3:6], rays[:, None, 6:7]
     t0, t1 = edges[:, :-1, None], edges[:, 1:, None]
@@ -175,7 +177,7 @@ def frustums(rays: Floats, edges: Floats) -> tuple[Floats, Floats]:
 
 
 def encode_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
-    """Return the means of sines, then of cosines, of 2^l x, [R, N, 6 degrees] (equations 13 and 14)."""
+    """Return the expected sines, then cosines, of 2^l x in each frustum, [R, N, 6 degrees] (equations 13 and 14)."""
     scales = 2.0 ** np.arange(degrees)[:, None]
     angles = (means[..., None, :] * scales).reshape(*means.shape[:-1], -1)
     falls = np.exp(-0.5 * (variances[..., None, :] * scales**2)).reshape(angles.shape)
@@ -196,19 +198,19 @@ CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
 
 
 def grid_positions(means: Floats, variances: Floats, corner: Floats, side: float) -> tuple[Floats, Floats]:
-    """Return means of samples in units of the cube's side, [S, 3], and means of their variances, [S]."""
+    """Return the means of samples, [S, 3], and the average variance of each, [S], in units of the cube's side."""
     return (means - corner) / side, variances.mean(axis=-1) / side**2
 
 
 @dataclass(frozen=True)
 class HashLevel:
-    """A cube of n^3 cells, whose corners share `entries` by a hash if there are fewer entries than corners."""
+    """A cube of cells³ cells.  If it has more corners than `entries`, corners share entries by a hash."""
 
     cells: int
     entries: int
 
     def weights(self, variances: Floats) -> Floats:
-        """Return how well samples resolve a level, [S]: close to erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
+        """Return a weight of the level for each sample, [S], close to erf(1 / sqrt(8 v n²)) (Barron et al. 2023)."""
         return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
 
     def corners(self, positions: Floats) -> tuple[NDArray[np.int64], Floats]:
@@ -219,23 +221,23 @@ class HashLevel:
         weights = np.where(CORNERS, within[:, None], 1 - within[:, None]).prod(axis=-1)
         if (self.cells + 1) ** 3 <= self.entries:
             return sides @ np.array([1, self.cells + 1, (self.cells + 1) ** 2]), weights
-        mixed = np.bitwise_xor.reduce(sides.astype(np.uint64) * PRIMES & np.uint64(0xFFFFFFFF), axis=-1)
-        return (mixed % np.uint64(self.entries)).astype(np.int64), weights
+        hashes = np.bitwise_xor.reduce(sides.astype(np.uint64) * PRIMES & np.uint64(0xFFFFFFFF), axis=-1)
+        return (hashes % np.uint64(self.entries)).astype(np.int64), weights
 
     def forward(self, table: Floats, positions: Floats, variances: Floats) -> Floats:
-        """Return features of samples, [S, F], from a table of entries, [entries, F]; 0 outside of the cube."""
+        """Return the features of samples, [S, F], from a table, [entries, F]; 0 outside of the cube."""
         entries, weights = self._masked_corners(positions, variances)
         return np.asarray((table[entries] * weights[..., None]).sum(axis=1))
 
     def backward(self, grad_features: Floats, positions: Floats, variances: Floats) -> Floats:
-        """Return the gradients of the table, [entries, F], from those of the features."""
+        """Return the gradients of the table, [entries, F].  grad_features: gradients of the features, [S, F]."""
         entries, weights = self._masked_corners(positions, variances)
-        actual = np.zeros((self.entries, grad_features.shape[1]))
-        np.add.at(actual, entries, weights[..., None] * grad_features[:, None])
-        return actual
+        grad_table = np.zeros((self.entries, grad_features.shape[1]))
+        np.add.at(grad_table, entries, weights[..., None] * grad_features[:, None])
+        return grad_table
 
     def _masked_corners(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return the entries of corners, and their weights in the level, which are 0 outside of the cube."""
+        """Return the entries of the corners around samples, and their weights, 0 outside of the cube, both [S, 8]."""
         inside = np.all((positions >= 0) & (positions <= 1), axis=1)
         entries, weights = self.corners(np.where(inside[..., None], positions, 0.5))
         return entries, weights * (inside * self.weights(variances))[:, None]

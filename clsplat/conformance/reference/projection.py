@@ -1,4 +1,4 @@
-"""Project Gaussians to splats, one at a time (Kerbl et al. 2023), with the filters of Yu et al. 2024."""
+"""Project Gaussians to splats, one after another (Kerbl et al. 2023), with the filters of Yu et al. 2024."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, Pinhole
 
 
 def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[Any, ...]]:
-    """Return the 16 rows (value, d/dx, d/dy, d/dz), treating x, y, z as independent."""
+    """Return value, d/dx, d/dy and d/dz of the 16 harmonics, with x, y, z independent."""
     c0, c1 = 0.28209479177387814, 0.4886025119029199
     a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
     d, e, f = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
@@ -39,7 +39,7 @@ def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[
 
 
 def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
-    """Return value and gradient of the first (degree+1)² harmonics, [..., K, 4]."""
+    """Return the values and gradients of the first (degree + 1)² harmonics, [..., K, 4]."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     table = np.empty((*x.shape, (degree + 1) ** 2, 4))
     for k, row in enumerate(_harmonics(x, y, z)[: (degree + 1) ** 2]):
@@ -88,7 +88,7 @@ def clamped_ray(camera: PinholeCamera, point: NDArray[Any]) -> NDArray[Any]:
 
 
 def adjugate(matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return d(det)/d(matrix) of a symmetric 2x2 matrix, which is det * inverse."""
+    """Return d(det)/d(matrix) of a symmetric 2 x 2 matrix, which is its determinant times its inverse."""
     return np.array([[matrix[1, 1], -matrix[0, 1]], [-matrix[1, 0], matrix[0, 0]]])
 
 
@@ -98,7 +98,7 @@ def determinant(matrix: NDArray[Any]) -> float:
 
 @dataclass
 class Footprint:
-    """The values between the parameters of one Gaussian and its screen covariance, for both passes."""
+    """Intermediate values between the parameters of a Gaussian and its screen covariance, for both passes."""
 
     point: NDArray[Any]  # [3] camera space
     rotation: NDArray[Any]  # [3,3] R
@@ -111,7 +111,7 @@ class Footprint:
 
 
 def footprint(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: float) -> Footprint:
-    """Project the covariance of one Gaussian (EWA splatting), with the 3D filter."""
+    """Project the covariance of Gaussian `n` (EWA splatting), with the 3D filter; variance: screen filter, px²."""
     point = camera.rotation @ gaussians.means[n] + camera.translation
     rotation = rotation_matrix(gaussians.quats[n])
     scale = np.exp(gaussians.log_scales[n])
@@ -144,13 +144,13 @@ def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[A
 
 
 def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
-    """Return Σ Y_k(d) c_k + 0.5, [3]."""
+    """Return the color of Gaussian `n` before it is clamped to 0, Σ Y_k(d) c_k + 0.5, [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
 
 
 def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, height: int) -> float:
-    """Return the radius of 3DGS, three standard deviations, or 0 if it reaches no tile."""
+    """Return the radius of 3DGS, three standard deviations in px, or 0 if the splat reaches no tile."""
     mean_variance = (dilated[0, 0] + dilated[1, 1]) / 2
     largest = mean_variance + np.sqrt(max(0.1, mean_variance**2 - determinant(dilated)))
     radius = np.ceil(3 * np.sqrt(largest))
@@ -171,9 +171,10 @@ def project(
     thresholds: Thresholds = Thresholds(),
     pixel_box: float = 0.0,
 ) -> Splats:
-    """Project Gaussians; `degree` is the active one, `variance` (px²) and `compensate` (0 or 1) the screen filter.
+    """Project Gaussians to splats.
 
-    pixel_box: 1 integrates splats over the pixel's box, with both of these 0.
+    degree: active degree of the harmonics; variance (px²), compensate (0 or 1): screen filter; pixel_box: 1 to
+    integrate splats over the box of each pixel, with variance and compensate 0.
     """
     count = len(gaussians.means)
     splats = Splats(
@@ -212,11 +213,11 @@ def project(
     return splats
 
 
-# Gradients of the projection, one Gaussian at a time.
+# Gradients of the projection, one Gaussian after another.
 
 
 def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
-    """Return dL/dq of the raw quaternion from H = dL/dR."""
+    """Return dL/dq of a quaternion that is not normalized, [4], from H = dL/dR, [3, 3]."""
     norm = np.linalg.norm(quat)
     unit = quat / norm
     w, x, y, z = unit
@@ -231,7 +232,7 @@ def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
 def point_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
 ) -> NDArray[Any]:
-    """Return dL/d(camera-space point), through the screen position and through J with its clamped ray."""
+    """Return dL/d(camera-space point), [3], through the screen position and through J with its clamped ray."""
     x, y, z = foot.point
     fx, fy = camera.fx, camera.fy
     gu, gv = grad_mean2d
@@ -253,7 +254,7 @@ def point_gradient(
 
 
 def ratio_gradient(foot: Footprint) -> NDArray[Any]:
-    """Return d(det V / det V1)/dV, [2,2], by the quotient rule; V1 = V + constant."""
+    """Return d(det V / det V1)/dV, [2, 2], by the quotient rule, where V1 = V + constant."""
     det0, det1 = determinant(foot.sharp), determinant(foot.dilated)
     return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
 
@@ -287,7 +288,7 @@ def project_backward(
     grad_opacity: NDArray[Any],
     grad_color: NDArray[Any],
 ) -> dict[str, NDArray[Any]]:
-    """Return the gradients of `PARAMETERS` by name; `filter_variance` is a constant, and culled rows are zero."""
+    """Return the gradients of `PARAMETERS` by name, zero for culled Gaussians; `filter_variance` is a constant."""
     grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
     for n in np.flatnonzero(splats.visible).tolist():
         foot = footprint(gaussians, n, camera, variance)
@@ -311,9 +312,9 @@ def project_backward(
         is_unclamped = unclamped_color(gaussians, n, camera, degree) > 0
         grad_c = grad_color[n] * is_unclamped
         basis, basis_gradient = sh_basis(direction, degree), sh_basis_gradient(direction, degree)
-        used = len(basis)
-        grad["sh"][n, :used] = np.outer(basis, grad_c)
-        grad_d = basis_gradient.T @ (gaussians.sh[n, :used] @ grad_c)
+        k = len(basis)
+        grad["sh"][n, :k] = np.outer(basis, grad_c)
+        grad_d = basis_gradient.T @ (gaussians.sh[n, :k] @ grad_c)
         grad["means"][n] = camera.rotation.T @ grad_point + (grad_d - direction * (direction @ grad_d)) / distance
 
         # Σ = L Lᵀ, L = R diag(s'); s' = sqrt(s² + f) is also part of ρ = Π s/s'
@@ -326,15 +327,15 @@ def project_backward(
     return grad
 
 
-# The world filter: how finely cameras sample each Gaussian (Yu et al. 2024, 5.1).
+# The 3D filter: the sampling interval of each Gaussian (Yu et al. 2024, 5.1).
 
 
 def sampling_interval(
     means: NDArray[Any], cameras: list[PinholeCamera], focal: list[float], near: float = 0.2, margin: float = 0.15
 ) -> NDArray[Any]:
-    """Return the smallest depth / focal length over the cameras that see each mean, [N].
+    """Return the smallest depth / focal length over the cameras in which each mean is visible, [N].
 
-    Means that no camera sees have the largest interval of the others.
+    Means that are visible in no camera have the largest interval of the others.
     """
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
@@ -348,16 +349,16 @@ def sampling_interval(
                 and -margin * camera.height <= v <= (1 + margin) * camera.height
             ):
                 intervals[n] = min(intervals[n], z / f)
-    is_seen = np.isfinite(intervals)
-    intervals[~is_seen] = intervals[is_seen].max(initial=0)
+    is_visible = np.isfinite(intervals)
+    intervals[~is_visible] = intervals[is_visible].max(initial=0)
     return intervals
 
 
-# Gradients of the pose and the focal length of a camera, one Gaussian at a time, in camera axes.
+# Gradients of the pose and the focal length of a camera, one Gaussian after another, in camera axes.
 
 
 def move_camera(camera: PinholeCamera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
-    """Return the camera after W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
+    """Return the camera with W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
     angle = np.linalg.norm(turn)
     x, y, z = turn
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -417,10 +418,10 @@ def focal_gradient(
 ) -> float:
     """Return dL/dfx (axis 0) or dL/dfy (axis 1), through the screen position and through J.
 
-    Limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
+    The limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
     """
     z = foot.point[2]
     ray = foot.point[axis] / z
     low, high = ray_limits(camera)[axis]
-    free = low <= ray <= high
-    return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if free else 0.0))
+    inside = low <= ray <= high
+    return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if inside else 0.0))

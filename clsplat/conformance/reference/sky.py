@@ -15,7 +15,7 @@ Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
 def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
-    """Return the directions through the centers of pixels."""
+    """Return the directions through the centers of pixels, [H, W, 3], in the scene."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
@@ -32,7 +32,7 @@ def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
     for j in (first_j, first_j + 1):
         for i in (first_i, first_i + 1):
             row, column = j, i
-            if column in (-1, side):  # across an edge is its mirrored half
+            if column in (-1, side):  # the map continues with the mirrored half of the edge
                 row, column = side - 1 - row, min(max(column, 0), side - 1)
             if row in (-1, side):
                 row, column = min(max(row, 0), side - 1), side - 1 - column
@@ -40,7 +40,7 @@ def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
 
 
 def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
-    """Return the map's values in directions, [C, H, W]."""
+    """Return the values of the map in these directions, [C, H, W]."""
     height, width, _ = directions.shape
     image = np.zeros((texels.shape[2], height, width))
     for v, u in np.ndindex(height, width):
@@ -50,7 +50,10 @@ def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
 
 
 def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any], grad: NDArray[Any]) -> NDArray[Any]:
-    """Return the gradient of sum(grad * T * sky_image) by texels.  grad: [C, H, W]; transmittance: [H, W]."""
+    """Return the gradient of sum(grad * T * sky_image) with respect to the texels, [side, side, C].
+
+    grad: [C, H, W]; transmittance T: [H, W].
+    """
     grad_texels = np.zeros((side, side, len(grad)))
     for v, u in np.ndindex(*transmittance.shape):
         for row, column, weight in map_entries(directions[v, u], side):
@@ -59,7 +62,10 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
 
 
 def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
-    """Return which pixels have a 3 x 3 neighborhood with the sky in at least 6 pixels, [H, W]; images: [3, H, W]."""
+    """Return a mask, [H, W], of pixels with at least 6 pixels of sky in their 3 x 3 neighborhood.
+
+    sky, photograph: [3, H, W]; difference: largest mean absolute color difference of a pixel of sky.
+    """
     matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
     height, width = photograph.shape[1:]
     counts = sum(matches[v : v + height, u : u + width].astype(int) for v in range(3) for u in range(3))

@@ -1,4 +1,4 @@
-"""Compute changes of Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared vectors."""
+"""Compute changes of Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared means."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +24,7 @@ def adam_step(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the new parameter and moments (Kingma and Ba 2015), with epsilon outside the root, as in PyTorch.
 
-    step: counted from 1.  Rows that are not `seen`, [N], are unchanged.
+    step: number of the update, from 1; seen: mask of the rows to update, [N], all if it is None.
     """
     first = beta1 * moment1 + (1 - beta1) * grad
     second = beta2 * moment2 + (1 - beta2) * grad**2
@@ -46,12 +46,12 @@ def covariance_trace(
     """Return the mean of max(sum of squared scales - above, 0) / extent².  log_scales: [N, 3]; above: scene units²."""
     scale2 = np.exp(2 * log_scales)
     excess = scale2.sum(axis=1) - above
-    penalized = (excess > 0)[:, None]
-    return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * penalized / len(scale2) / extent**2
+    is_above = (excess > 0)[:, None]
+    return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * is_above / len(scale2) / extent**2
 
 
 def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(longest / shortest axis - above, 0)."""
+    """Return the mean of max(longest / shortest axis - above, 0).  log_scales: [N, 3]."""
     rows = np.arange(len(log_scales))
     longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)
     ratio = np.exp(log_scales[rows, longest] - log_scales[rows, shortest])
@@ -87,7 +87,7 @@ KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows afterwards: itself; itself twice;
 
 @dataclass(frozen=True)
 class DensityRule:
-    """Constants; lengths are fractions of the scene extent."""
+    """Constants of density control; lengths are fractions of the scene extent."""
 
     clone_gradient: float = 2e-4
     split_gradient: float = 2e-4
@@ -101,14 +101,15 @@ VANILLA = DensityRule()
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Return ‖g2d‖ in normalized device coordinates, [N], from gradients in px, [N,2]; also for `mean2d_abs`."""
+    """Return the norms of gradients in normalized device coordinates, [N], from gradients per px, [N, 2]."""
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 
 def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
-    """Return the largest first-order change of the loss by a shift of one standard deviation, [N]; 0 if culled.
+    """Return the largest first-order change of the loss if a splat moves by one standard deviation, [N].
 
-    grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  This is the length of L^T g, with L L^T the covariance.
+    This is the norm of Lᵀ g, where L Lᵀ is the covariance; 0 for culled splats.  grad_mean2d: [N, 2] px⁻¹; conic:
+    [N, 3] px⁻².
     """
     gain = np.zeros(len(conic))
     for i, (xx, xy, yy) in enumerate(conic):
@@ -119,7 +120,7 @@ def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
 
 
 def mean_gradient(total: NDArray[Any], count: NDArray[Any]) -> NDArray[Any]:
-    """Return the mean gradient ḡ, [N]; 0 where the Gaussian was never visible."""
+    """Return the mean gradients, [N]; 0 for Gaussians that were never visible."""
     return np.where(count > 0, total / np.maximum(count, 1), 0)
 
 
@@ -134,8 +135,8 @@ def adc_actions(
 ) -> NDArray[Any]:
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
-    Pruning comes last and sees the new rows: copies and children have their parent's opacity, children its scale / 1.6.
-    split_gradient: the statistic of the split test if it differs (ḡabs).
+    Pruning is last, and applies to the new rows: copies and children have the opacity of their parent, and children its
+    scale / 1.6.  split_gradient: the statistic for splits if it is another, such as the absolute gradient.
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []
@@ -153,13 +154,16 @@ def adc_actions(
 
 
 def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Return the logits of `rows` equal Gaussians that together transmit as much as one: 1 - o' = (1 - o)^(1/n)."""
+    """Return the logits of `rows` equal Gaussians that together transmit as much as the original Gaussian.
+
+    Their opacity o' satisfies 1 - o' = (1 - o)^(1/rows).
+    """
     log_transmittance = -np.log1p(np.exp(logit)) / rows
     return np.log(-np.expm1(log_transmittance)) - log_transmittance
 
 
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
-    """Return logits, [N], whose opacities after the 3D filter, a factor of `filter_ratio`, are at most `ceiling`."""
+    """Return logits, [N], of opacities that are at most `ceiling` after a 3D filter of factor `filter_ratio`."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
     return np.log(opacity / (1 - opacity))
 
@@ -175,7 +179,7 @@ def screen_splitting(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """Return Σ dL/dalpha · (Hessian of alpha with respect to the splat's mean) over pixels, [N,2,2] px⁻²."""
+    """Return the sums over pixels of dL/dalpha times the Hessian of alpha by the splat's mean, [N, 2, 2] px⁻²."""
     matrices = np.zeros((len(splats.opacity), 2, 2))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         a, b, c = splats.conic[step.splat]
