@@ -1,10 +1,10 @@
-"""Read and write glTF with KHR_gaussian_splatting, as .glb or, only read, as .gltf; write OpenUSD as text.
+"""Read .glb and .gltf files with KHR_gaussian_splatting; write .glb, and OpenUSD as text.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
 
 Axes of glTF are x right, y up, z back.  The Gaussians are converted instead of rotating the node, because the extension
-does not say whether viewers rotate SH with a node.
+does not specify whether viewers rotate SH with a node.
 """
 
 import base64
@@ -52,9 +52,9 @@ LOG = logging.getLogger("clsplat")
 EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or without effect
+SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or no effect
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-SHARED = 8  # times that a byte may be read on average, because equal columns may share an accessor
+MAX_READS = 8  # average number of reads of a byte, because equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 FLIP_4 = np.diag([*FLIP, 1.0])  # converts between the axes of glTF and of a PLY
 LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
@@ -65,7 +65,7 @@ MAX_TEXT = 1 << 29  # bytes of a .gltf
 class Gltf:
     """The Gaussian primitives of a file.
 
-    Raises DataError if there are none; a damaged tree raises Python's own errors.
+    Raises DataError if there are none; a damaged tree raises built-in errors, such as KeyError.
     """
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes | None) -> None:
@@ -85,7 +85,7 @@ class Gltf:
         self.placement = None if np.allclose(placement, np.eye(4)) else placement  # [4, 4], in the axes of a PLY
 
     def parameters(self) -> Parameters:
-        """Return all Gaussians in the axes of a PLY, before the transform `placement`."""
+        """Return the parameters of all Gaussians in the axes of a PLY, without the transform `placement`."""
         return concatenate([self._place(primitive, matrix) for primitive, matrix in self.primitives])
 
     def _place(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
@@ -124,9 +124,9 @@ class Gltf:
         return part
 
     def _spz(self, view: Any, names: dict[str, Any]) -> Parameters:
-        """Return the Gaussians of an SPZ file in a view, in the axes of glTF.
+        """Return the Gaussians of an SPZ file in a buffer view, in the axes of glTF.
 
-        The axes should be x left, y up, z front after unpacking; some programs keep those of SPZ, as the bounds show.
+        Unpacked axes should be x left, y up, z front, but some programs keep those of SPZ; the declared bounds decide.
         """
         data, start, length, _ = self._view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])
@@ -137,9 +137,9 @@ class Gltf:
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
         position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
         if len(splats) and {"min", "max"} <= position.keys():
-            ends = [part["means"].min(axis=0), part["means"].max(axis=0)]
+            bounds = [part["means"].min(axis=0), part["means"].max(axis=0)]
             declared = np.array([position["min"], position["max"]], np.float64)
-            axes.sort(key=lambda signs: float(np.abs(np.sort(ends * np.array(signs), axis=0) - declared).sum()))
+            axes.sort(key=lambda signs: float(np.abs(np.sort(bounds * np.array(signs), axis=0) - declared).sum()))
         return flip_axes(part, axes[0])
 
     def _attributes(self, names: dict[str, Any]) -> Parameters:
@@ -196,7 +196,7 @@ class Gltf:
         return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
 
     def _view(self, number: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
-        """Return the data of a buffer, and offset, length, and stride of a view in it; stride: the default."""
+        """Return a buffer, and the offset, length, and stride of a view in it, bytes.  stride: the default."""
         view = self.tree["bufferViews"][_index(number)]
         if compressed := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
@@ -212,7 +212,7 @@ class Gltf:
         return data, offset, length, _index(view.get("byteStride", stride))
 
     def _content(self, uri: Any, number: int) -> bytes:
-        """Return the bytes of a buffer: of the GLB itself, of a data URI, or of a file in the same folder."""
+        """Return the bytes of a buffer, from the GLB itself, a data URI, or a file in the same folder."""
         if uri in self.files and (uri or not number):
             return self.files[uri]
         data = None
@@ -233,26 +233,26 @@ class Gltf:
                 "export it again"
             )
         self.files[uri] = data
-        self.bytes_left += SHARED * len(data)
+        self.bytes_left += MAX_READS * len(data)
         return data
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the meshes of the scene, each with the matrix of its node."""
+        """Return the index of each mesh in the scene, with the world matrix of its node, [4, 4]."""
         nodes = self.tree["nodes"]
         meshes: list[tuple[int, NDArray[np.float64]]] = []
-        seen: set[int] = set()
-        waiting = [(_index(root), np.eye(4)) for root in self._roots()]
-        while waiting:
-            number, parent_matrix = waiting.pop()
-            if number in seen:
+        visited: set[int] = set()
+        pending = [(_index(root), np.eye(4)) for root in self._roots()]
+        while pending:
+            number, parent_matrix = pending.pop()
+            if number in visited:
                 raise DataError(f"{self.path}: its nodes are not a tree: node {number} occurs twice; export it again")
-            seen.add(number)
+            visited.add(number)
             matrix = parent_matrix @ self._matrix(number)
             if not np.isfinite(matrix).all():
                 raise DataError(f"{self.path}: node {number} has no finite transform; export it again")
             if "mesh" in nodes[number]:
                 meshes.append((_index(nodes[number]["mesh"]), matrix))
-            waiting += [(_index(child), matrix) for child in nodes[number].get("children", [])]
+            pending += [(_index(child), matrix) for child in nodes[number].get("children", [])]
         return meshes
 
     def _matrix(self, number: int) -> NDArray[np.float64]:
@@ -283,7 +283,7 @@ class Gltf:
 
 
 def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:
-    """Return the extensions of a primitive, and those of KHR_gaussian_splatting."""
+    """Return the extensions of a primitive, including those nested in KHR_gaussian_splatting."""
     extensions: dict[str, Any] = primitive.get("extensions", {})
     return {**extensions, **extensions.get(EXTENSION, {}).get("extensions", {})}
 
@@ -293,23 +293,23 @@ def _has_gaussians(extensions: dict[str, Any]) -> bool:
 
 
 def _spz_view(extensions: dict[str, Any]) -> Any:
-    """Return the view that holds an SPZ file, as several drafts name it, or None."""
+    """Return the buffer view that contains an SPZ file, under any of its draft names, or None."""
     return next((extension["bufferView"] for name, extension in extensions.items() if "spz" in name), None)
 
 
 def _sh_names(degree: int) -> list[str]:
-    """Return the attributes of the SH coefficients up to a degree, in order."""
+    """Return the attribute names of the SH coefficients up to a degree, in order."""
     return [f"{PREFIX}SH_DEGREE_{d}_COEF_{m}" for d in range(degree + 1) for m in range(2 * d + 1)]
 
 
 def _to_srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sRGB values of linear colors, IEC 61966-2-1; those below 0 become 0, as they are shown."""
+    """Convert linear colors to sRGB (IEC 61966-2-1); negative values become 0."""
     color = np.maximum(linear, 0)
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
 
 
 def _index(value: Any) -> int:
-    """Check an index, size, or offset.  Raises ValueError."""
+    """Return an index, size, or offset.  Raises ValueError if it is not an integer from 0."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
         raise ValueError(f"expected a whole number from 0, got {quote(value)}")
     return value
@@ -329,7 +329,7 @@ def looks_like_gltf(data: bytes) -> bool:
 
 
 def gltf_files(path: Path) -> list[Path]:
-    """Return a .gltf and the existing files of its buffers; only itself if it is damaged."""
+    """Return a .gltf file and the files of its buffers; only the .gltf file if it is damaged."""
     try:
         uris = [unquote(buffer["uri"]) for buffer in read_json(path)["buffers"]]
         return [path, *(path.parent / uri for uri in uris if is_inside(uri) and not uri.startswith("data:"))]
@@ -355,7 +355,7 @@ def read_gltf(path: Path) -> SplatFile:
         ) from error
     for note in sorted(gltf.notes):
         LOG.warning("%s: %s", path, note)
-    if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
+    if rendering.pop("origin", None) and placement is not None:  # the node has it, perhaps changed
         rendering["origin"] = placement[:3, 3].tolist()
         placement[:3, 3] = 0
     return SplatFile(
@@ -364,7 +364,7 @@ def read_gltf(path: Path) -> SplatFile:
 
 
 def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write Gaussians as one primitive.  Raises OutputError."""
+    """Write Gaussians as one primitive; return the SHA-256 of the file.  Raises OutputError."""
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)
     attributes = _attributes(p)
@@ -413,13 +413,13 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
 
 
 def _origin(splats: SplatFile) -> list[float] | None:
-    """Return the origin of a model in the axes of glTF; None if it has none."""
+    """Return the origin of a model, [3], in the axes of glTF, or None."""
     origin: list[float] | None = splats.rendering.get("origin")
     return origin and (np.array(FLIP) * origin).tolist()
 
 
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
-    """Return the attributes by name: tables [N, c] of float32 or uint8."""
+    """Return the glTF attributes by name, [N, components] float32 or uint8."""
     alpha = opacities(p["logit_opacity"])
     color = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
@@ -433,9 +433,9 @@ def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
     }
     bands = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1)
     tables |= {name: bands[:, 3 * i : 3 * i + 3] for i, name in enumerate(_sh_names(MAX_DEGREE)[: bands.shape[1] // 3])}
-    written = {name: np.ascontiguousarray(table, "<f4") for name, table in tables.items()}
-    written["COLOR_0"] = np.rint(255 * np.concatenate([linear, alpha], axis=1)).astype(np.uint8)
-    return written
+    attributes = {name: np.ascontiguousarray(table, "<f4") for name, table in tables.items()}
+    attributes["COLOR_0"] = np.rint(255 * np.concatenate([linear, alpha], axis=1)).astype(np.uint8)
+    return attributes
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
@@ -475,7 +475,7 @@ def ParticleField3DGaussianSplat "Gaussians"
 
 
 def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.usda` file.  Raises OutputError."""
+    """Write a `.usda` file; return its SHA-256.  Raises OutputError."""
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)
     scales = np.exp(np.clip(p["log_scales"].astype(np.float64), -80, 80))

@@ -1,12 +1,12 @@
-"""Read and write the PLY of 3DGS: written in its property order, read by property name in any order.
+"""Read and write the PLY files of 3DGS; properties are written in its order, and read in any order.
 
     x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity scale_0..2 rot_0..3    float32, before activation
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
-Normals are written as zeros.  `filter_3D` follows if a world filter is not baked into scales and opacity: its standard
-deviation (Mip-Splatting).  For moving Gaussians, the columns of their motion follow (clsplat/formats/splats.py).
-Comments contain the numbers for rendering, and the mode for viewers: `SplatRenderMode: mip` if a screen filter reduces
-opacities to conserve energy, else `default`.
+Normals are written as zeros.  `filter_3D`, the standard deviation of a world filter (Mip-Splatting), follows if the
+filter is not baked into scales and opacity.  For moving Gaussians, the columns of their motion follow
+(clsplat/formats/splats.py).  Comments contain the rendering settings, and the mode for viewers: `SplatRenderMode: mip`
+if a screen filter reduces opacities to conserve energy, else `default`.
 """
 
 import io
@@ -161,7 +161,7 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
 def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
     """Return the header of a binary little-endian file.
 
-    elements: name, number of rows, and properties such as `float x` of each element, in order.
+    elements: by name, the number of rows and the properties, such as `float x`, in order.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, (count, properties) in elements.items():
@@ -175,8 +175,8 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
         raise DataError(
             f"{path}: has no vertices, only {shorten(', '.join(names)) or 'a header'}; expected 'element vertex N'"
         )
-    *before, vertex = elements[: names.index("vertex") + 1]
-    if lists := [element.name for element in before if element.has_list]:
+    *preceding_elements, vertex = elements[: names.index("vertex") + 1]
+    if lists := [element.name for element in preceding_elements if element.has_list]:
         raise DataError(
             f"{path}: {quote(lists[0])}, with a list, comes before the vertices; export it with vertices first"
         )
@@ -186,13 +186,14 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
         raise DataError(f"{path}: {fault}; export it again")
     dtype = np.dtype([(name, ORDERS[form] + kind) for name, kind in vertex.properties])
     if form == "ascii":
-        return PlyHeader(form, comments, vertex.count, dtype, start, sum(element.count for element in before))
+        lines_before = sum(element.count for element in preceding_elements)
+        return PlyHeader(form, comments, vertex.count, dtype, start, lines_before)
     sections = _sections(elements, ORDERS[form], start)
     return PlyHeader(form, comments, vertex.count, dtype, sections["vertex"].start, 0, sections)
 
 
 def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
-    """Return the sections of a binary file, up to an element of unknown size; for equal names, the first."""
+    """Return the sections of a binary file by name, up to an element with a list; the first of equal names counts."""
     sections: dict[str, Section] = {}
     for element in elements:
         if element.has_list:
@@ -211,7 +212,7 @@ RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 # a mip model, as several programs spell it
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)
 FILTER = "filter_3D"
-NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # numbers in the comment
+NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # rendering settings with values from 0
 ROWS = 65_536  # rows in memory at once while reading and writing
 MAX_NUMBER = 1e15  # same limit as for numbers in a dataset
 _COLUMNS = {
@@ -224,7 +225,7 @@ _COLUMNS = {
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat PLY; 2DGS discs, without scale_2, get FLAT_LOG_SCALE as the third scale.
+    """Read a splat PLY; the discs of 2DGS, which have no scale_2, get a third log scale of at most FLAT_LOG_SCALE.
 
     Raises DataError if it is missing, damaged, or not a splat.
     """
@@ -283,18 +284,18 @@ def _body(parameters: Parameters) -> bytes:
 
 
 def rendering_comments(rendering: dict[str, Any]) -> list[str]:
-    """Return the header comments that say how to render a model."""
+    """Return the header comments that contain the rendering settings."""
     mode = "mip" if rendering.get("compensate") else "default"
     return [f"{RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"{MODE}{mode}"]
 
 
 def render_mode(header: PlyHeader) -> str:
-    """Return `mip` if a comment of any program says so, else `default`."""
+    """Return `mip` if a comment, as any known program writes it, marks a mip model, else `default`."""
     return "mip" if any(MIP.match(text) for text in header.comments) else "default"
 
 
 def read_rendering_comment(path: Path, header: PlyHeader) -> dict[str, Any]:
-    """Return the values of clsplat's JSON comment, or {}.  Raises DataError for an invalid number."""
+    """Return the rendering settings in clsplat's JSON comment, or {}.  Raises DataError for an invalid value."""
     text = next((text.removeprefix(RENDERING) for text in header.comments if text.startswith(RENDERING)), "")
     try:
         values = json.loads(text or "{}")
@@ -304,14 +305,14 @@ def read_rendering_comment(path: Path, header: PlyHeader) -> dict[str, Any]:
 
 
 def read_extras(path: Path, table: dict[str, Any]) -> dict[str, Any]:
-    """Return our rendering values in the extras of a JSON table, or {}.  Raises DataError for an invalid number."""
+    """Return clsplat's rendering settings in the extras of a JSON object, or {}.  Raises DataError if invalid."""
     extras = table.get("extras")
     values = extras.get("clsplat") if isinstance(extras, dict) else None
     return check_rendering(path, values) if isinstance(values, dict) else {}
 
 
 def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Validate the rendering values of a file and return them.  Raises DataError for an invalid number."""
+    """Validate the rendering settings of a file and return them.  Raises DataError for an invalid value."""
     for name in NUMBERS:
         value = values.get(name)
         if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
@@ -333,14 +334,14 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
-    """Read the tables of a file, positioned at its first row, some rows at a time."""
+    """Read the parameters from a file that is positioned at its first row, in blocks of rows."""
     tables: Parameters = {}
     for first in range(0, max(header.count, 1), ROWS):
         rows = min(ROWS, header.count - first)
-        part = _parameters(path, np.frombuffer(file.read(rows * header.dtype.itemsize), header.dtype))
+        block = _parameters(path, np.frombuffer(file.read(rows * header.dtype.itemsize), header.dtype))
         if not tables:
-            tables = {name: np.empty((header.count, table.shape[1]), table.dtype) for name, table in part.items()}
-        for name, table in part.items():
+            tables = {name: np.empty((header.count, table.shape[1]), table.dtype) for name, table in block.items()}
+        for name, table in block.items():
             tables[name][first : first + rows] = table
     return tables
 
@@ -358,17 +359,17 @@ def _degree(path: Path, names: Sequence[str]) -> int:
 
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
-    columns_of = dict(_COLUMNS)
+    columns_by_name = dict(_COLUMNS)
     if is_flat := "scale_1" in names and "scale_2" not in names:  # 2DGS
-        columns_of["log_scales"] = ("scale_0", "scale_1")
-    missing = [column for columns in columns_of.values() for column in columns if column not in names]
+        columns_by_name["log_scales"] = ("scale_0", "scale_1")
+    missing = [column for columns in columns_by_name.values() for column in columns if column not in names]
     if missing:
         raise DataError(
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
             "to train from a point cloud, use `clsplat run`"
         )
     columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_degree(path, names)) - 1)))
-    parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
+    parameters = {name: _columns(vertices, columns) for name, columns in columns_by_name.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
         doubles = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), doubles, parameters["means"])
@@ -397,13 +398,13 @@ def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.flo
         return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
 
 
-# Joining PLY files piece by piece, in little memory.
+# Joining PLY files block by block, with little memory.
 
 Check = Callable[[int, NDArray[np.float32]], None]
 
 
 def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
-    """Write the vertices of all parts in order, with the header of the first; return their number.
+    """Write the vertices of all parts in order, with the header of the first part; return the number of vertices.
 
     check: called with the index of a part and the means of some of its rows, [n, 3]; it may raise an error.
     Raises DataError if a part is damaged or its properties or comments differ from the first, and OutputError.
@@ -423,12 +424,12 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
                 file.seek(header.start)
                 for start in range(0, header.count, ROWS):
                     size = min(ROWS, header.count - start) * header.dtype.itemsize
-                    piece = file.read(size)
-                    if len(piece) < size:
+                    block = file.read(size)
+                    if len(block) < size:
                         raise DataError(f"{part}: is truncated; train that block again")
-                    rows = np.frombuffer(piece, header.dtype)
+                    rows = np.frombuffer(block, header.dtype)
                     check(number, np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1))
-                    output.write(piece)
+                    output.write(block)
     return count
 
 

@@ -39,7 +39,7 @@ from clsplat.formats.splats import (
 
 LOG = logging.getLogger("clsplat")
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-LARGEST_SCALE = 1e6  # scene units; text misread as numbers has larger ones
+LARGEST_SCALE = 1e6  # scene units; text misread as numbers has larger values
 EXPECTED = "a .splat file with 32 bytes per splat"
 
 
@@ -80,7 +80,7 @@ def read_splat(path: Path) -> SplatFile:
 
 
 def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.splat` file.  Raises DataError for a model without Gaussians, OutputError."""
+    """Write a `.splat` file; return its SHA-256.  Raises DataError for a model without Gaussians, and OutputError."""
     require_gaussians(path, splats)
     p = splats.parameters
     alpha = opacities(p["logit_opacity"])
@@ -104,7 +104,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
 
 HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
-SH_ENDS = (-1.5, 1.5)
+SH_RANGE = (-1.5, 1.5)
 RANGE = 32767
 # position, scale and rotation, SH by level
 KINDS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
@@ -119,17 +119,17 @@ class SplatSection:
     degree: int
     bucket_size: int
     buckets: int
-    block: float  # scene units
+    block: float  # side of a bucket, scene units
     bucket_bytes: int
     range: int
-    full: int
-    partial: int
+    full: int  # number of full buckets
+    partial: int  # number of partial buckets
 
     @classmethod
     def parse(cls, data: bytes, start: int) -> "SplatSection":
-        """Parse the header at an offset, in bytes."""
-        numbers = struct.unpack_from("<4IfH2x4IH", data, start)
-        count, rows, size, buckets, block, bucket_bytes, scale, _, full, partial, degree = numbers
+        """Parse the header at byte offset `start`."""
+        values = struct.unpack_from("<4IfH2x4IH", data, start)
+        count, rows, size, buckets, block, bucket_bytes, scale, _, full, partial, degree = values
         return cls(count, rows, degree, size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
 
     def row(self, level: int) -> np.dtype[Any]:
@@ -140,7 +140,7 @@ class SplatSection:
         return np.dtype(fields)
 
     def sizes(self, level: int) -> tuple[int, int, int]:
-        """Return the bytes of the counts of partial buckets, of the buckets, and of the splats."""
+        """Return the sizes of the partial buckets' counts, of the buckets, and of the splats, bytes."""
         return 4 * self.partial, self.bucket_bytes * self.buckets, self.row(level).itemsize * self.rows
 
 
@@ -160,7 +160,7 @@ def read_ksplat(path: Path) -> SplatFile:
         raise DataError(f"{path}: has no splats; export it again")
     if not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
-    sections = sections or max_sections  # the number of those loaded so far, which some writers leave at 0
+    sections = sections or max_sections  # `sections` counts those loaded so far; some writers leave it at 0
     ends = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * max_sections
     require_size(path, len(data), start, f"{max_sections} sections")
@@ -171,7 +171,7 @@ def read_ksplat(path: Path) -> SplatFile:
         sizes = section.sizes(level)
         require_size(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
         require_memory(path, section.count, section.degree)
-        parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_ENDS))
+        parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_RANGE))
         start += sum(sizes)
     return SplatFile(concatenate(parts))
 

@@ -1,4 +1,4 @@
-"""Define what all formats share: names and widths of tables, activations, axes, and checks.
+"""Define the parameters, activations, axes, and checks that all formats share.
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
@@ -40,7 +40,7 @@ def is_timestamp(time: float) -> bool:
 
 
 def motion_width(degree: int, turns: bool) -> int:
-    """Return the number of columns for polynomials of a degree from 1 to 3."""
+    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; turns: with rotations."""
     return 2 + 3 * degree + TURN * turns
 
 
@@ -55,7 +55,7 @@ def motion_degree(width: int) -> int:
 
 
 def motion_fields(width: int) -> dict[str, slice]:
-    """Return the columns of each field of a motion table with `width` columns, by name, in order."""
+    """Return the column slice of each field, by name and in order, of a motion table with `width` columns."""
     degree, turns = WIDTHS[width]
     names = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
     ends = accumulate(FIELDS[name] for name in names)
@@ -77,10 +77,10 @@ def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
-STORED_DEGREE = 4  # of some formats; bands beyond MAX_DEGREE are dropped
+STORED_DEGREE = 4  # largest SH degree in files; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
-NEAR_FRACTION = 0.04  # of the median distance of the means from their middle: the near plane without a file or scene
+NEAR_FRACTION = 0.04  # default near plane, relative to the median distance of the means from their center
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
@@ -92,7 +92,7 @@ MIN_OUTSIDE = (
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
-FLATNESS = -6.907755  # log 1e-3: of that axis by the others, at most
+FLATNESS = -6.907755  # log 1e-3: largest ratio of that axis to the others
 # axes in which the functions of bands 1 to 3 are odd
 PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
@@ -104,7 +104,7 @@ LOG = logging.getLogger("clsplat")
 
 @dataclass(frozen=True)
 class SplatFile:
-    """The content of a model file: the parameters, and the numbers in its comment for rendering."""
+    """The content of a model file: the parameters and the rendering settings."""
 
     parameters: Parameters  # including filter_variance and motion if the file has them
     rendering: dict[str, Any] = field(default_factory=dict)
@@ -121,7 +121,7 @@ class SplatFile:
 
     @property
     def has_sky(self) -> bool:
-        """Whether some Gaussians are a sky, as clsplat/gaussians/conversion.py marks in the comment."""
+        """Whether some Gaussians represent the sky, as marked by clsplat/gaussians/conversion.py."""
         return bool(self.rendering.get("sky") == "splats")
 
     def rows(self, indices: Any) -> "SplatFile":
@@ -131,7 +131,7 @@ class SplatFile:
 
 @dataclass(frozen=True)
 class Reading:
-    """Options for reading that a file does not determine itself."""
+    """Options for reading a model."""
 
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
     quiet: bool = False  # do not log about the axes of an SPZ file
@@ -158,7 +158,7 @@ def columns_to_sh_degree(columns: int) -> int:
 
 
 def with_degree(parameters: Parameters, degree: int) -> Parameters:
-    """Return the parameters with more or fewer SH bands."""
+    """Return the parameters with SH bands up to `degree`; missing bands are zero."""
     columns = 3 * (sh_coefficients(degree) - 1)
     rest = parameters["sh_rest"][:, :columns]
     padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
@@ -166,7 +166,7 @@ def with_degree(parameters: Parameters, degree: int) -> Parameters:
 
 
 def concatenate(parts: Sequence[Parameters]) -> Parameters:
-    """Concatenate the rows of several tables, with their largest SH degree."""
+    """Concatenate the Gaussians of several models, with their largest SH degree."""
     degree = max(columns_to_sh_degree(part["sh_rest"].shape[1]) for part in parts)
     tables = [with_degree(part, degree) for part in parts]
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
@@ -244,36 +244,36 @@ def transform(
 
 
 def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
-    """Return columns in outer-major order as inner-major ones, [N, outer * inner]."""
+    """Convert columns from outer-major to inner-major order, [N, outer * inner]."""
     count = len(table)
-    moved = table.reshape(count, outer, inner).transpose(0, 2, 1)
-    return np.ascontiguousarray(moved.reshape(count, outer * inner))
+    transposed = table.reshape(count, outer, inner).transpose(0, 2, 1)
+    return np.ascontiguousarray(transposed.reshape(count, outer * inner))
 
 
 def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
-    """Return which Gaussians have NaN or infinity, [N]."""
+    """Return a mask of the Gaussians with NaN or infinity, [N]."""
     return np.asarray(np.any([~np.isfinite(table).all(axis=1) for table in parameters.values()], axis=0))
 
 
 def typical_size(means: NDArray[np.floating]) -> float:
-    """Return the median distance of means, [N, 3], from their middle, or the largest one if that is 0, scene units."""
+    """Return the median distance of means, [N, 3], from their center, or the largest if that is 0, scene units."""
     finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
     distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1) if len(finite) else np.zeros(1)
     return float(np.median(distances)) or float(distances.max()) or 1.0
 
 
 def usual_near(means: NDArray[np.floating]) -> float:
-    """Return the near plane of Gaussians with these means, [N, 3], if no file or scene gives one, scene units."""
+    """Return the default near plane for Gaussians with these means, [N, 3], scene units."""
     return NEAR_FRACTION * typical_size(means)
 
 
 def exceeds_limit(parameters: Parameters) -> NDArray[np.bool_]:
-    """Return which Gaussians have finite log scales, SH coefficients, or motions beyond MAX_VALUE, [N]."""
+    """Return a mask, [N], of the Gaussians with finite log scales, SH coefficients, or motions beyond MAX_VALUE."""
     return np.asarray(np.any([_row_exceeds_limit(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
 def too_large_message(parameters: Parameters) -> str:
-    """Return how many Gaussians have values that are too large, and in which tables; '' if none."""
+    """Describe how many Gaussians have values that are too large, and in which tables; '' if there are none."""
     if not (count := int(exceeds_limit(parameters).sum())):
         return ""
     names = ", ".join(name for name in LIMITED if name in parameters and _row_exceeds_limit(parameters[name]).any())
@@ -281,27 +281,28 @@ def too_large_message(parameters: Parameters) -> str:
 
 
 def _row_exceeds_limit(table: Floats) -> NDArray[np.bool_]:
-    """Return which rows have finite values beyond MAX_VALUE, [N]."""
-    size = np.abs(table)
-    return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
+    """Return a mask of the rows with finite values beyond MAX_VALUE, [N]."""
+    magnitude = np.abs(table)
+    return np.asarray(((magnitude > MAX_VALUE) & (magnitude < np.inf)).any(axis=1))
 
 
 def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Replace the logits of opacities 0 and 1, and the logarithms of scales 0, by finite numbers."""
+    """Replace infinite logits and logarithms, of opacities 0 and 1 and of scales 0, by finite values; warn."""
     logit, log_scales = (splats.parameters[name] for name in ("logit_opacity", "log_scales"))
-    infinite, flat = np.isinf(logit), np.isneginf(log_scales)
-    if not (count := int((infinite.any(axis=1) | flat.any(axis=1)).sum())):
+    is_infinite, is_flat = np.isinf(logit), np.isneginf(log_scales)
+    if not (count := int((is_infinite.any(axis=1) | is_flat.any(axis=1)).sum())):
         return splats
     if not options.quiet:
         fault = f"{count:,} Gaussians have an opacity of 0 or 1, or a scale of 0, without a finite logit or logarithm"
         LOG.warning("%s: %s; they are moved by %g", path, fault, MIN_ALPHA)
-    bound, flat_scale = logits((logit > 0).astype(np.float32)), np.float32(FLAT_LOG_SCALE)
-    limits = {"logit_opacity": np.where(infinite, bound, logit), "log_scales": np.where(flat, flat_scale, log_scales)}
-    return replace(splats, parameters={**splats.parameters, **limits})
+    finite_logit = np.where(is_infinite, logits((logit > 0).astype(np.float32)), logit)
+    finite_scales = np.where(is_flat, np.float32(FLAT_LOG_SCALE), log_scales)
+    finite_tables = {"logit_opacity": finite_logit, "log_scales": finite_scales}
+    return replace(splats, parameters={**splats.parameters, **finite_tables})
 
 
 def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return logarithms of scales; if most are negative, they are logarithms already, as a note says."""
+    """Return the logarithms of scales; if most are negative, return them as logarithms, and add a note to `notes`."""
     if np.count_nonzero(scales < 0) > MIN_OUTSIDE * scales.size:
         notes.add("its scales are negative: they are read as logarithms")
         return scales.astype(np.float32)
@@ -309,7 +310,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return logits of opacities; values mostly outside of [0, 1] are taken for logits, with a note."""
+    """Return the logits of opacities; if most are outside [0, 1], return them as logits, and add a note to `notes`."""
     if np.count_nonzero((alpha < 0) | (alpha > 1)) > MIN_OUTSIDE * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)
@@ -317,9 +318,9 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Refuse, drop, or keep Gaussians with NaN or infinity.
+    """Refuse, drop, or keep Gaussians with NaN or infinity, as `options.not_finite` says.
 
-    Dropping includes values that are too large, and quaternions of length 0.  Raises DataError.
+    "drop" also drops Gaussians with values that are too large, or with quaternions of length 0.  Raises DataError.
     """
     is_invalid = not_finite(splats.parameters)
     if options.not_finite == "drop":
@@ -377,7 +378,7 @@ def require_memory(path: Path, count: int, degree: int = MAX_DEGREE) -> None:
 
 
 def warn_dropped(path: Path, degree: int) -> None:
-    """Warn about SH bands beyond MAX_DEGREE."""
+    """Log a warning about SH bands beyond MAX_DEGREE, which readers drop."""
     if degree > MAX_DEGREE:
         LOG.warning("%s: dropped the bands of SH degree %d", path, degree)
 

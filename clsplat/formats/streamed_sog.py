@@ -63,18 +63,18 @@ def find_level_faults(path: Path) -> list[str]:
     """Return a message for each missing or damaged file of the coarser levels; `read_lod` checks the finest."""
     meta, faults = _meta(path), []
     levels = _runs(path, meta)
-    spare: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
+    unused_files: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
     for level, runs in enumerate(levels):
         try:
             faults += _faults(path, meta, runs) if level else []
             _require_count(path, meta, level, runs)
         except DataError as error:
             faults.append(str(error))
-    return faults + _faults(path, meta, spare)
+    return faults + _faults(path, meta, unused_files)
 
 
 def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
-    """Return a message for each of the files that is missing or damaged."""
+    """Return an error message for each missing or damaged file.  runs: of its leaves, by file number."""
     faults = []
     for file, leaves in sorted(runs.items()):
         try:
@@ -151,15 +151,15 @@ def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> 
 
 
 def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
-    """Yield the runs of each leaf by level."""
-    waiting = [tree]
-    while waiting:
-        node = waiting.pop()
+    """Yield the runs of each leaf, by level."""
+    pending = [tree]
+    while pending:
+        node = pending.pop()
         children, lods = (node.get("children"), node.get("lods")) if isinstance(node, dict) else (None, None)
         if isinstance(lods, dict):
             yield lods
         elif isinstance(children, list):
-            waiting += children[::-1]
+            pending += children[::-1]
         else:
             raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods; export it again")
 
@@ -172,18 +172,18 @@ def _whole_number(path: Path, key: str, run: Any) -> int:
 
 
 def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
-    """Return the splats of a file that are in leaves.  runs: ascending."""
-    part = read_sog(path.parent / name)
+    """Return the splats of a file that belong to leaves.  runs: in ascending order."""
+    splats = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
     for offset, count in runs:
-        if offset < end or offset + count > len(part):
+        if offset < end or offset + count > len(splats):
             raise DataError(
-                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(part)}, the first "
+                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(splats)}, the first "
                 f"{end} in other leaves; export it again"
             )
         end = offset + count
         rows.append(np.arange(offset, end))
-    return part.rows(np.concatenate(rows))
+    return splats.rows(np.concatenate(rows))
 
 
 # The tree of a streamed SOG: boxes of the splats of all levels, halved until they are small.
@@ -198,7 +198,7 @@ class LeafLimits:
     """The limits of a leaf; the defaults are those of PlayCanvas."""
 
     splats: int = 512 * 1024  # of all levels; a file exceeds it by one leaf at most
-    extent: float = 4.0  # longest side of the bounding box of means, in typical sizes: 16 scene units at a size of 4
+    extent: float = 4.0  # max_extent side of the bounding box of means, in typical sizes: 16 scene units at a size of 4
     few: int = 1024  # splats that are never split because of their extent
 
 
@@ -220,14 +220,14 @@ class Node:
 
 
 def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
-    """Build the tree of levels, finest first; no level may be empty."""
+    """Build the tree of all levels, which are ordered from the finest and not empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
-    reach, longest = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
+    reach, max_extent = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
 
     def node(rows: Rows) -> Node:
         span = np.ptp(means[rows], axis=0)
-        if len(rows) > limits.splats or (span.max() > longest and len(rows) > limits.few):
+        if len(rows) > limits.splats or (span.max() > max_extent and len(rows) > limits.few):
             ordered = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
             halves = node(ordered[: len(rows) // 2]), node(ordered[len(rows) // 2 :])
             low = np.minimum(*(half.low for half in halves))
@@ -289,14 +289,14 @@ def write_lod(
 
 @dataclass
 class _Files:
-    """The files of all levels; a file takes leaves until it has more than `splats` splats."""
+    """The files of all levels; leaves are added to a file until it has more than `splats` splats."""
 
     splats: int
     rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
     open: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
     def shape(self, node: Node) -> dict[str, Any]:
-        """Return a node as JSON, and assign the rows of its leaves to files."""
+        """Return a node as JSON data, and assign the rows of its leaves to files."""
         bound = {"bound": {"min": _short(node.low), "max": _short(node.high)}}
         if node.children:
             return {**bound, "children": [self.shape(child) for child in node.children]}

@@ -1,4 +1,4 @@
-"""List the file formats; reading detects a format by content, writing chooses it by the file name."""
+"""List the file formats; reading detects the format by content, and writing selects it by file name."""
 
 import logging
 import os
@@ -43,7 +43,7 @@ class Start:
     size: int  # bytes of the file
 
     def ply(self) -> PlyHeader | None:
-        """Return the header if this is a readable PLY file."""
+        """Return the header of a readable PLY file, or None for other files."""
         if not self.data.startswith(b"ply"):
             return None
         try:
@@ -61,11 +61,11 @@ class Codec:
     matches: Callable[[Start], bool]
     read: Callable[[Path, Reading], SplatFile] | None = None
     write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256
-    command: str = ""  # the only one that writes this format
+    command: str = ""  # the only command that writes this format
     keeps_all: bool = False  # the world filter, motion, values that are not finite, and positions in float64
     keeps_mode: bool = True  # whether a model is a mip model
-    keeps_numbers: bool = False  # numbers for rendering
-    keeps_origin: bool = False  # apart from the numbers for rendering
+    keeps_rendering: bool = False  # rendering settings
+    keeps_origin: bool = False  # apart from the rendering settings
     has_quality: bool = False  # writing uses Writing.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
 
@@ -107,14 +107,14 @@ CODECS = (
         lambda path, options: read_ply(path),
         lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
         keeps_all=True,
-        keeps_numbers=True,
+        keeps_rendering=True,
     ),
     Codec(
         "compressed PLY",
         (".compressed.ply",),
         lambda start: (header := start.ply()) is not None and is_compressed(header),
         lambda path, options: read_compressed_ply(path),
-        keeps_numbers=True,
+        keeps_rendering=True,
     ),
     Codec(
         "SPZ",
@@ -130,7 +130,7 @@ CODECS = (
         lambda start: looks_like_sog(start.data),
         lambda path, options: read_sog(path),
         write_sog,
-        keeps_numbers=True,
+        keeps_rendering=True,
         has_quality=True,
     ),
     Codec(
@@ -139,7 +139,7 @@ CODECS = (
         lambda start: looks_like_lod(start.data),
         lambda path, options: read_lod(path),
         command="clsplat lod",
-        keeps_numbers=True,
+        keeps_rendering=True,
     ),
     Codec(
         "GLB",
@@ -147,7 +147,7 @@ CODECS = (
         lambda start: start.data.startswith(b"glTF"),
         lambda path, options: read_gltf(path),
         write_glb,
-        keeps_numbers=True,
+        keeps_rendering=True,
     ),
     Codec(
         "glTF",
@@ -183,7 +183,7 @@ CODECS = (
 
 
 def endings(reads: bool = False) -> list[str]:
-    """Return the file name endings that can be written, or that can be read."""
+    """Return the file name endings of the formats that can be written, or with `reads`, that can be read."""
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
 
 
@@ -194,8 +194,8 @@ def detect(path: Path) -> Codec | None:
     """
     with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
-    named = format_of_name(path)
-    codec = next((c for c in CODECS if c.matches(start) and (c.has_magic or named in (None, c))), None)
+    named_codec = format_of_name(path)
+    codec = next((c for c in CODECS if c.matches(start) and (c.has_magic or named_codec in (None, c))), None)
     if codec is None or not start.size:
         require_content(path, start.data)
     return codec
@@ -259,13 +259,13 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
     options = options or Writing()
     if not options.quiet:
         warn_about_losses(path, splats)
-    if codec.keeps_numbers:
+    if codec.keeps_rendering:
         check_rendering(path, splats.rendering)  # the reader would refuse invalid numbers
     return codec.write(path, splats, options)
 
 
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
-    """Warn if the format of a file name does not store the mip mark, the numbers for rendering, or the origin."""
+    """Warn if the format of a file name does not store the mip mark, the rendering settings, or the origin."""
     codec = writing_format(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(
@@ -273,20 +273,20 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
             path,
             codec.name,
         )
-    if not codec.keeps_numbers and (losses := _unusual_numbers(splats)):
+    if not codec.keeps_rendering and (losses := _unusual_settings(splats)):
         LOG.warning("%s: %s does not store %s; PLY, SOG, and GLB do", path, codec.name, losses)
-    if (origin := splats.rendering.get("origin")) and not (codec.keeps_numbers or codec.keeps_origin):
+    if (origin := splats.rendering.get("origin")) and not (codec.keeps_rendering or codec.keeps_origin):
         LOG.warning(
             "%s: %s does not store the origin (%s) of the coordinates; PLY, SOG, GLB, and OpenUSD do",
             *(path, codec.name, ", ".join(f"{value:.15g}" for value in origin)),
         )
 
 
-USUAL = 10  # largest ratio of a near plane to that of a file without one, and its inverse, that a file need not store
+USUAL = 10  # a near plane within this factor of the default is not worth a warning
 
 
-def _unusual_numbers(splats: SplatFile) -> str:
-    """Describe the numbers for rendering that differ from the defaults of files without them."""
+def _unusual_settings(splats: SplatFile) -> str:
+    """Describe the rendering settings that differ from the defaults for files without them."""
     near, default = splats.rendering.get("near"), usual_near(splats.parameters["means"])
     usual: dict[str, Any] = {} if near and default / USUAL < near < default * USUAL else {"near": near and default}
     usual |= {"screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None, "pixel_box": 0}
