@@ -1,4 +1,4 @@
-"""Pinhole cameras for rendering, and lenses with distortion for photographs."""
+"""Define pinhole cameras for rendering, and lenses with distortion for photographs."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
 
-MAX_SIDE = 4096 * 8  # px: tiles that cl_kernels/tiles.h can number, times the smallest tile size of a device
-MAX_SOURCE = 32764  # px: a larger photograph cannot be cut by OpenCV
-MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover half of all directions
+MAX_SIDE = 4096 * 8  # px: tiles per side that cl_kernels/tiles.h can index, times the smallest tile size
+MAX_SOURCE = 32764  # px: OpenCV cannot remap larger photographs
+MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover nearly half of all directions
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: image size, focal lengths and principal point, in pixels."""
+    """A pinhole camera with image size, focal lengths and principal point, all in pixels."""
 
     width: int
     height: int
@@ -30,15 +30,15 @@ class Camera:
     cy: float
 
     def check(self) -> "Camera":
-        """Return the camera.
+        """Validate the camera and return it.
 
-        Raises ValueError unless sizes are positive integers up to MAX_SIDE, focal lengths are positive, and all numbers
-        are finite.
+        Raises ValueError unless the size is two positive integers up to MAX_SIDE, the focal lengths are positive, and
+        all values are finite.
         """
         if not (isinstance(self.width, Integral) and isinstance(self.height, Integral)):
             raise ValueError(f"the camera is {self.width}x{self.height}; expected integers")
         if max(self.width, self.height) > MAX_SIDE:
-            raise ValueError(f"the camera is {self.width}x{self.height} pixels; expected at most {MAX_SIDE} to a side")
+            raise ValueError(f"the camera is {self.width}x{self.height} pixels; expected at most {MAX_SIDE} per side")
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
             raise ValueError(
                 f"the camera is {self.width}x{self.height} with focal lengths {self.fx}, {self.fy} and principal point "
@@ -47,11 +47,11 @@ class Camera:
         return self
 
     def zoomed(self, factor: float) -> "Camera":
-        """Return the camera with both focal lengths multiplied by a factor."""
+        """Return the camera with both focal lengths multiplied by `factor`."""
         return self if factor == 1 else replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the photograph resampled to another size."""
+        """Return the camera of the image resampled to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
@@ -65,7 +65,7 @@ class Camera:
 # Lenses with distortion: COLMAP's camera models, and undistortion of photographs.
 
 Floats = NDArray[np.float64]
-Distortion = Callable[..., tuple[Floats, Floats]]  # (u, v, k), or (x, y, k, z) of a direction for models of WIDE
+Distortion = Callable[..., tuple[Floats, Floats]]  # of (u, v, k), or of (x, y, k, z) for directions in models of WIDE
 BORDER_POINTS = 200  # per edge of a photograph
 MAX_ROUNDS = 50  # iterations of Newton's method
 MAX_ERROR = 1.0e-6  # of its result, normalized units
@@ -167,15 +167,15 @@ WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover dire
 
 # Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
-MIN_WIDE = math.radians(80)  # to one side of the image: a pinhole image would be 3.6 times as wide
-MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle and the nearest edge
+MIN_WIDE = math.radians(80)  # from the axis to a side of the image: a pinhole image would be 3.6 times as wide
+MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle or its nearest edge, whichever is farther
 RIM = 1.5  # px: samples at the edge of a fisheye's circle would mix with the dark pixels around it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
 FACE_GRID = 128  # directions along a side at which the visible part of a face is measured
-MIN_SHOWN = 0.02  # visible fraction of a face; faces with less are left out
+MIN_SHOWN = 0.02  # visible fraction of a face below which the face is left out
 ANGLES = 1801  # from 0 to 180 degrees
 BLOCK = 1 << 20  # samples at a time
-# rotations from the camera of the photograph to that of the face: its right, down, forward
+# rotations from the camera of the photograph to that of the face; the rows are its right, down, and forward axes
 FACES: dict[str, Floats] = {
     "front": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
     "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
@@ -188,14 +188,14 @@ FACES: dict[str, Floats] = {
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera of a distorted photograph: its size in pixels, and a model of MODELS with COLMAP's parameters."""
+    """The camera of a distorted photograph: its size in pixels, and a model from MODELS with COLMAP's parameters."""
 
     width: int
     height: int
     model: str
     params: tuple[float, ...]
-    whole: bool = False  # keep the whole photograph, with undefined pixels, instead of cropping them away
-    face: str = field(default="", repr=False)  # a face of a wide photograph, from FACES; "": the photograph
+    whole: bool = False  # keep all of the photograph, with undefined pixels, instead of cropping them away
+    face: str = field(default="", repr=False)  # a face of a wide photograph, from FACES; "": the photograph itself
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -205,24 +205,24 @@ class Lens:
 
     @property
     def has_distortion(self) -> bool:
-        """Whether the lens has distortion; a fisheye lens always has."""
+        """Whether the lens has distortion; always true for fisheye lenses and panoramas."""
         return "FISHEYE" in self.model or self.model == "EQUIRECTANGULAR" or any(self._split[4])
 
     @cached_property
     def _angles(self) -> tuple[Floats, float]:
-        """The angles (rad) of view to the left, right, top and bottom, [4], and the angle where the lens folds back."""
-        fx, fy, cx, cy, rest = self._split
-        angle, sides, folds = np.linspace(0, np.pi, ANGLES), [], []
+        """The angles of view to the left, right, top and bottom, [4] rad, and the angle where the lens folds back."""
+        fx, fy, cx, cy, coefficients = self._split
+        angle, side_angles, fold_angles = np.linspace(0, np.pi, ANGLES), [], []
         sizes = cx / fx, (self.width - cx) / fx, cy / fy, (self.height - cy) / fy
         for (x, y), size in zip(((-1, 0), (1, 0), (0, -1), (0, 1)), sizes, strict=True):
             with np.errstate(all="ignore"):
-                u, v = MODELS[self.model][1](x * np.sin(angle), y * np.sin(angle), rest, np.cos(angle))
+                u, v = MODELS[self.model][1](x * np.sin(angle), y * np.sin(angle), coefficients, np.cos(angle))
                 radius = x * u + y * v
-                rises = np.diff(radius) > 0
-            folds.append(angle[np.argmin(rises)] if not rises.all() else np.pi)
+                is_rising = np.diff(radius) > 0
+            fold_angles.append(angle[np.argmin(is_rising)] if not is_rising.all() else np.pi)
             is_outside = radius > size
-            sides.append(min(folds[-1], angle[np.argmax(is_outside)] if is_outside.any() else np.pi))
-        return np.array(sides), min(folds)
+            side_angles.append(min(fold_angles[-1], angle[np.argmax(is_outside)] if is_outside.any() else np.pi))
+        return np.array(side_angles), min(fold_angles)
 
     @cached_property
     def is_wide(self) -> bool:
@@ -232,34 +232,34 @@ class Lens:
 
     @cached_property
     def faces(self) -> tuple["Lens", ...]:
-        """The front of a wide photograph, and the other faces that show MIN_SHOWN or more.  Raises DataError."""
+        """The lenses of the faces of a wide photograph: the front, and others of which MIN_SHOWN or more is visible."""
         lenses = [intern_lens(replace(self, face=face, whole=self.model != "EQUIRECTANGULAR")) for face in FACES]
         return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_SHOWN)
 
     @cached_property
     def _visible_grid(self) -> NDArray[np.bool_]:
-        """Which points of `_face_grid` the photograph shows, [FACE_GRID, FACE_GRID]."""
+        """Which points of `_face_grid` are visible in the photograph, [FACE_GRID, FACE_GRID]."""
         return self._sees(*_face_grid())
 
     def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the directions x, y, z in the camera of the photograph, from normalized coordinates of the face."""
+        """Convert normalized coordinates of the face to directions x, y, z in the camera of the photograph."""
         x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
         return x, y, z
 
     def _sees(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
-        """Return which rays, in normalized coordinates of the face, the wide photograph shows."""
+        """Return which rays, in normalized coordinates of the face, are visible in the wide photograph."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
-        (sides, fold), (x, y, z) = self._angles, self._directions(u, v)
+        (side_angles, fold_angle), (x, y, z) = self._angles, self._directions(u, v)
         angle = np.arctan2(np.hypot(x, y), z)
         with np.errstate(all="ignore"):
             x, y = self.distort(x, y, z)
             inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
-        circle = max(sides.min(), MIN_CIRCLE) - RIM / self._split[0]
-        return np.asarray(inside & (angle < min(fold, circle)))
+        circle_angle = max(side_angles.min(), MIN_CIRCLE) - RIM / self._split[0]
+        return np.asarray(inside & (angle < min(fold_angle, circle_angle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
-        """Return whether a face shows a white pixel of a mask, [H, W, C], of the photograph."""
+        """Return whether a white pixel of the photograph's mask, [H, W, C], is visible in this face."""
         u, v = np.stack(_face_grid())[:, self._visible_grid]
         x, y = self.distort(*self._directions(u, v))
         height, width = mask.shape[:2]
@@ -267,17 +267,17 @@ class Lens:
         return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
 
     def _face_camera(self) -> Camera:
-        """Return the camera of the smallest part of a face that contains everything visible in the photograph.
+        """Return the camera of a face, cropped to the smallest rectangle with all pixels visible in the photograph.
 
-        In the center, its pixels are as large as those of the photograph.  Raises DataError for an implausible camera.
+        At the center, its pixels are as large as those of the photograph.  Raises DataError for an implausible camera.
         """
         focal = max(self._split[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
-        longest = max(self.width, self.height)
-        if side > MAX_GROWTH * longest or longest > MAX_SOURCE:
+        long_side = max(self.width, self.height)
+        if side > MAX_GROWTH * long_side or long_side > MAX_SOURCE:
             raise DataError(
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
-                f"at most {MAX_SOURCE} px to a side and focal lengths that fit: calibrate the camera again"
+                f"at most {MAX_SOURCE} px per side and focal lengths that fit: calibrate the camera again"
             )
         if not self._visible_grid.any():
             raise self._error("shows nothing")
@@ -288,16 +288,16 @@ class Lens:
         return Camera(x1 - x0, y1 - y0, focal, focal, side / 2 - x0, side / 2 - y0)
 
     def _blocks(self, samples: int) -> Iterator[tuple[slice, Floats, Floats]]:
-        """Yield a block of rows of the face, and the normalized coordinates of its rays as `_rays` does."""
-        step = max(1, BLOCK // (self.pinhole.width * samples**2))
-        for row in range(0, self.pinhole.height, step):
-            rows = slice(row, row + step)
+        """Yield blocks of rows of the face, each with the normalized coordinates of its rays as from `_rays`."""
+        block_height = max(1, BLOCK // (self.pinhole.width * samples**2))
+        for row in range(0, self.pinhole.height, block_height):
+            rows = slice(row, row + block_height)
             yield rows, *_rays(self.pinhole, rows, samples)
 
     def _extract_face(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the face of a wide photograph, [H, W, C]; each pixel is the mean of 2 x 2 rays."""
+        """Resample a wide photograph to the face, [H, W, C]; each pixel is the mean of 2 x 2 rays."""
         camera, border = self.pinhole, int(self.model == "EQUIRECTANGULAR")
-        if border:  # add a column from the opposite side, which a panorama continues on
+        if border:  # a panorama continues at the opposite side
             pixels = np.concatenate([pixels[:, -1:], pixels, pixels[:, :1]], axis=1)
         face = np.empty((camera.height, camera.width, pixels.shape[2]), pixels.dtype)
         for rows, u, v in self._blocks(2):
@@ -309,31 +309,31 @@ class Lens:
         return face
 
     def distort(self, u: Floats, v: Floats, *z: Floats) -> tuple[Floats, Floats]:
-        """Return the pixel coordinates of normalized coordinates, or of directions (u, v, z) for models of WIDE."""
-        fx, fy, cx, cy, rest = self._split
-        x, y = MODELS[self.model][1](u, v, rest, *z)
+        """Convert normalized coordinates, or directions (u, v, z) for models in WIDE, to pixel coordinates."""
+        fx, fy, cx, cy, coefficients = self._split
+        x, y = MODELS[self.model][1](u, v, coefficients, *z)
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Return the pixel coordinates, [M, 2], of points in camera space, [M, 3]; for a wide lens, also behind it."""
+        """Project points in camera space, [M, 3], to pixels, [M, 2]; only a wide lens projects points behind it."""
         x, y, z = points.T
         return np.stack(self.distort(x, y, z) if self.is_wide else self.distort(x / z, y / z), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the normalized coordinates of pixels by Newton's method; NaN where it does not converge."""
-        fx, fy, cx, cy, rest = self._split
+        """Convert pixel coordinates to normalized coordinates by Newton's method; NaN where it does not converge."""
+        fx, fy, cx, cy, coefficients = self._split
         distortion = MODELS[self.model][1]
-        goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
-        point, active = goal.copy(), np.arange(x.size)
+        target = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
+        point, active = target.copy(), np.arange(x.size)
         with np.errstate(all="ignore"):
             for _ in range(MAX_ROUNDS):
                 previous = point[:, active]
-                point[:, active] = current = _newton_step(distortion, rest, previous, goal[:, active])
-                # a point whose bits did not change will never change
+                point[:, active] = current = _newton_step(distortion, coefficients, previous, target[:, active])
+                # a point whose bits did not change has converged
                 active = active[(previous.view(np.int64) != current.view(np.int64)).any(axis=0)]
                 if not active.size:
                     break
-            error = np.abs(np.stack(distortion(point[0], point[1], rest)) - goal)
+            error = np.abs(np.stack(distortion(point[0], point[1], coefficients)) - target)
             u, v = np.where((error < MAX_ERROR).all(axis=0), point, np.nan)
         return u.reshape(x.shape), v.reshape(x.shape)
 
@@ -346,9 +346,9 @@ class Lens:
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph, with the same focal lengths.
 
-        It shows the largest rectangle in which all pixels are defined.  With `whole`, it shows the smallest
-        rectangle that contains the photograph, up to 60 degrees to each side and twice the size.  Raises DataError when
-        there is no such rectangle.  For a wide photograph, it is the camera of the face.
+        Its image is the largest rectangle in which all pixels are defined.  With `whole`, it is the smallest rectangle
+        that contains the photograph, up to 60 degrees to each side and twice the size.  For a wide photograph, it is
+        the camera of the face.  Raises DataError if there is no such rectangle.
         """
         if self.is_wide:
             return self._face_camera()
@@ -375,7 +375,7 @@ class Lens:
         return DataError(f"the lens {self.model} {quote(self.params)} {fault}; calibrate the camera again")
 
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
+        """Undistort a photograph, [H, W, C], to the camera `pinhole`; the data type does not change."""
         if self.is_wide:
             return self._extract_face(pixels)
         undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -383,7 +383,7 @@ class Lens:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph covers: their rays distort into it and back."""
+        """Which pixels of `pinhole`, [H, W], the photograph covers: distortion maps their rays into it and back."""
         if self.is_wide:
             return np.concatenate([self._sees(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
@@ -394,7 +394,7 @@ class Lens:
 
 
 def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) -> tuple[Floats, Floats]:
-    """Return the normalized coordinates of samples x samples rays in each pixel of some rows, [H, W] each."""
+    """Return the normalized coordinates of `samples` x `samples` rays per pixel in some rows, [H, W] each."""
     x, y = ((np.arange(size * samples) + 0.5) / samples for size in (camera.width, camera.height))
     y = y[rows.start * samples : rows.stop * samples]
     u, v = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
@@ -402,37 +402,37 @@ def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) ->
 
 
 def _face_grid() -> tuple[Floats, Floats]:
-    """Return the normalized coordinates of FACE_GRID x FACE_GRID points of a face."""
+    """Return the normalized coordinates of an even grid of points on a face, [FACE_GRID, FACE_GRID] each."""
     positions = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
     u, v = np.meshgrid(positions, positions)
     return u, v
 
 
 def panorama_lens(width: int, height: int) -> Lens:
-    """Return the lens of a panorama that covers the sphere; the middle of the image is forward, its top is up."""
+    """Return the lens of a panorama of the full sphere; the center of the image is forward, its top is up."""
     return Lens(width, height, "EQUIRECTANGULAR", (width / math.tau, height / math.pi, width / 2, height / 2))
 
 
-def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
-    """Return the points, [2, M], after one step of Newton's method toward those that distort to `goal`."""
-    step, (u, v) = 1e-7, point
-    a, b = distortion(u, v, k)
-    au, bu = distortion(u + step, v, k)
-    av, bv = distortion(u, v + step, k)
-    j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
+def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, target: Floats) -> Floats:
+    """Return points, [2, M], after one step of Newton's method toward the points that are distorted to `target`."""
+    h, (u, v) = 1e-7, point
+    x, y = distortion(u, v, k)
+    xu, yu = distortion(u + h, v, k)
+    xv, yv = distortion(u, v + h, k)
+    j00, j10, j01, j11 = (xu - x) / h, (yu - y) / h, (xv - x) / h, (yv - y) / h
     det = j00 * j11 - j01 * j10
-    da, db = goal[0] - a, goal[1] - b
-    return np.stack([u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det])
+    dx, dy = target[0] - x, target[1] - y
+    return np.stack([u + (j11 * dx - j01 * dy) / det, v + (j00 * dy - j10 * dx) / det])
 
 
 @lru_cache(maxsize=2)  # for portrait and landscape photographs of a phone; 8 bytes per pixel each
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the position in the photograph of each pixel of `pinhole`, [H, W] each, for OpenCV's integer centers."""
+    """Return the x and y maps of cv2.remap, [H, W] each: the position of each pixel of `pinhole` in the photograph."""
     x, y = lens.distort(*_rays(lens.pinhole))
-    return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
+    return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV has pixel centers at integers
 
 
 @lru_cache(maxsize=64)
 def intern_lens(lens: Lens) -> Lens:
-    """Return the first lens that equals this one, so that views share its slow properties `pinhole` and `shown`."""
+    """Return the first lens that equals `lens`, so that views share its expensive properties `pinhole` and `shown`."""
     return lens

@@ -1,4 +1,4 @@
-"""Files of cameras for other programs: COLMAP, nerfstudio and INRIA, read and written."""
+"""Write cameras for other programs (COLMAP, nerfstudio, and INRIA's 3DGS), and read the cameras of INRIA's 3DGS."""
 
 import json
 import logging
@@ -32,29 +32,29 @@ def with_image_names(scene: Scene) -> Scene:
     Raises DataError for duplicate names and for names that are not one line of text.
     """
     names = []
-    for view in scene.views:  # with the suffix of the file, which some formats leave out
+    for view in scene.views:  # some formats leave out the suffix of the file
         has_suffix = is_image(PurePosixPath(view.name)) or view.image_path == NO_FILE
         names.append(view.name if has_suffix else f"{view.name}{view.image_path.suffix}")
     if all(name.startswith(f"{IMAGES}/") for name in names):
         names = [name.removeprefix(f"{IMAGES}/") for name in names]
-    seen: set[str] = set()
+    previous_names: set[str] = set()
     for name in names:
         if not name.isprintable() or name != name.strip():
             raise DataError(f"{scene.path}: an image is called {quote(name)}; expected a name in one line of text")
-        if name in seen:
+        if name in previous_names:
             raise DataError(f"{scene.path}: two images would be called {quote(name)}; rename one")
-        seen.add(name)
+        previous_names.add(name)
     return scene.renamed(names)
 
 
 def image_files(views: Sequence[View], folder: Path) -> dict[Path, Path]:
-    """Return the photograph of each view, by its path below `folder`.  Raises DataError without a photograph."""
+    """Return the photograph of each view by its path in `folder`.  Raises DataError for a view without one."""
     for view in views:
         if view.image_path == NO_FILE:
-            raise DataError(f"the view {quote(view.name)} has no photograph to copy; write only the cameras")
+            raise DataError(f"the view {quote(view.name)} has no photo to copy; write only the cameras")
         if view.lens is not None and view.lens.is_wide:
             raise DataError(
-                f"the view {quote(view.name)} is part of a wide photograph; run `clsplat data undistort` first, "
+                f"the view {quote(view.name)} is part of a wide photo; run `clsplat data undistort` first, "
                 "or write only the cameras"
             )
     return {folder / view.name: view.image_path for view in views}
@@ -67,13 +67,13 @@ LOG = logging.getLogger("clsplat")
 INRIA_FILE = "cameras.json"
 MAX_BYTES = 1 << 27
 MAX_VIEWS = 100_000
-TOLERANCE = 0.5  # px: a smaller difference is only a convention about pixel centers
+TOLERANCE = 0.5  # px: smaller offsets come from different conventions for pixel centers
 
 
 def write_inria(out: Path, scene: Scene) -> list[Path]:
-    """Write out/cameras.json, which does not hold points and tracks, and return its path.  Raises OutputError.
+    """Write out/cameras.json, without points and tracks, and return its path in a list.  Raises OutputError.
 
-    Warns if the principal point is not in the center of the image, where other programs assume it.
+    Warns if a principal point is not at the center of the image, where other programs assume it.
     """
     write_text(out / INRIA_FILE, json.dumps([_camera(view, i) for i, view in enumerate(scene.views)], indent=1) + "\n")
     cameras = [view.camera for view in scene.views]
@@ -105,12 +105,12 @@ def _camera(view: View, number: int) -> dict[str, Any]:
 def read_inria(path: Path) -> list[View]:
     """Return the views of a cameras.json, without photographs.
 
-    Raises DataError for another file and for damaged numbers.
+    Raises DataError if the file has another format, or if its values are invalid.
     """
-    table = read_json(path, "a cameras.json of 3DGS", limit=MAX_BYTES)
-    if not isinstance(table, list) or not 1 <= len(table) <= MAX_VIEWS or not all(isinstance(v, dict) for v in table):
+    rows = read_json(path, "a cameras.json of 3DGS", limit=MAX_BYTES)
+    if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIEWS or not all(isinstance(row, dict) for row in rows):
         raise DataError(f"{path}: expected a list of 1 to {MAX_VIEWS} cameras, as 3DGS writes it")
-    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", frame), i) for i, frame in enumerate(table)]
+    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", row), i) for i, row in enumerate(rows)]
 
 
 def _view(frame: JsonFrame, number: int) -> View:
@@ -140,7 +140,7 @@ def _array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
 
 # nerfstudio's transforms.json, with points3d.ply next to it.
 
-DISTORTION = {  # by COLMAP's model: nerfstudio's model, and the names of the distortion parameters
+DISTORTION = {  # for each of COLMAP's models: nerfstudio's model, and the names of the distortion parameters
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
     "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
@@ -155,9 +155,9 @@ REMEDY = "write colmap, or run `clsplat data undistort` first"
 
 
 def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
-    """Write out/transforms.json, and the points, if any, without tracks; return the files.
+    """Write out/transforms.json and, if there are any, the points without their tracks; return the paths.
 
-    The test views are listed as validation views, too, because nerfstudio evaluates those.  Raises OutputError.
+    The test views are also listed as validation views, because nerfstudio evaluates those.  Raises OutputError.
     """
     lenses = [_lens(view) for view in scene.views]
     model, common = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
@@ -209,37 +209,37 @@ WRITERS: dict[str, Callable[[Path, Scene], list[Path]]] = {
     "nerfstudio": write_nerfstudio,
     "inria": write_inria,
 }
-OUTPUTS = {  # files that each writes
+OUTPUTS = {  # the files of each format
     "colmap": [MODEL / name for name in FILES],
     "nerfstudio": [Path(TRANSFORMS_FILE), Path(POINTS)],
     "inria": [Path(INRIA_FILE)],
 }
-UNDISTORTED = ("inria",)  # formats of cameras without lenses
+UNDISTORTED = ("inria",)  # formats without lens distortion
 COPIES = ("none", "copy")  # of the photographs
 SPLIT = "nerfstudio"  # the format that stores the split and times
-TRACKS = "colmap"  # the format that stores which points the photographs show
+TRACKS = "colmap"  # the format that stores which points each photograph shows
 
 
 def check_cameras(scene: Scene, format_: str) -> Scene:
-    """Return the scene with views named like their images.  Raises DataError for one that the format cannot hold."""
-    named, models = with_image_names(scene), dict[str, str]()
+    """Return the scene with views named like their images.  Raises DataError if the format cannot represent it."""
+    named, view_by_model = with_image_names(scene), dict[str, str]()
     for view in named.views if format_ == "nerfstudio" else ():
         if (model := photo_lens(view).model) not in DISTORTION:
             raise DataError(f"{view.name}: nerfstudio has no camera model {model}; {REMEDY}")
-        models[DISTORTION[model][0]] = view.name
-    if len(models) > 1:
-        model, name = models.popitem()
-        raise DataError(
-            f"{name}: is {model}, other views are {next(iter(models))}; nerfstudio allows one model per file; {REMEDY}"
-        )
+        view_by_model[DISTORTION[model][0]] = view.name
+    if len(view_by_model) > 1:
+        model, name = view_by_model.popitem()
+        first = next(iter(view_by_model))
+        raise DataError(f"{name}: is {model}, other views are {first}; nerfstudio allows one model per file; {REMEDY}")
     return named
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", overwrite: bool = False) -> list[Path]:
     """Write the cameras of a scene and, with `images="copy"`, copies of the photographs and their exposures.
 
-    Returns the camera files.  The views have the size of the dataset.  overwrite: whether to replace existing files.
-    Raises ConfigError for an unknown format and for an existing file, DataError if the format cannot hold the scene.
+    Returns the paths of the camera files.  The scene must not be downscaled.  overwrite: whether to replace existing
+    files.  Raises ConfigError for an unknown format and for an existing file, and DataError if the format cannot
+    represent the scene.
     """
     for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in choices:
@@ -248,7 +248,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     named = check_cameras(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(view.lens is not None for view in scene.views):
         raise DataError(
-            f"{scene.path}: {format_} has no lens distortion, and these photographs are distorted; "
+            f"{scene.path}: {format_} has no lens distortion, and these photos are distorted; "
             "run `clsplat data undistort` first, or write only the cameras"
         )
     copies = image_files(named.views, out / IMAGES) if images == "copy" else {}
@@ -263,11 +263,11 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     if format_ != SPLIT and any(view.time is not None for view in scene.views):
         LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT)
     if format_ != TRACKS and copies and scene.tracks is not None:
-        LOG.warning("%s: %s does not store which points the photographs show; %s does", out, format_, TRACKS)
-    for path, source in counted(copies.items(), "photographs copied", len(copies)):
-        with open_file(source, "an image") as old, open_atomic(path) as new:
-            shutil.copyfileobj(old, new)
+        LOG.warning("%s: %s does not store which points the photos show; %s does", out, format_, TRACKS)
+    for path, source in counted(copies.items(), "photos copied", len(copies)):
+        with open_file(source, "an image") as src, open_atomic(path) as dst:
+            shutil.copyfileobj(src, dst)
     if copies:
-        exposures = load_exposures(scene.views)  # found by the names in the dataset
+        exposures = load_exposures(scene.views)  # looked up by the names in the dataset
         write_exposures(out / IMAGES, dict(zip((view.name for view in named.views), exposures, strict=True)))
     return files

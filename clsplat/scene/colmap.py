@@ -40,7 +40,7 @@ REMEDY = "copy or export the model again"
 
 
 class CameraRecord(NamedTuple):
-    """A camera; `source` is its position in the file, for messages."""
+    """A camera with its size in pixels and its parameters; `source` is its position in the file, for messages."""
 
     source: str
     model: str
@@ -50,9 +50,9 @@ class CameraRecord(NamedTuple):
 
 
 class ImageRecord(NamedTuple):
-    """An image: its name, camera id, and world-to-camera quaternion (w, x, y, z) and translation.
+    """An image with its name, camera ID, and pose: world-to-camera quaternion (w, x, y, z) and translation.
 
-    `points` are the ids of the 3D points that the image shows, [K], and `pixels` their positions, [K, 2] px.
+    `points` are the IDs of the 3D points that the image shows, [K], and `pixels` are their positions, [K, 2] px.
     """
 
     source: str
@@ -72,7 +72,7 @@ def parameter_count(source: str, model: str) -> int:
 
 
 def decode(source: str, data: bytes) -> str:
-    """Decode UTF-8.  Raises DataError, prefixed with `source`, for other bytes."""
+    """Decode UTF-8 text.  Raises DataError, with `source`, if the bytes are not UTF-8."""
     try:
         return data.decode()
     except UnicodeDecodeError as error:
@@ -85,20 +85,21 @@ LARGEST_ID = 2**63 - 1
 
 
 def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
-    """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
+    """Yield the ID and the record of each camera.  Raises DataError, like all functions here, for a damaged file."""
     for source, line in _lines(path):
         if line:
             layout = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-            words = line.split()
-            number, model, width, height = _convert(source, words[:4], (int, str, int, int), layout)
-            params = _convert(source, words[4:], [float] * parameter_count(source, model), f"the parameters of {model}")
-            yield number, CameraRecord(source, model, width, height, tuple(params))
+            fields = line.split()
+            camera_id, model, width, height = _convert(source, fields[:4], (int, str, int, int), layout)
+            types = [float] * parameter_count(source, model)
+            params = _convert(source, fields[4:], types, f"the parameters of {model}")
+            yield camera_id, CameraRecord(source, model, width, height, tuple(params))
 
 
 def images_text(path: Path) -> Iterator[ImageRecord]:
     """Yield the registered images, in the order of the file."""
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    kinds = (int, *[float] * 7, int, str)
+    types = (int, *[float] * 7, int, str)
     image: ImageRecord | None = None  # its points may follow on the next line
     for source, line in _lines(path):
         if image and _is_points2d(line):
@@ -108,7 +109,7 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
         elif line:
             if image:
                 yield image
-            _, *pose, camera, name = _convert(source, line.split(maxsplit=9), kinds, layout)
+            _, *pose, camera, name = _convert(source, line.split(maxsplit=9), types, layout)
             image = ImageRecord(source, name, camera, tuple(pose[:4]), tuple(pose[4:]))
     if image:
         yield image
@@ -116,38 +117,38 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
 
 def _is_points2d(line: str) -> bool:
     """Return whether a line is empty or lists 2D points, (X, Y, POINT3D_ID); some writers omit these lines."""
-    words = line.split()
-    return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
+    fields = line.split()
+    return len(fields) % 3 == 0 and (not fields or fields[-1].lstrip("-").isdecimal())
 
 
 def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the ids of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
-    words = line.split()
-    indices = [i for i in range(2, len(words), 3) if words[i].isdecimal()]
-    pixels = [(_number(words[i - 2]), _number(words[i - 1])) for i in indices]
-    return np.array([_id(words[i]) for i in indices], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+    """Return the IDs of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
+    fields = line.split()
+    indices = [i for i in range(2, len(fields), 3) if fields[i].isdecimal()]
+    pixels = [(_coordinate(fields[i - 2]), _coordinate(fields[i - 1])) for i in indices]
+    return np.array([_point_id(fields[i]) for i in indices], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
 
 
-def _number(word: str) -> float:
-    """Return a coordinate of a 2D point; NaN if it is not a number, since only reprojection errors need it."""
+def _coordinate(text: str) -> float:
+    """Parse a coordinate of a 2D point; NaN if it is not a number, since only reprojection errors need it."""
     try:
-        return float(word)
+        return float(text)
     except ValueError:
         return math.nan
 
 
 def points_text(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
-    kinds = (_id, float, float, float, _byte, _byte, _byte, float)
+    types = (_point_id, float, float, float, _byte, _byte, _byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-    rows = [_convert(source, line.split(maxsplit=8)[:8], kinds, layout) for source, line in _lines(path) if line]
+    rows = [_convert(source, line.split(maxsplit=8)[:8], types, layout) for source, line in _lines(path) if line]
     table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
     ids = np.array([row[0] for row in rows], np.int64).reshape(-1)
     return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6], ids)
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield the position and the text of every line that is not a comment."""
+    """Yield the position, for messages, and the text of each line that is not a comment."""
     text = decode(str(path), read_file(path)).lstrip("\ufeff")
     require_content(path, text.encode() or b"#")  # a file without points may be empty
     for number, line in enumerate(map(str.strip, text.split("\n")), start=1):
@@ -155,25 +156,25 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
             yield f"{path}: line {number}", line
 
 
-def _convert(source: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
-    """Convert each word to its kind.  Raises DataError with the line."""
-    if len(words) != len(kinds):
-        raise DataError(f"{source}: expected {layout}, found {len(words)} of {len(kinds)} words; {REMEDY}")
+def _convert(source: str, fields: list[str], types: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
+    """Convert the fields of a line to their types.  Raises DataError, with `source` and `layout`, if that fails."""
+    if len(fields) != len(types):
+        raise DataError(f"{source}: expected {layout}, found {len(fields)} of {len(types)} values; {REMEDY}")
     try:
-        return [kind(word) for kind, word in zip(kinds, words, strict=True)]
+        return [convert(field) for convert, field in zip(types, fields, strict=True)]
     except ValueError as error:
         raise DataError(f"{source}: {shorten(str(error))}; expected {layout}: remove that entry or {REMEDY}") from error
 
 
-def _id(word: str) -> int:
-    """Return the id of a point, clamped to the ids that COLMAP uses; -1: none."""
-    return min(max(int(word), -1), LARGEST_ID)
+def _point_id(text: str) -> int:
+    """Parse the ID of a point, clamped to the range that COLMAP uses; -1: no point."""
+    return min(max(int(text), -1), LARGEST_ID)
 
 
-def _byte(word: str) -> int:
-    if not 0 <= int(word) <= 255:
-        raise ValueError(f"color {word} is not in 0..255")
-    return int(word)
+def _byte(text: str) -> int:
+    if not 0 <= int(text) <= 255:
+        raise ValueError(f"color {text} is not in 0..255")
+    return int(text)
 
 
 # Read the binary files of a COLMAP model; every number is checked against the end of the file.
@@ -183,11 +184,11 @@ POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("rgb", "u1", 3), ("err
 
 
 class _Binary:
-    """A reader of binary files that checks that bytes exist before it reads them."""
+    """A reader of binary values.  Raises DataError if the file ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.offset = path, read_file(path), 0
-        require_content(path, self.data or b"#")  # `skip` says what an empty file lacks
+        require_content(path, self.data or b"#")  # `skip` reports what an empty file lacks
 
     @property
     def source(self) -> str:
@@ -195,7 +196,7 @@ class _Binary:
         return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, label: str) -> int:
-        """Skip `size` bytes and return the offset of the first."""
+        """Skip `size` bytes and return the offset of the first; `label` describes them in messages."""
         available = len(self.data) - self.offset
         if size > available:
             raise DataError(
@@ -208,7 +209,7 @@ class _Binary:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), label))
 
     def count(self, stride: int, label: str) -> int:
-        """Read the number of records, and check that this many records of at least `stride` bytes can follow."""
+        """Read the number of records, and check that the file has room for them, of at least `stride` bytes each."""
         (count,) = self.read("<Q", f"the number of {label}")
         self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
@@ -227,14 +228,14 @@ class _Binary:
 
 
 def cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
-    """Yield ids and cameras.  Raises DataError, like all functions here, if the file is damaged."""
+    """Yield the ID and the record of each camera.  Raises DataError, like all functions here, for a damaged file."""
     file = _Binary(path)
     for _ in range(file.count(24, "cameras")):
         source = file.source
-        number, model, width, height = file.read("<IiQQ", "a camera")
+        camera_id, model, width, height = file.read("<IiQQ", "a camera")
         name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
         params = file.read(f"<{parameter_count(source, name)}d", "camera parameters")
-        yield number, CameraRecord(source, name, width, height, params)
+        yield camera_id, CameraRecord(source, name, width, height, params)
     file.finish()
 
 
@@ -278,13 +279,13 @@ def find_file(folder: Path, stem: str) -> Path | None:
 
 
 def read_cameras(folder: Path) -> dict[int, CameraRecord]:
-    """Return the cameras of a model by id.  Raises DataError, like all functions here, for a damaged file."""
+    """Return the cameras of a model by ID.  Raises DataError, like all functions here, for a damaged file."""
     file = _require_file(folder, "cameras")
     cameras: dict[int, CameraRecord] = {}
-    for number, camera in cameras_binary(file) if file.suffix == ".bin" else cameras_text(file):
-        if number in cameras:
-            raise DataError(f"{camera.source}: a second camera {number}; expected different ids: {REMEDY}")
-        cameras[number] = camera
+    for camera_id, camera in cameras_binary(file) if file.suffix == ".bin" else cameras_text(file):
+        if camera_id in cameras:
+            raise DataError(f"{camera.source}: a second camera {camera_id}; expected different ids: {REMEDY}")
+        cameras[camera_id] = camera
     return cameras
 
 
@@ -295,7 +296,7 @@ def read_images(folder: Path) -> list[ImageRecord]:
 
 
 def read_point_table(folder: Path) -> PointTable | None:
-    """Return the points of a model with their reprojection errors, or None if the model has no such file."""
+    """Return the points of a model with their reprojection errors, or None if the model has no file of points."""
     file = find_file(folder, "points3D")
     if file is None:
         return None
@@ -317,8 +318,8 @@ class ColmapReader(Reader):
 
     If there are several models, the one with the most images is used.  Every `holdout`-th view by name is a test view.
     Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may contain masks,
-    named like the images, with .png appended or as the suffix.  With a file `images/times.json` that gives each image a
-    time, the scene is dynamic.
+    named like the images, with .png appended or as the suffix.  With a file `images/times.json` that lists the time of
+    each image, the scene is dynamic.
     """
 
     name = "COLMAP"
@@ -331,11 +332,11 @@ class ColmapReader(Reader):
         model, images = _largest_model(path)
         cameras = read_cameras(model)
         images, files, masks = self._files(path, images)
-        views = [make_view(*row) for row in zip(images, repeat(cameras), files.paths, masks, strict=False)]
+        views = [make_view(*args) for args in zip(images, repeat(cameras), files.paths, masks, strict=False)]
         views = sorted((views[i] for i in files.existing_indices(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
-        original = [view for view in views if view.image_path not in files.downscaled_files]
-        points, tracks = (table.cloud(), make_tracks(images, table, original)) if table else (None, None)
+        full_size = [view for view in views if view.image_path not in files.downscaled_files]
+        points, tracks = (table.cloud(), make_tracks(images, table, full_size)) if table else (None, None)
         views = [fit_to_photograph(view) if view.image_path in files.downscaled_files else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         tracks = tracks and tracks.shifted(scene.origin).split_by_face(scene.views)
@@ -358,7 +359,7 @@ class ColmapReader(Reader):
                 parts.observed[view.name] = len(image.points)
 
     def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
-        """Return images with the names of their files, the files, and masks."""
+        """Return the images, renamed like their files, and the files and masks of the images."""
         folder = image_folder(path, self.root)
         root = self.root if self.root and folder.is_relative_to(self.root) else folder.parent
         files = FileLookup(root, folder, [image.name for image in images])
@@ -375,28 +376,28 @@ def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
 
 def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
     """Return which points each image shows, with reprojection residuals for `views`; None if no image lists points."""
-    finite = table.is_finite()
-    positions, ids = table.positions[finite], table.ids[finite]
+    is_finite = table.is_finite()
+    positions, ids = table.positions[is_finite], table.ids[is_finite]
     order = np.argsort(ids, kind="stable")
-    seen, residuals, by_name = {}, {}, {view.name: view for view in views}
+    rows_of, residuals, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
-        ids2, first = np.unique(image.points, return_index=True)
-        nearest = np.minimum(np.searchsorted(ids[order], ids2), max(len(ids) - 1, 0))
-        is_match = ids[order][nearest] == ids2 if len(ids) else np.zeros(len(ids2), bool)
-        rows = seen[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
+        image_ids, first = np.unique(image.points, return_index=True)
+        nearest = np.minimum(np.searchsorted(ids[order], image_ids), max(len(ids) - 1, 0))
+        is_match = ids[order][nearest] == image_ids if len(ids) else np.zeros(len(image_ids), bool)
+        rows = rows_of[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
         view = by_name.get(image.name)
         if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
             residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[is_match]])
-    return Tracks(positions, seen, residuals) if any(map(len, seen.values())) else None
+    return Tracks(positions, rows_of, residuals) if any(map(len, rows_of.values())) else None
 
 
 def find_models(path: Path) -> list[Path]:
     """Return `path` and folders below it that contain a COLMAP model, sorted by name."""
     sparse = path / "sparse"
     folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
-    files = {folder: sum(find_file(folder, stem) is not None for stem in ("cameras", "images")) for folder in folders}
-    complete = [folder for folder, count in files.items() if count == 2]
-    return complete or [folder for folder, count in files.items() if count == 1 and find_file(folder, "points3D")]
+    counts = {folder: sum(find_file(folder, stem) is not None for stem in ("cameras", "images")) for folder in folders}
+    complete = [folder for folder, count in counts.items() if count == 2]
+    return complete or [folder for folder, count in counts.items() if count == 1 and find_file(folder, "points3D")]
 
 
 def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
@@ -412,7 +413,7 @@ def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
 def image_folder(path: Path, root: Path | None = None) -> Path:
     """Return `images` next to `sparse` if `path` is `sparse` or one of its models, otherwise `images` in `path`.
 
-    Without that folder, return the first `images` above it that is not above `root`.
+    If that folder does not exist, return the nearest `images` in a parent folder, up to `root`.
     """
     folder = next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path)
     folders = [folder, *(parent for parent in folder.parents if root and parent.is_relative_to(root))]
@@ -439,36 +440,36 @@ def make_view(
     return View(image.name, camera, pose, file, mask, lens=distortion)
 
 
-def _lens(number: int, camera: CameraRecord) -> Lens:
-    """Return the lens of a camera.  Raises DataError for invalid numbers."""
-    sizes, focals = (camera.width, camera.height), camera.params[: LENS_MODELS[camera.model][0]]
-    is_valid = min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(focals) >= MIN_FOCAL
+def _lens(camera_id: int, camera: CameraRecord) -> Lens:
+    """Return the lens of a camera.  Raises DataError for an invalid size or parameter."""
+    size, focals = (camera.width, camera.height), camera.params[: LENS_MODELS[camera.model][0]]
+    is_valid = min(size) > 0 and max(size) <= MAX_SIDE and min(focals) >= MIN_FOCAL
     if not is_valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
-            f"{camera.source}: camera {number} is {camera.width}x{camera.height} with parameters "
+            f"{camera.source}: camera {camera_id} is {camera.width}x{camera.height} with parameters "
             f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths of "
             f"at least {MIN_FOCAL:g}, and finite numbers: {REMEDY}"
         )
     if camera.model != "EQUIRECTANGULAR":
         return Lens(camera.width, camera.height, camera.model, camera.params)
-    if camera.params != sizes:
+    if camera.params != size:
         raise DataError(
-            f"{camera.source}: camera {number} is EQUIRECTANGULAR with parameters {quote(camera.params)}; expected the "
-            f"size of its images, {camera.width}, {camera.height}: {REMEDY}"
+            f"{camera.source}: camera {camera_id} is EQUIRECTANGULAR with parameters {quote(camera.params)}; expected "
+            f"the size of its images, {camera.width}, {camera.height}: {REMEDY}"
         )
-    return panorama_lens(*sizes)
+    return panorama_lens(*size)
 
 
 def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> NDArray[np.float64]:
-    """Return the pose [3, 4] of a quaternion, of any nonzero length, and a translation in scene units.
+    """Return the pose, [3, 4], of a quaternion (w, x, y, z) of any nonzero length and a translation, scene units.
 
-    Raises ValueError if numbers are missing or not finite, or the quaternion is zero.
+    Raises ValueError if values are missing or not finite, or if the quaternion is zero.
     """
     length = math.hypot(*quaternion)
     sizes = len(quaternion), len(translation)
-    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
+    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(value) < MAX_VALUE for value in translation):
         raise ValueError(
             f"quaternion {quote(tuple(quaternion))}, translation {quote(tuple(translation))}; "
             "expected finite numbers and a rotation"
         )
-    return np.column_stack([rotation_matrix(*(part / length for part in quaternion)), translation])
+    return np.column_stack([rotation_matrix(*(value / length for value in quaternion)), translation])

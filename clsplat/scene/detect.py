@@ -27,7 +27,7 @@ def readers() -> list[Reader]:
     """
 
     def rank(kind: type[Reader]) -> int:
-        """Return the rank of a shipped reader or of its subclass; other readers come last."""
+        """Return the rank of a shipped reader or a subclass of it; other readers come last."""
         return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(kind, shipped)), len(PRECEDENCE))
 
     by_name: dict[str, Reader] = {}
@@ -41,23 +41,23 @@ def readers() -> list[Reader]:
 
 
 def format_names() -> str:
-    """Return the names of all formats in the form `A, B or C`."""
+    """Return the names of all dataset formats in one phrase, as `A, B or C`."""
     *names, last = (reader.name for reader in readers())
     return f"{', '.join(names)} or {last}"
 
 
 def find_reader(path: Path) -> Reader | None:
-    """Return the first reader that matches the dataset in a folder, or None."""
+    """Return the first reader that matches the dataset in a folder, or None if there is none."""
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
-MAX_DEPTH = 2  # folders between a scene and the dataset in it
-DEEPEST = 4  # if there is none up to MAX_DEPTH
+MAX_DEPTH = 2  # levels of folders below a scene in which its dataset may be
+DEEPEST = 4  # levels to search if there is none up to MAX_DEPTH
 logger = logging.getLogger("clsplat")
 
 
 def find_datasets(path: Path) -> list[Reader]:
-    """Return the reader of the dataset in a folder, otherwise of all datasets one or two levels below, or deeper."""
+    """Return the reader of the dataset in a folder, otherwise the readers of all datasets in its subfolders."""
     return _find_datasets(path, MAX_DEPTH) or _find_datasets(path, DEEPEST)
 
 
@@ -73,36 +73,36 @@ def _find_datasets(path: Path, depth: int) -> list[Reader]:
 
 
 def find_dataset(path: Path) -> Reader | None:
-    """Return the reader of the dataset in a folder, or of the only one below it; None without a dataset.
+    """Return the reader of the dataset in a folder, or of the only dataset in its subfolders; None if there is none.
 
-    If several COLMAP models have the same photographs, the one with the image files is used, otherwise the largest (the
-    first by name in a tie).  Raises DataError, with a list, for several datasets.
+    If there are several models of the same photographs, the one with the image files is used, otherwise the largest
+    (the first by name in a tie).  Raises DataError, with a list, for several datasets.
     """
     datasets = find_datasets(path)
     if len(datasets) < 2:
         return datasets[0] if datasets else None
     names = [_image_names(reader.folder) for reader in datasets]
-    has_photographs = [
+    has_images = [
         any(is_image(Path(name)) for _, files in walk_folders(reader.folder, MAX_DEPTH) for name in files)
         for reader in datasets
     ]
-    best = max(range(len(datasets)), key=lambda i: (has_photographs[i], len(names[i])))
-    if sum(has_photographs) > 1 or not all(names[i] & names[best] for i in range(len(names))):
+    best = max(range(len(datasets)), key=lambda i: (has_images[i], len(names[i])))
+    if sum(has_images) > 1 or not all(names[i] & names[best] for i in range(len(names))):
         candidates = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
         raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {candidates}; give one of these")
-    datasets[best].choice = f", of {len(datasets)} models of these photographs"
+    datasets[best].choice = f", of {len(datasets)} models of these photos"
     return datasets[best]
 
 
 def _image_names(folder: Path) -> set[str]:
-    """Return the names of the images of a COLMAP dataset without folder and suffix; empty if it is damaged."""
+    """Return the names of the images of a COLMAP dataset, without folders and suffixes; empty if it is damaged."""
     with suppress(DataError):
         return {PureWindowsPath(image.name).stem for model in find_models(folder) for image in read_images(model)}
     return set()
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a folder holds a dataset in a format that read_scene can read."""
+    """Return whether a folder contains a dataset in a format that read_scene can read."""
     return bool(find_datasets(path))
 
 
@@ -130,6 +130,6 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {parent}: give that folder" if parent else remedy
-        raise DataError(f"{path}: photographs without cameras; {remedy}{unread}")
+        raise DataError(f"{path}: photos without cameras; {remedy}{unread}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {formats}{unread}")

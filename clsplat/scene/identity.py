@@ -1,4 +1,4 @@
-"""Identify a scene by hashes of its photographs, masks, cameras and points, independent of its folder."""
+"""Identify a scene, independently of its folder, by hashes of its photographs, masks, cameras and points."""
 
 import hashlib
 import json
@@ -27,30 +27,30 @@ from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene before training, so that damaged files are found early.
 
-MAX_THREADS = 8  # each has one photograph in memory
-MAX_CACHE_BYTES = 1 << 24  # bytes: about 200 000 photographs
+MAX_THREADS = 8  # each keeps one photograph in memory
+MAX_CACHE_BYTES = 1 << 24  # about 200 000 photographs
 MAX_NAMES = 3  # in a message
-Entry = tuple[int, int, int]  # width and height, px, and bits: blank, excludes every pixel as a mask, transparent
+Entry = tuple[int, int, int]  # width, height, and flags as bits: is blank, excludes every pixel as a mask, transparent
 
 
 @dataclass
 class ImageFile:
     """The result of decoding an image file."""
 
-    digest: str = ""  # SHA-256 of its content; "" if it cannot be read
-    size: Size | None = None  # as stored; None if it cannot be decoded
+    digest: str = ""  # SHA-256 of the content; "" if the file cannot be read
+    size: Size | None = None  # as stored; None if the file cannot be decoded
     orientation: int = 1  # from EXIF; 1: upright
-    cut: bool = False  # its end is missing
+    cut: bool = False  # whether the end of the file is missing
     fault: str = ""  # the error that training would report
-    blank: bool = False  # as a photograph: black, of a single color, or transparent
-    excluded: bool = False  # as a mask: it excludes every pixel
-    transparent: bool = False
+    blank: bool = False  # whether the image is black, of a single color, or transparent
+    excluded: bool = False  # whether the image, as a mask, excludes every pixel
+    transparent: bool = False  # whether the alpha channel excludes every pixel
 
 
 def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
-    """Decode the photographs and masks of views, and check that their sizes match the cameras, as load_image does.
+    """Decode the photographs and masks of views in threads, and check their sizes against the cameras, as load_image.
 
-    Files are read in threads; files shared by several views are read once.  Views without a photograph are skipped.
+    Returns the result for each file; a file that several views share is read once.  Views without files are skipped.
     """
     users: dict[Path, list[View]] = defaultdict(list)
     for view in views:
@@ -58,7 +58,7 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
             if file is not None and file != NO_FILE:
                 users[file].append(view)
     files = {file: ImageFile() for file in users}
-    cache, count = DecodedSizes(), Count("photographs decoded", len(users))
+    cache, count = DecodedSizes(), Count("photos decoded", len(users))
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "decoding")
     try:
         futures = [pool.submit(_examine, file, users[file], files[file], cache) for file in users]
@@ -72,7 +72,7 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
 
 
 def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
-    """Raise DataError if training cannot use image files of the scene at `path`."""
+    """Raise DataError if some image files of the scene at `path` cannot be used for training."""
     damaged = {file: result.fault.removeprefix(f"{file}: ") for file, result in files.items() if result.fault}
     if damaged:
         examples = "; ".join(f"{file} ({fault})" for file, fault in list(damaged.items())[:MAX_NAMES])
@@ -83,19 +83,19 @@ def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
 def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:
     """Return the names of the views with blank photographs.
 
-    Raises DataError, as training would, if all are blank or if a mask excludes every pixel of a photograph.
+    Raises DataError, as training would, if all photographs are blank or a mask excludes every pixel of one.
     """
     masked = [view for view in views if _is_excluded(view, files)]
     if masked:
         examples = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
         raise DataError(
-            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photograph')}: {examples}; masks are white "
-            "(255) in pixels to use: correct them, or remove these photographs"
+            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photo')}: {examples}; masks are white "
+            "(255) in pixels to use: correct them, or remove these photos"
         )
     blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
     if blank and len(blank) == len(views):
         raise DataError(
-            f"{path}: no photograph shows anything: {first_few(blank)} are black, of a single color, or transparent; "
+            f"{path}: no photo shows anything: {first_few(blank)} are black, of a single color, or transparent; "
             "export them again"
         )
     return blank
@@ -121,64 +121,65 @@ def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSi
 
 
 class DecodedSizes:
-    """A cache of the sizes and contents of images that this version of the decoder has decoded, by content hash.
+    """A cache of the sizes and flags of images that this version of OpenCV has decoded, by the hash of their content.
 
     It is a text file in the user's cache folder; without a usable cache folder, all images are decoded.
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, Entry] = {}
+        self._entries: dict[str, Entry] = {}
         self._new: dict[str, Entry] = {}
         self.path: Path | None = None
         with suppress(DataError, OutputError):
             self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-contents.txt"
             lines = read_file(self.path, limit=MAX_CACHE_BYTES).splitlines(keepends=True)
-            self._known = dict(filter(None, map(_entry, lines)))
+            self._entries = dict(filter(None, map(_entry, lines)))
 
     def size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
-        """Return (width, height) of the content of `file`, decoding it if it is not cached.  Raises DataError."""
+        """Return (width, height) of an image file, px, and decode `data` if it is not cached.  Raises DataError."""
         key = f"{digest}-upright" if upright else digest
-        if key not in self._known:
+        if key not in self._entries:
             pixels = decode_image(data, file, upright)
             is_transparent = pixels.shape[2] == 4 and excludes_all(pixels[:, :, 3])
             flags = is_blank(pixels), excludes_all(pixels[:, :, 0]), is_transparent
             height, width = pixels.shape[:2]
-            self._known[key] = self._new[key] = width, height, sum(2**bit for bit, is_set in enumerate(flags) if is_set)
-        return self._known[key][:2]
+            self._entries[key] = self._new[key] = width, height, sum(2**i for i, is_set in enumerate(flags) if is_set)
+        return self._entries[key][:2]
 
     def contents(self, digest: str) -> tuple[bool, bool, bool]:
-        """Return whether a cached image is blank, excludes every pixel as a mask, and is transparent."""
-        bits = self._known[digest][2]
+        """Return three flags of a cached image: it is blank, excludes every pixel as a mask, and is transparent."""
+        bits = self._entries[digest][2]
         return bool(bits & 1), bool(bits & 2), bool(bits & 4)
 
     def save(self) -> None:
-        """Append the new sizes in one write, so that lines of several processes do not mix."""
+        """Append the new entries in one write, so that lines of several processes do not mix."""
         if self.path is None or not self._new:
             return
         lines = "".join(f"{key} {width} {height} {bits}\n" for key, (width, height, bits) in self._new.items())
         with suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            full = self.path.exists() and self.path.stat().st_size >= MAX_CACHE_BYTES
-            with self.path.open("wb" if full else "ab", buffering=0) as file:
+            is_full = self.path.exists() and self.path.stat().st_size >= MAX_CACHE_BYTES
+            with self.path.open("wb" if is_full else "ab", buffering=0) as file:
                 file.write(lines.encode())
 
 
 def _entry(line: bytes) -> tuple[str, Entry] | None:
-    """Return the key and the entry on a complete line, otherwise None."""
-    words = line.split()
-    if len(words) != 4 or not line.endswith(b"\n") or not re.fullmatch(rb"\d{1,7} \d{1,7} [0-7]", b" ".join(words[1:])):
+    """Return the key and the entry on a line of the cache file; None if the line is incomplete or damaged."""
+    fields = line.split()
+    is_complete = len(fields) == 4 and line.endswith(b"\n")
+    if not is_complete or not re.fullmatch(rb"\d{1,7} \d{1,7} [0-7]", b" ".join(fields[1:])):
         return None
-    return words[0].decode(errors="replace"), (int(words[1]), int(words[2]), int(words[3]))
+    return fields[0].decode(errors="replace"), (int(fields[1]), int(fields[2]), int(fields[3]))
 
 
-Row = dict[str, str]  # hashes of the photograph, mask and camera of a view ("" if missing); its time if it has one
+Row = dict[str, str]  # of a view: hashes of its photograph, mask, and camera ("" if missing), and its time, if any
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Hashes of the views, by split and name in the order of the scene, and of the points.
+    """Hashes of the points and of the views; views are grouped by split and ordered as in the scene.
 
-    Cameras and points are hashed as parsed, so rewriting a file with the same numbers changes nothing.
+    Cameras and points are hashed after parsing, so rewriting a file with the same values changes nothing.
     """
 
     train: dict[str, Row]
@@ -188,7 +189,7 @@ class Identity:
 
     @classmethod
     def from_scene(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
-        """Return the identity of a scene with decoded image files."""
+        """Return the identity of a scene; files: the results of `decode_all`."""
         train, test, fold = (
             {view.name: _row(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
         )
@@ -198,18 +199,18 @@ class Identity:
 
     @property
     def digest(self) -> str:
-        """One hash of everything that affects the bits of a run; the order of the test views does not."""
-        parts = [list(self.train.items()), sorted(self.test.items()), self.points]
-        parts += [list(self.validation.items())] if self.validation else []
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        """One hash of everything that affects the bits of a run, which the order of the test views does not."""
+        values = [list(self.train.items()), sorted(self.test.items()), self.points]
+        values += [list(self.validation.items())] if self.validation else []
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def changes(self, before: "Identity") -> list[str]:
-        """Return what changed, with counts and the first few names: 'the photographs of 2 views (…)'."""
+        """List the changes since `before`, with counts and the first few names: 'the photograph of 2 views (…)'."""
         changes = []
         old, new = before._rows, self._rows
-        for part in ("photograph", "mask", "camera", "time"):
-            names = [name for name in old if name in new and old[name].get(part) != new[name].get(part)]
-            changes += [f"the {part} of {_list_views(names)}"] if names else []
+        for key in ("photograph", "mask", "camera", "time"):
+            names = [name for name in old if name in new and old[name].get(key) != new[name].get(key)]
+            changes += [f"the {key} of {_list_views(names)}"] if names else []
         moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
         changes += [f"the split of {_list_views(moved)}"] if moved else []
@@ -232,7 +233,7 @@ class Identity:
 
     @classmethod
     def from_data(cls, data: Any) -> "Identity":
-        """Return the identity from the result of `data`.  Raises ValueError if it is damaged."""
+        """Restore an identity from the result of `data`.  Raises ValueError if it is damaged."""
         try:
             train, test, points = dict(data["train"]), dict(data["test"]), str(data["points"])
             identity = cls(train, test, points, dict(data["validation"]))
@@ -245,12 +246,12 @@ class Identity:
 
 def _row(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
     camera, lens = view.camera, view.lens
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, view.downscale]
+    values = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, view.downscale]
     distortion = [lens.model, lens.width, lens.height, lens.whole, *map(float, lens.params)] if lens else []
     return {
         "photograph": _photograph_digest(view, files),
         "mask": files[view.mask_path].digest if view.mask_path else "",
-        "camera": _hash(numbers, view.world_to_camera, *([origin] if origin.any() else []), text=repr(distortion)),
+        "camera": _hash(values, view.world_to_camera, *([origin] if origin.any() else []), text=repr(distortion)),
         **({} if view.time is None else {"time": repr(view.time)}),
     }
 
@@ -262,7 +263,7 @@ def _photograph_digest(view: View, files: Mapping[Path, ImageFile]) -> str:
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:
-    """Return a hash of arrays, as little-endian float64; -0 counts as 0."""
+    """Return the SHA-256 hash of a text and of arrays, converted to little-endian float64; -0 counts as 0."""
     state = hashlib.sha256(text.encode())
     for array in arrays:
         values = np.asarray(array, np.float64) + 0.0

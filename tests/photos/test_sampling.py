@@ -86,7 +86,7 @@ def masked_everywhere(source: Path, out: Path, name: str) -> Path:
 
 def test_fully_masked_photograph_is_refused_before_training(tiny_scene, tmp_path):
     scene = masked_everywhere(tiny_scene, tmp_path / "scene", "r_003")
-    with pytest.raises(DataError, match=r"masks exclude every pixel of 1 photograph: .*003") as error:
+    with pytest.raises(DataError, match=r"masks exclude every pixel of 1 photo: .*003") as error:
         train(scene, tmp_path / "run", "scene.alpha=mask")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists(), "before training"

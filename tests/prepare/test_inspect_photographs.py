@@ -193,7 +193,7 @@ def test_cameras_of_other_programs_are_reported(tmp_path, name, content, program
     expected = f"the cameras of {program} in {tmp_path / name} are not read; to use them, export COLMAP's format"
     assert texts(inspection, "warning")[1].startswith(expected)
     assert inspection.next_step
-    with pytest.raises(DataError, match=f"photographs without cameras; .*the cameras of {program}"):
+    with pytest.raises(DataError, match=f"photos without cameras; .*the cameras of {program}"):
         read_scene(tmp_path)
 
 

@@ -213,16 +213,16 @@ def test_listeners_receive_the_progress(scene):
     heard: list[tuple[str, int, int]] = []
     with progress.listening(lambda *what, seconds_left: heard.append(what)):
         decode_all(views(scene))
-    assert heard == [("photographs decoded", i, 10) for i in range(11)]
+    assert heard == [("photos decoded", i, 10) for i in range(11)]
 
 
 def test_progress_is_logged_periodically(scene, monkeypatch, caplog):
     caplog.set_level("INFO", "clsplat")
     decode_all(views(scene))
-    assert "photographs decoded" not in caplog.text
+    assert "photos decoded" not in caplog.text
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     decode_all(views(scene))
-    assert "photographs decoded: 10 of 10" in caplog.text
+    assert "photos decoded: 10 of 10" in caplog.text
 
 
 # ---- the same inputs

@@ -209,7 +209,7 @@ def test_unwritable_output_is_refused(scene_of, tmp_path):
     with pytest.raises(DataError, match="a name in one line of text"):
         clsplat.write_cameras(alone, tmp_path / "out")
     nameless = make_scene(tmp_path, [View("a", view.camera, view.world_to_camera)], set(), None)
-    with pytest.raises(DataError, match="has no photograph to copy"):
+    with pytest.raises(DataError, match="has no photo to copy"):
         clsplat.write_cameras(nameless, tmp_path / "out", images="copy")
     assert not (tmp_path / "out").exists()
 
@@ -273,7 +273,7 @@ def test_exposures_are_written_next_to_copied_images(form, scene_of, tmp_path, r
     prefix = "images/" if form == "nerfstudio" else ""
     assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
     assert (actual.tracks is None) == (form == "nerfstudio")
-    said = "nerfstudio does not store which points the photographs show; colmap does"
+    said = "nerfstudio does not store which points the photos show; colmap does"
     assert (said in caplog.text) == (form == "nerfstudio")
     clsplat.write_cameras(scene, tmp_path / "alone", form)
     assert not (tmp_path / "alone/images").exists()

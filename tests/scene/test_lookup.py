@@ -208,7 +208,7 @@ def test_largest_nested_model_of_equal_photographs_is_used(tmp_path: Path) -> No
     write_model(tmp_path / "colmap_a" / "0", small)
     write_model(tmp_path / "colmap_b", orbit(), "txt")
     write_model(tmp_path / "colmap_c" / "0", orbit())
-    note = "the COLMAP dataset in colmap_b is used, of 3 models of these photographs"
+    note = "the COLMAP dataset in colmap_b is used, of 3 models of these photos"
     assert Inspection.from_folder(tmp_path).facts.notes == [note]
     write_model(tmp_path / "colmap_c" / "0", replace(small, images=[ImageEntry("other.png")]))
     message = refusal(read_scene, tmp_path)

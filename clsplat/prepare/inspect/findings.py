@@ -309,7 +309,7 @@ class Inspection:
         facts = self.facts
         if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
             return None
-        elsewhere = facts.refusal.partition("photographs without cameras; the cameras are ")[2]
+        elsewhere = facts.refusal.partition("photos without cameras; the cameras are ")[2]
         command = f"`clsplat run photos --scene {shell_quote(facts.path)}`"
         return f"use the cameras {elsewhere}" if elsewhere else command
 
