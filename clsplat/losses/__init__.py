@@ -1,4 +1,4 @@
-"""Losses that compare images, and penalties on Gaussians.  Each module defines its own variants."""
+"""Losses on images, and penalties on Gaussians, one topic per module."""
 
 from clsplat.core.settings import import_modules
 

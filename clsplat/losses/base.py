@@ -22,7 +22,7 @@ class Comparison:
     """A render and its photograph, float planes [3, rows, stride], and the gradient that losses add to.
 
     Image and gradient have a fourth plane, the inverse depth, if a loss reads it.  Losses are means
-    over the whole image, masked or not, so that thresholds mean the same with and without a mask.
+    over the entire image, including masked pixels, so that thresholds mean the same with and without a mask.
     """
 
     workspace: Workspace
@@ -37,12 +37,12 @@ class Comparison:
 
     @property
     def values(self) -> int:
-        """Number of values in the image."""
+        """The number of values in the image."""
         return 3 * self.camera.width * self.camera.height
 
     @property
     def counted(self) -> int:
-        """Number of values in unmasked pixels; waits for the device if there is a mask."""
+        """The number of values in unmasked pixels; waits for the device if there is a mask."""
         return self.values if self.mask is None else 3 * int(self.mask.get().sum())
 
 
@@ -103,7 +103,7 @@ class ImageLoss(Loss):
     """Whether the loss compares the image with the photograph; training needs at least one such loss."""
 
     def reads(self, step: int) -> Content:
-        """Return the planes of the image that the loss needs at a global step: only colors, or a fourth plane too."""
+        """Return the planes of the image that the loss needs at a global step: colors, or colors and inverse depth."""
         return "color"
 
     @abstractmethod
@@ -123,15 +123,15 @@ class PenaltyInputs:
 
     @property
     def items(self) -> int:
-        """The number of work-items of a kernel whose item is LANES Gaussians."""
+        """The number of work-items of a kernel in which a work-item processes LANES Gaussians."""
         return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
 
     def sums(self, name: str) -> Array:
-        """Return an array for the sums of work-items, [items].  name: must be unique among the penalties of a step."""
+        """Return an array for one sum per work-item, [items].  name: must be unique among the penalties of a step."""
         return self.workspace.array(f"{name} sums", self.items)
 
     def arguments(self, parameter: str) -> dict[str, Any]:
-        """Return the arguments of a penalty's kernel by name: `<parameter>`, `grad_<parameter>`, and sizes."""
+        """Return the common arguments of penalty kernels: `<parameter>`, `grad_<parameter>`, and sizes."""
         return {
             "items": self.items,
             parameter: self.gaussians[parameter],
@@ -146,7 +146,7 @@ class Penalty(Loss):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that the penalty reads in addition to the parameters."""
+        """The tables of Gaussians that the penalty reads in addition to the parameters."""
         return set()
 
     @abstractmethod

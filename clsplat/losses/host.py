@@ -25,7 +25,7 @@ class HostLoss(ImageLoss):
     _function: HostFunction = PrivateAttr()
 
     def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Raise ConfigError for a weight that is not a schedule of nonnegative numbers."""
+        """Raises ConfigError if the weight is not a schedule of nonnegative numbers."""
         try:
             super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
         except ValidationError as error:
@@ -58,7 +58,7 @@ class HostLoss(ImageLoss):
         return LossValue(self.name, lambda: weight * value)
 
     def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        """Call the function; return its value and gradient.  Raises ValueError for any other result."""
+        """Call the function; return its value and gradient.  Raises ValueError if the result has another form."""
         result: Any = self._function(image, photograph)
         try:
             value, derivative = result

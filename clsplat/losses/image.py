@@ -110,7 +110,7 @@ def view_error(comparison: Comparison) -> Array:
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
     """Return the derivatives of the SSIM map, [3, 3, rows, stride], and the map's sums, [3, height, blocks].
 
-    Raises DataError for images of more than SSIM_PIXELS_MAX pixels, in whole tiles.
+    Raises DataError for images of more than SSIM_PIXELS_MAX pixels, rounded up to full tiles.
     """
     camera, array = comparison.camera, comparison.workspace.array
     if camera.rows * camera.stride > SSIM_PIXELS_MAX:

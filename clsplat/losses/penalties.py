@@ -15,8 +15,8 @@ from clsplat.render.filters import AT_REST
 class CovarianceTrace(Penalty):
     """Mean over Gaussians of max(tr Σ - τ, 0), in extents² (Micro-splatting, Lee et al. 2025).
 
-    τ is `above`, or with `pixels`, 3 s², where s is the length of that many pixels in the nearest training view, at the
-    last edit.
+    τ is `above`, or with `pixels`, 3 s², where s is the length of that number of pixels in the training view that was
+    nearest at the last edit.
     """
 
     type: Literal["covariance_trace"] = "covariance_trace"

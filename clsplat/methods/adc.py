@@ -20,11 +20,11 @@ class Grow(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})
 
     statistic: StatisticName = "screen_grad"
-    """Statistic whose mean is compared."""
+    """Statistic whose mean is compared with `gradient_above`."""
     gradient_above: Positive = 2.0e-4
     """Smallest mean of the statistic, in its unit, at which a Gaussian grows."""
     as_many_as: StatisticName | None = None
-    """Statistic in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
+    """Other statistic; the number of Gaussians that reach `gradient_above` in it sets the threshold of `statistic`."""
 
     opacity: Literal["copied", "shared"] = "copied"
     """`copied`: each child has the parent's opacity; `shared`: together they are as opaque as their parent,
@@ -42,7 +42,7 @@ class Grow(Rule):
         return {self.statistic, self.as_many_as or self.statistic}
 
     def condition(self, edit: Edit) -> dict[str, Any]:
-        """Return the rule's condition, and whether opacity is shared, as arguments of `Edit.mark`."""
+        """Return arguments of `Edit.mark`: the condition of the rule, and whether children share the opacity."""
         threshold = edit.at(self.gradient_above)
         if self.as_many_as:
             threshold = edit.matching_threshold(self.statistic, self.as_many_as, threshold)
@@ -100,7 +100,7 @@ class PruneFaint(Rule):
 
 
 class PruneLarge(Rule):
-    """Remove Gaussians that are large in the scene."""
+    """Remove Gaussians that are large relative to the scene extent."""
 
     type: Literal["prune_large"] = "prune_large"
     grows: ClassVar[bool] = False

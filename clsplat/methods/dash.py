@@ -13,8 +13,8 @@ from clsplat.density.edit import Edit
 
 
 class Momentum(Budget):
-    """Allow fewer Gaussians while images are small, up to a number that growth itself determines (DashGaussian, Chen
-    et al. 2025).
+    """Allow fewer Gaussians while images are small; growth determines the final number (DashGaussian, Chen et
+    al. 2025).
 
     The final number is the initial number plus a momentum, which starts at `initial_momentum` times the initial number.
     Each edit sets the momentum to `keep` times itself plus the number of Gaussians that could grow, if that is larger.
@@ -48,8 +48,10 @@ class Momentum(Budget):
         count = edit.gaussians.count
         initial = numbers.setdefault("momentum/start", count)
         momentum = numbers.setdefault("momentum/sum", self.initial_momentum * initial)
-        end = self.gaussians or initial + momentum
-        target = end if context.edits == 1 else initial + (end - initial) / context.divisor ** (2 - context.progress)
-        growing = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
-        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, growing))))
+        final = self.gaussians or initial + momentum
+        target = (
+            final if context.edits == 1 else initial + (final - initial) / context.divisor ** (2 - context.progress)
+        )
+        candidates = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
+        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, candidates))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

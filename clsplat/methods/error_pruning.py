@@ -1,4 +1,4 @@
-"""Prune by the increase of the error in training views, and measure how much error a Gaussian can remove (ours)."""
+"""Prune by the increase of the error in training views, and estimate the error that a Gaussian can remove (ours)."""
 
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal
@@ -20,7 +20,7 @@ from clsplat.render.painter import crop
 from clsplat.scene.view import View
 
 HIDDEN = -40.0  # logit of an invisible opacity
-RESOLUTION = 256  # the search for the number to prune is accurate to 1/256 of the Gaussians
+RESOLUTION = 256  # the number of Gaussians to prune is accurate to 1/256 of all Gaussians
 
 
 def squared_error(survey: Survey, views: list[View]) -> float:
@@ -35,9 +35,9 @@ def squared_error(survey: Survey, views: list[View]) -> float:
 def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[], float]) -> float:
     """Return `function()` while the Gaussians in `rows` are invisible; restore them afterwards."""
     logits = gaussians.get("logit_opacity")
-    hidden = logits.copy()
-    hidden[rows] = HIDDEN
-    gaussians.set("logit_opacity", hidden)
+    hidden_logits = logits.copy()
+    hidden_logits[rows] = HIDDEN
+    gaussians.set("logit_opacity", hidden_logits)
     try:
         return function()
     finally:
@@ -45,7 +45,7 @@ def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Cal
 
 
 def find_largest_allowed(is_allowed: Callable[[int], bool], count: int) -> int:
-    """Find the largest allowed number from 0 to `count` by bisection, up to `count` / RESOLUTION."""
+    """Return the largest allowed number from 0 to `count`, by bisection, accurate to `count` / RESOLUTION."""
     low, high, step = 0, count + 1, max(1, count // RESOLUTION)
     while high - low > step:
         middle = (low + high) // 2
@@ -78,13 +78,13 @@ class PruneRedundant(Rule):
         def is_allowed(number: int) -> bool:
             return evaluate_without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
 
-        chosen = np.zeros(len(order), bool)
-        chosen[order[: find_largest_allowed(is_allowed, len(order))]] = True
-        edit.choose(chosen, copies=0, old_rows=0)
+        is_pruned = np.zeros(len(order), bool)
+        is_pruned[order[: find_largest_allowed(is_allowed, len(order))]] = True
+        edit.choose(is_pruned, copies=0, old_rows=0)
 
 
 class ErrorGain(Statistic):
-    """Error that a Gaussian can remove, in mean errors of a pixel, over all training views (ours).
+    """Error that a Gaussian can remove over all training views, in units of the mean error of a pixel (ours).
 
     It is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does not
     depend on the exposure, size, and number of the images, nor on the weights of the losses.

@@ -26,15 +26,15 @@ class WrongPixels:
 
 def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongPixels:
     """Count the wrong pixels that each Gaussian contributes to, over `views` training views."""
-    sampled = survey.sample_views(views)
-    total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
-    for render in survey.render(sampled):
-        error, counted = render.error().astype(np.float64), render.counted_pixels()
-        is_wrong = counted & (normalize(error, counted) > error_above)
+    sampled_views = survey.sample_views(views)
+    total, weighted_sum = np.zeros(survey.count, np.int64), np.zeros(survey.count)
+    for render in survey.render(sampled_views):
+        error, is_unmasked = render.error().astype(np.float64), render.counted_pixels()
+        is_wrong = is_unmasked & (normalize(error, is_unmasked) > error_above)
         pixels = render.sum(BLENDED, is_wrong).astype(np.int64)  # integers below 2^24: exact in float32
         total += pixels
-        weighted += render.loss(LOSSES) * pixels
-    return WrongPixels(total // max(len(sampled), 1), normalize(weighted, np.ones(len(weighted), bool)))
+        weighted_sum += render.loss(LOSSES) * pixels
+    return WrongPixels(total // max(len(sampled_views), 1), normalize(weighted_sum, np.ones(len(weighted_sum), bool)))
 
 
 class ByWrongPixels(Rule):

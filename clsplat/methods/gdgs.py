@@ -15,7 +15,7 @@ CENTRAL = (0.01, 0.99)  # the grid spans these quantiles of the means along each
 
 
 class CloneDense(Rule):
-    """Copy small Gaussians with large gradients in dense regions twice: once in place, once with jitter.
+    """Copy small Gaussians with large gradients in dense regions twice: at the same position, and with jitter.
 
     A grid of `cells`³ covers the central 98 % of the means.  The rule acts only in the `extremes` fullest cells, if
     they have at least `ratio_above` times as many Gaussians with large gradients as the `extremes` emptiest cells.
@@ -58,12 +58,12 @@ class CloneDense(Rule):
         if counts[fullest].sum() < edit.at(self.ratio_above) * max(counts[emptiest].sum(), 1):
             return
         is_small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
-        chosen = has_gradient & is_small & np.isin(cell, fullest) & (edit.rows() == 1)
-        rows = np.flatnonzero(chosen)
+        is_copied = has_gradient & is_small & np.isin(cell, fullest) & (edit.rows() == 1)
+        rows = np.flatnonzero(is_copied)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
         offset = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
-        edit.choose(chosen, copies=3, old_rows=1)
+        edit.choose(is_copied, copies=3, old_rows=1)
         edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + offset], axis=1))
 
 

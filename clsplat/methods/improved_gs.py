@@ -1,4 +1,4 @@
-"""Split along the longest axis by an edge-aware score, and prune what does not recover (Improved-GS, Deng et al. 2025).
+"""Split along the longest axis by an edge-aware score, and prune faint Gaussians (Improved-GS, Deng et al. 2025).
 
 The third part of the method, several views per update, is `optimize.views_per_update`.
 """
@@ -31,9 +31,9 @@ def edge_map(render: RenderedView) -> Floats:
 
 
 def edge_scores(survey: Survey, views: int) -> Floats:
-    """Return the blend weight of each Gaussian times the edges of the photographs, over pixels and views, [N]."""
-    sampled, total = survey.sample_views(views), np.zeros(survey.count)
-    for render in survey.render(sampled):
+    """Return blend weights of Gaussians times the edges of the photographs, summed over pixels and views, [N]."""
+    sampled_views, total = survey.sample_views(views), np.zeros(survey.count)
+    for render in survey.render(sampled_views):
         total += render.sum(TEXTURE, edge_map(render))
     return total
 
@@ -68,31 +68,32 @@ class SplitLongAxis(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
-        chosen = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.rows() == 1)
-        if edit.room is not None and edit.room < chosen.sum():
-            order = sampling_order(chosen, edit.survey.compute_once(edge_scores, self.views), edit.random())
-            chosen = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
-        rows = np.flatnonzero(chosen)
+        is_split = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.rows() == 1)
+        if edit.room is not None and edit.room < is_split.sum():
+            order = sampling_order(is_split, edit.survey.compute_once(edge_scores, self.views), edit.random())
+            is_split = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
+        rows = np.flatnonzero(is_split)
         means, quats, log_scales, logits = (
             gaussians.get(name)[rows].astype(np.float64) for name in ("means", "quats", "log_scales", "logit_opacity")
         )
         longest = log_scales.argmax(axis=1)
-        at = np.arange(len(rows)), longest
-        axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)[at[0], :, longest]
-        offset = edit.at(self.distance) * np.exp(log_scales[at])[:, None] * axes
+        index = np.arange(len(rows)), longest
+        axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)[index[0], :, longest]
+        offset = edit.at(self.distance) * np.exp(log_scales[index])[:, None] * axes
         log_scales += math.log(self.other_axes)
-        log_scales[at] += math.log(self.long_axis / self.other_axes)
+        log_scales[index] += math.log(self.long_axis / self.other_axes)
         logits = math.log(self.opacity) - np.log1p(np.exp(-logits) - self.opacity)  # logit of a fraction of the opacity
-        edit.choose(chosen, copies=2, old_rows=0)
+        edit.choose(is_split, copies=2, old_rows=0)
         edit.set_children("means", rows, np.stack([means + offset, means - offset], axis=1))
         edit.set_children("log_scales", rows, np.stack([log_scales, log_scales], axis=1))
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))
 
 
 class PruneLowestOpacity(Rule):
-    """Remove a fraction of the Gaussians, those with the lowest opacities.
+    """Remove the fraction of Gaussians with the lowest opacities.
 
-    Some steps after a reset of all opacities, these fit only a few views: Gaussians that many views need recover fast.
+    Use it some steps after a reset of all opacities: Gaussians that many views need have recovered by then, and the
+    faintest ones fit only a few views.
     """
 
     type: Literal["prune_lowest_opacity"] = "prune_lowest_opacity"
@@ -103,12 +104,12 @@ class PruneLowestOpacity(Rule):
     """Fraction of the Gaussians that is removed."""
 
     def mark(self, edit: Edit) -> None:
-        logits, is_left = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
-        edit.choose(largest(-logits, int(self.share * is_left.sum()), is_left), copies=0, old_rows=0)
+        logits, is_remaining = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
+        edit.choose(largest(-logits, int(self.share * is_remaining.sum()), is_remaining), copies=0, old_rows=0)
 
 
 class SquareRoot(Budget):
-    """Grow to a given number, with the square root of the progress of training: B √x."""
+    """Grow to a given number B, in proportion to the square root of the training progress x: B √x."""
 
     type: Literal["square_root"] = "square_root"
     training_keys: ClassVar[frozenset[str]] = frozenset({"gaussians"})

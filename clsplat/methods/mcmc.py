@@ -39,8 +39,8 @@ class Relocate(Rule):
         weights = np.where(is_faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
         if not weights.any():
             return
-        added = min(int(self.growth * len(rows)) - len(rows), np.inf if edit.room is None else edit.room)
-        draws = sample_systematically(weights, max(0, int(added) + int(rows[is_faint].sum())), edit.random())
+        new_rows = min(int(self.growth * len(rows)) - len(rows), np.inf if edit.room is None else edit.room)
+        draws = sample_systematically(weights, max(0, int(new_rows) + int(rows[is_faint].sum())), edit.random())
         sources = np.flatnonzero(draws)
         copies = draws[sources] + 1
         opacities, factors = divide(opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below))
@@ -57,7 +57,7 @@ class Relocate(Rule):
 def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Return how often systematic sampling draws each item, [N]: its expected number, rounded down or up.
 
-    Places `draws` equidistant points, shifted by one random number, on the cumulative weights; exact in integers.
+    It places `draws` equidistant points, shifted by one random number, on the cumulative weights, in exact integers.
     """
     ends = np.cumsum(weights)
     total = int(ends[-1])
@@ -75,10 +75,10 @@ def divide(
     Together they have the opacity of the original at its center and the same integral along a line.  The published code
     clips opacities after it has computed the scales; here, the scales belong to the clipped opacities.
     """
-    new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
+    child_opacity = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
     orders = range(1, MAX_COPIES + 1)
-    series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in orders)
-    return new, opacity / series
+    series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * child_opacity**j / np.sqrt(j) for j in orders)
+    return child_opacity, opacity / series
 
 
 class AddNoise(Scheduled):

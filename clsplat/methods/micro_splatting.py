@@ -1,6 +1,6 @@
 """Split, prune, and merge Gaussians as in Micro-splatting (Lee et al. 2025).
 
-All rules select Gaussians on the host, where NumPy compares them with each other in a few lines.
+All rules select Gaussians on the host, where NumPy can compare them with each other.
 """
 
 from collections.abc import Mapping
@@ -71,8 +71,8 @@ class Subdivide(Rule):
         Skips Gaussians that are small on the screen or that an earlier rule has selected.
         """
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        chosen = largest(score, int(self.max_fraction * len(candidates)), candidates)
-        edit.choose(chosen, copies=self.children, old_rows=0, shrink=self.beta**0.5)
+        is_split = largest(score, int(self.max_fraction * len(candidates)), candidates)
+        edit.choose(is_split, copies=self.children, old_rows=0, shrink=self.beta**0.5)
 
 
 class SplitTextured(Subdivide):
@@ -156,9 +156,9 @@ class PruneUnimportant(Rule):
         gaussians = edit.gaussians
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         score = opacity * np.exp(gaussians.get("log_scales").astype(np.float64).mean(axis=1))
-        chosen = np.zeros(len(score), bool)
-        chosen[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True
-        edit.choose(chosen, copies=0, old_rows=0)
+        is_pruned = np.zeros(len(score), bool)
+        is_pruned[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True
+        edit.choose(is_pruned, copies=0, old_rows=0)
 
 
 class MergeNeighbors(Rule):
@@ -185,16 +185,16 @@ class MergeNeighbors(Rule):
         tables = {name: gaussians.get(name).astype(np.float64) for name in names}
         first, second = self._pairs(edit, tables)
         is_unchanged = edit.rows() == 1
-        usable = is_unchanged[first] & is_unchanged[second]
-        first, second = first[usable], second[usable]
+        is_usable = is_unchanged[first] & is_unchanged[second]
+        first, second = first[is_usable], second[is_usable]
         if not len(first):
             return
         for name, values in merge(tables, first, second).items():
             edit.set_rows(name, first, values)
         edit.zero_moments(first, ("log_scales", "quats"))  # the axes have changed
-        absorbed = np.zeros(gaussians.count, bool)
-        absorbed[second] = True
-        edit.choose(absorbed, copies=0, old_rows=0)
+        is_absorbed = np.zeros(gaussians.count, bool)
+        is_absorbed[second] = True
+        edit.choose(is_absorbed, copies=0, old_rows=0)
 
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rows of mutual nearest neighbors to merge, the heavier one of each pair first."""

@@ -23,9 +23,9 @@ Floats = NDArray[np.float64]
 
 
 def sampled_weights(survey: Survey, weight_per_view: float | None = None, number: int | None = None) -> Weights:
-    """Return the weights in training views.
+    """Return the blend weights of all Gaussians in training views.
 
-    weight_per_view: as in `weights`.  number: of sampled views; None for all views.
+    weight_per_view: as in `weights`.  number: number of views to sample; None for all views.
     """
     views = survey.views if number is None else survey.sample_views(number)
     return weights(survey.render(views), survey.count, weight_per_view)
@@ -36,10 +36,10 @@ def find_unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
 
     A view needs its heaviest Gaussians, which together make up the fraction `weight_per_view` of its weight.
     """
-    hidden = np.zeros((len(survey.views), survey.count), bool)
-    for row, render in zip(hidden, survey.render(survey.views), strict=True):
+    is_unneeded = np.zeros((len(survey.views), survey.count), bool)
+    for row, render in zip(is_unneeded, survey.render(survey.views), strict=True):
         row[:] = (render.radius() > 0) & ~heaviest(render.sum(WEIGHT).astype(np.float64), weight_per_view)
-    return hidden
+    return is_unneeded
 
 
 class PruneUseless(Rule):
@@ -64,12 +64,12 @@ class PruneUseless(Rule):
 
     def mark(self, edit: Edit) -> None:
         weights = edit.survey.compute_once(sampled_weights, self.weight_per_view, self.views)
-        keep = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
-        edit.choose(~keep, copies=0, old_rows=0)
+        is_needed = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
+        edit.choose(~is_needed, copies=0, old_rows=0)
 
 
 class HideUseless(Scheduled):
-    """Skip the Gaussians that contribute little to a training view in the steps on that view, to save time
+    """Skip Gaussians that contribute little to a training view in the steps that train on it, to save time
     (Mini-Splatting2, Fang and Wang 2024).
 
     The heaviest Gaussians that together make up `weight_per_view` of a view's weight, alpha T over all pixels, are

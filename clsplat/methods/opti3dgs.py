@@ -106,14 +106,14 @@ class HaarState(ModuleState):
 def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
     """Return the planes with the filtered photo; the colors of `planes` do not change."""
     camera, workspace = planes.camera, planes.workspace
-    filtered = workspace.array("haar", planes.colors.shape)
+    filtered_colors = workspace.array("haar", planes.colors.shape)
     workspace.device.program("haar.cl").haar_forward(
         items=(camera.stride // 2, camera.rows // 2),
         image=planes.colors,
-        result=filtered,
-        **_arguments(planes, scalars, filtered),
+        result=filtered_colors,
+        **_arguments(planes, scalars, filtered_colors),
     )
-    return replace(planes, colors=filtered)
+    return replace(planes, colors=filtered_colors)
 
 
 def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
@@ -140,11 +140,11 @@ def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Call
     return derivatives
 
 
-def _arguments(planes: Planes, scalars: ByNumber, unread: Array) -> dict[str, Any]:
-    """Return the arguments of both kernels.  unread: any array, passed if there is no mask."""
+def _arguments(planes: Planes, scalars: ByNumber, placeholder: Array) -> dict[str, Any]:
+    """Return the arguments of both kernels.  placeholder: any array, passed if there is no mask."""
     scale, leak = scalars["haar/scale"], scalars.get("haar/leak", 0.0)
-    masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()
-    return {"mask": planes.mask or unread, "masked": masked, "u": leak + scale, "v": leak - scale, **sizes}
+    is_masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()
+    return {"mask": planes.mask or placeholder, "masked": is_masked, "u": leak + scale, "v": leak - scale, **sizes}
 
 
 def photograph_gradient(losses: Sequence[Loss], comparison: Comparison) -> Array:
@@ -154,10 +154,10 @@ def photograph_gradient(losses: Sequence[Loss], comparison: Comparison) -> Array
     """
     gradient = comparison.workspace.array("grad_photograph", comparison.photograph.shape)
     image, photograph = comparison.photograph, comparison.image
-    swapped = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
+    swapped_comparison = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
     image_losses = [loss for loss in losses if isinstance(loss, ImageLoss) and loss.reads_photograph]
     if not image_losses:
         gradient.fill(0)
     for loss in image_losses:
-        loss.add(swapped)
+        loss.add(swapped_comparison)
     return gradient

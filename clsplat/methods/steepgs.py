@@ -92,9 +92,9 @@ class SplitSteepest(Rule):
         covariance = covariance_matrices(tables["quats"], tables["log_scales"])
         deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes, covariance, axes))
         offset = edit.at(self.distance) * deviation[:, None] * axes
-        chosen = np.zeros(gaussians.count, bool)
-        chosen[rows] = True
-        edit.choose(chosen, copies=2, old_rows=0, shrink=1 / self.shrink)
+        is_split = np.zeros(gaussians.count, bool)
+        is_split[rows] = True
+        edit.choose(is_split, copies=2, old_rows=0, shrink=1 / self.shrink)
         edit.set_children("means", rows, np.stack([tables["means"] + offset, tables["means"] - offset], axis=1))
         logits = divide_logits(tables["logit_opacity"], self.opacity)
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))

@@ -24,25 +24,28 @@ def normalize_by_median(values: NDArray[np.floating]) -> Floats:
 
 def pixel_weights(render: RenderedView) -> Floats:
     """Return the error of a view's pixels plus the edges of its photograph, each scaled to [0, 1], [height, width]."""
-    counted = render.counted_pixels()
+    is_unmasked = render.counted_pixels()
     edges = np.abs(scipy.ndimage.laplace(render.photograph.image().mean(axis=2), mode="nearest"))
-    return normalize(render.error().astype(np.float64), counted) + normalize(edges, counted)
+    return normalize(render.error().astype(np.float64), is_unmasked) + normalize(edges, is_unmasked)
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return for each Gaussian, [N], the sum of the losses of the views that see it, and of its terms times the loss.
+    """Return two sums over sampled views for each Gaussian, [N]: of the losses, and of its terms times the loss.
 
-    The terms are its depth, its radius, and three sums over the pixels where it is blended: of the pixels' weights,
-    their number, and its blend weight.
+    Only views that see the Gaussian count.  Its terms are its depth, its radius, and over the pixels where it is
+    blended, the sum of `pixel_weights`, the number of pixels, and the sum of its blend weights.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
-    sampled = survey.sample_views(views)
-    for view, render in zip(sampled, survey.render(sampled), strict=True):
+    sampled_views = survey.sample_views(views)
+    for view, render in zip(sampled_views, survey.render(sampled_views), strict=True):
         radius = render.radius()
         row = view.world_to_camera[2]
         depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
-        pixels = render.sum(BLENDED, pixel_weights(render)), render.sum(BLENDED, np.ones(render.counted_pixels().shape))
-        values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, render.sum(WEIGHT))
+        sums = (
+            render.sum(BLENDED, pixel_weights(render)),
+            render.sum(BLENDED, np.ones(render.counted_pixels().shape)),
+        )
+        values = (5, depth), (10, radius), (10, sums[0]), (0.1, sums[1]), (50, render.sum(WEIGHT))
         loss = render.loss(LOSSES) * (radius > 0)
         losses += loss
         terms += loss * sum(factor * normalize_by_median(np.where(radius > 0, value, 0)) for factor, value in values)
@@ -72,9 +75,9 @@ class ByScore(Rule):
 
 
 class GrowScored(ByScore):
-    """Keep only as much growth by earlier rules as the edit's limit allows (`max_gaussians`, `budget`, memory).
+    """Undo growth by earlier rules that exceeds the limit of the edit (`max_gaussians`, `budget`, memory).
 
-    Gaussians are sampled by score.  Clones and splits share the limit in proportion to their numbers.
+    Gaussians that may grow are sampled by score.  Clones and splits share the limit in proportion to their numbers.
     """
 
     type: Literal["grow_scored"] = "grow_scored"
@@ -82,19 +85,19 @@ class GrowScored(ByScore):
     def mark(self, edit: Edit) -> None:
         if edit.room is None or edit.room >= 0:
             return
-        rows, keep = edit.rows().astype(np.int64), edit.old_rows.get() > 0
+        rows, is_clone = edit.rows().astype(np.int64), edit.old_rows.get() > 0
         is_undone = rows > 1
         if not is_undone.any():
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
-        # first the clones, which keep the original, with their part of the room; then the splits with the remainder
-        for kind, fraction in ((keep, (is_undone & keep).sum() / is_undone.sum()), (~keep, 1.0)):
-            order = sampling_order((rows > 1) & kind, score, random)
-            added = np.cumsum(rows[order] - 1)
-            grows = added <= round(fraction * room)
-            is_undone[order[grows]] = False
-            room -= int(added[grows][-1]) if grows.any() else 0
+        # first the clones, with their part of the room, and then the splits, with the remainder
+        for group, fraction in ((is_clone, (is_undone & is_clone).sum() / is_undone.sum()), (~is_clone, 1.0)):
+            order = sampling_order((rows > 1) & group, score, random)
+            added_rows = np.cumsum(rows[order] - 1)
+            fits = added_rows <= round(fraction * room)
+            is_undone[order[fits]] = False
+            room -= int(added_rows[fits][-1]) if fits.any() else 0
         edit.undo_growth(is_undone)
 
 
@@ -123,6 +126,6 @@ class Parabola(Budget):
     """The number B that the last edit may reach."""
 
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
-        missing = self.gaussians - edit.gaussians.count
+        shortfall = self.gaussians - edit.gaussians.count
         remaining = (context.edits - 1) / context.edits
-        return self.gaussians - int(missing * remaining**2) if missing > 0 else self.gaussians
+        return self.gaussians - int(shortfall * remaining**2) if shortfall > 0 else self.gaussians

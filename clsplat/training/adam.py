@@ -1,4 +1,4 @@
-"""Optimize the tables of Gaussians with Adam, one learning rate per table, and average them over steps."""
+"""Optimize the parameters of Gaussians with Adam, each with its learning rate, and average them over steps."""
 
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,15 +20,15 @@ from clsplat.training.motion import MotionRates, update_motion
 
 
 class FullSizeDecay(Settings):
-    """Keep the initial rate until photographs have their full size, then decay exponentially (DashGaussian, Chen et al.
-    2025)."""
+    """Keep the initial rate until training uses full-size photographs, then decay exponentially (DashGaussian, Chen et
+    al. 2025)."""
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"until"})
 
     start: Literal["full_size"]
     """`full_size`: the decay starts at the first step with full-size photographs."""
     until: Annotated[int, Field(gt=0)]
-    """Global step at which the rate is final."""
+    """Global step at which the rate reaches `final`."""
     initial: Annotated[float, Field(gt=0)]
     """Rate before the decay."""
     final: Annotated[float, Field(gt=0)]
@@ -47,24 +47,24 @@ def _scale_rate(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay 
 
 
 class Rates(Settings):
-    """Learning rates of the parameters; may be scheduled."""
+    """Learning rates of the parameters, which may be scheduled."""
 
     means: Annotated[
         FullSizeDecay | NonNegative, explain_schedule(", or {initial, final, until, start: full_size}")
     ] = Decay(initial=1.6e-4, final=1.6e-6, over=30_000)
-    """Of the means, in units of the scene's extent."""
+    """Learning rate of the means, in units of the scene's extent."""
     quats: NonNegative = 1.0e-3
-    """Of the quaternions."""
+    """Learning rate of the quaternions."""
     log_scales: NonNegative = 5.0e-3
-    """Of the logarithms of the scales."""
+    """Learning rate of the logarithms of the scales."""
     logit_opacity: NonNegative = 5.0e-2
-    """Of the logits of the opacities."""
+    """Learning rate of the logits of the opacities."""
     sh_base: NonNegative = 2.5e-3
-    """Of the spherical harmonics of degree 0."""
+    """Learning rate of the spherical harmonics of degree 0."""
     sh_rest: NonNegative = 1.25e-4
-    """Of the higher degrees, which cost the most time; at 0, they and their moments are not updated."""
+    """Learning rate of the higher degrees, which cost the most time; at 0, they and their moments are not updated."""
     motion: MotionRates = MotionRates()
-    """Of the motion, if Gaussians move."""
+    """Learning rates of the motion, if Gaussians move."""
 
     def times(self, factor: float) -> "Rates":
         """Return all rates multiplied by a factor."""
@@ -73,15 +73,15 @@ class Rates(Settings):
         return self.model_copy(update={**scaled, "motion": self.motion.times(factor)})
 
     def resolve(self, full_size: int) -> "Rates":
-        """Return rates that depend only on the step.  full_size: first step with full-size photographs."""
+        """Return rates that depend only on the step.  full_size: first global step with full-size photographs."""
         if not isinstance(self.means, FullSizeDecay):
             return self
         return self.model_copy(update={"means": self.means.from_step(full_size)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates at a global step by the names of parameters and of motion fields.
+        """Return the rates at a global step, keyed by parameter or motion field.
 
-        extent: extent of the scene, scene units.  Raises ConfigError unless `resolve` was called.
+        extent: extent of the scene, scene units.  Raises ConfigError if `resolve` must be called first.
         """
         if isinstance(self.means, FullSizeDecay):
             raise ConfigError(
@@ -92,7 +92,7 @@ class Rates(Settings):
         return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
-Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, some of them later
+Rows = Literal["all", "seen", "deferred"]  # rows to update; deferred: all rows, some of them later
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
@@ -100,11 +100,12 @@ _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 class Adam:
     """Adam (Kingma and Ba 2015), with moments in tables next to the parameters and one update count per parameter.
 
-    With rows `seen`, a Gaussian that is culled in the view (no pixel of the photograph with an alpha of 1/255 or more)
-    keeps its parameters and moments, even if penalties have gradients.  Bias correction uses the update count of the
-    parameter, although a row may have had fewer updates; published kernels (Taming 3DGS) omit the correction.
+    With `rows="seen"`, a Gaussian that is culled in the view (its alpha is below 1/255 in all pixels) keeps its
+    parameters and moments, even if penalties have gradients.  Bias correction uses the update count of the parameter,
+    although a row may have had fewer updates; published kernels (Taming 3DGS) omit the correction.
 
-    With rows `deferred`, `sh_rest` of a Gaussian is updated when a view sees it; results are bit-identical to `all`.
+    With `rows="deferred"`, `sh_rest` of a Gaussian is not updated until a view sees it; results are bit-identical to
+    those of `all`.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
@@ -124,7 +125,7 @@ class Adam:
     ) -> Array:
         """Update all parameters from the frame's sums over pixels, [PIXEL_SUMS, S].
 
-        Returns the gradient of the projected means, [2, S] px⁻¹, valid until the next update.
+        Returns the gradient of the projected means, [2, S] px⁻¹, which is valid until the next update.
         """
         gaussians = self.gaussians
         rows = self._effective_rows(rows)
@@ -160,9 +161,9 @@ class Adam:
         without: Collection[str] = (),
         rows: Rows = "all",
     ) -> None:
-        """Update all parameters except `without` from gradients in memory.
+        """Update all parameters except those in `without` from gradients in memory.
 
-        Harmonics above the active degree are skipped, since their gradients and moments are zero.
+        Harmonics above the active degree are skipped, because their gradients and moments are zero.
         """
         gaussians, rows = self.gaussians, self._effective_rows(rows)
         deferred = None if "sh_rest" in without else self._prepare_deferred(rows, model, rates)
@@ -174,8 +175,8 @@ class Adam:
                 components = 3 * (sh_coefficients(model.degree) - 1)
             values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
             rate, correction2 = self._factors(name, rates)
-            in_slots = slot_defines(gaussians) if name == "sh_rest" else {}
-            gaussians.device.program("adam.cl", **in_slots).adam_step(
+            defines = slot_defines(gaussians) if name == "sh_rest" else {}
+            gaussians.device.program("adam.cl", **defines).adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
                 values=values,
                 gradient=gradients[name],
@@ -197,7 +198,7 @@ class Adam:
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
     def _prepare_deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
-        """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none are."""
+        """Return the deferred updates of `sh_rest`, or None if none of its updates are deferred."""
         gaussians = self.gaussians
         if rows != "deferred":
             if gaussians.deferred:
@@ -210,7 +211,7 @@ class Adam:
         return gaussians.deferred
 
     def _mean2d(self) -> Array:
-        """Return the array for the gradient of the projected means, [2, S]; edits change its size."""
+        """Return the array for the gradient of the projected means, [2, S]; allocate it again if an edit changed S."""
         shape = (2, self.gaussians.capacity)
         if self._grad_mean2d is None or self._grad_mean2d.shape != shape:
             self._grad_mean2d = None  # frees the old array before the new one is allocated
@@ -218,24 +219,24 @@ class Adam:
         return self._grad_mean2d
 
     def _effective_rows(self, rows: Rows) -> Rows:
-        """Return the rows to update: harmonics on the host are always updated later, when a view sees them."""
+        """Return the rows to update; updates of offloaded harmonics are always deferred until a view sees them."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
     def _record_sh(self, deferred: DeferredUpdates | None, frame: Frame, rate: float, correction2: float) -> None:
-        """Record that the rows in the view have received this update of `sh_rest`."""
+        """Record that the visible rows have received this update of `sh_rest`."""
         if deferred:
             deferred.record(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:
             self.gaussians.on_host.start_download()
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
-        """Return the bias-corrected rate and the correction of moment 2 for a parameter's next update; count it."""
+        """Count an update of a parameter; return its bias-corrected rate and the correction of its second moment."""
         self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
         updates = max(self.updates[name], 1)
         return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
     def reset_moments(self, name: str) -> None:
-        """Set the moments of one parameter to zero."""
+        """Set both moments of a parameter to zero."""
         self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
 
 
@@ -246,13 +247,13 @@ VIEWS = f"{GRADIENT}views"  # number of views in the mean of a row
 
 
 def attach_gradients(gaussians: Gaussians) -> None:
-    """Add empty tables for the gradients of several views, if missing."""
+    """Add tables for the mean gradients of several views, unless they exist."""
     if VIEWS not in gaussians.tables:
         _add_tables(gaussians, GRADIENT, VIEWS)
 
 
 def add_gradients(gaussians: Gaussians, gradients: GaussianGradients) -> GaussianGradients:
-    """Add the gradients of a view to the mean; return the mean, which changes with the next view."""
+    """Add the gradients of a view to the mean, and return the mean; the next call overwrites it."""
     _add_to_mean(gaussians, {name: gradients[name] for name in gaussians.trained}, GRADIENT, VIEWS)
     return gradients.replace({name: gaussians[GRADIENT + name] for name in gaussians.trained})
 
@@ -264,20 +265,20 @@ NUMBER = f"{FOLDER}number"  # number of steps in the average of a row
 
 
 def has_average(gaussians: Gaussians) -> bool:
-    """Return whether there are tables for averages."""
+    """Return whether the Gaussians have tables for averages."""
     return NUMBER in gaussians.tables
 
 
 def attach_average(gaussians: Gaussians) -> None:
-    """Add empty tables for averages, if missing.  Rows of new Gaussians start empty."""
+    """Add tables for averages, unless they exist.  The averages of new Gaussians start empty."""
     if not has_average(gaussians):
         _add_tables(gaussians, FOLDER, NUMBER)
 
 
-def _add_tables(gaussians: Gaussians, folder: str, number: str) -> None:
+def _add_tables(gaussians: Gaussians, prefix: str, counts: str) -> None:
     for name in gaussians.trained:
-        gaussians.add(folder + name, gaussians.tables[name].components, zero_fresh=True)
-    gaussians.add(number, 1, zero_fresh=True)
+        gaussians.add(prefix + name, gaussians.tables[name].components, zero_fresh=True)
+    gaussians.add(counts, 1, zero_fresh=True)
 
 
 def add_to_average(gaussians: Gaussians) -> None:
@@ -285,23 +286,23 @@ def add_to_average(gaussians: Gaussians) -> None:
     _add_to_mean(gaussians, {name: gaussians[name] for name in gaussians.trained}, FOLDER, NUMBER)
 
 
-def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], folder: str, number: str) -> None:
-    """Add values, by parameter, to the means in the tables of a folder; `number` counts them for each row."""
+def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], prefix: str, counts: str) -> None:
+    """Add values, keyed by parameter, to the means in the tables with this prefix.  counts: table of counts by row."""
     program, count = gaussians.device.program("average.cl"), gaussians.count
     for name, array in values.items():
         program.add_to_average(
             items=(count, gaussians.tables[name].components),
             values=array,
-            average=gaussians[folder + name],
-            number=gaussians[number],
+            average=gaussians[prefix + name],
+            number=gaussians[counts],
             stride=gaussians.capacity,
             count=count,
         )
-    program.count_step(items=count, number=gaussians[number], count=count)
+    program.count_step(items=count, number=gaussians[counts], count=count)
 
 
 def take_average(gaussians: Gaussians) -> None:
-    """Replace parameters by their averages, in rows that have one, and remove the averages."""
+    """Replace the parameters by their averages in rows that have one, and remove the tables of averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

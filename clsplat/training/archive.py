@@ -1,10 +1,10 @@
-"""Write and read named arrays and notes in an .npz file that has a SHA-256 for each, to detect damage.
+"""Write and read named arrays and notes in an .npz file, with a SHA-256 of each to detect damage.
 
     NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the notes
     meta.npy          the notes: JSON, with the hashes of arrays by name under the key `sha256`
     meta_sha256.npy   the SHA-256 of meta.npy
 
-NumPy can read the arrays.  A changed byte is detected, unless it is unused, such as in time stamps.
+NumPy can read the arrays.  Any changed byte is detected, except in fields that are not used, such as time stamps.
 """
 
 import errno
@@ -29,7 +29,7 @@ Arrays = dict[str, NDArray[np.float32]]
 
 
 def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> None:
-    """Write arrays, and notes as JSON; only one array is in memory at a time."""
+    """Write arrays, and notes as JSON.  Only one array is in memory at a time."""
     with zipfile.ZipFile(file, "w") as archive:
         digests = {name: _add(archive, name, array) for name, array in arrays}
         digest = _add(archive, META, np.array(json.dumps({**notes, DIGESTS: digests})))
@@ -37,9 +37,10 @@ def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.f
 
 
 def read(path: Path) -> tuple[Notes, Arrays]:
-    """Read notes and arrays.  Raises DataError, with only the reason, if the file is damaged.
+    """Read notes and arrays.
 
-    Raises OutputError or MemoryError if the system cannot read it, which does not mean that it is damaged.
+    Raises DataError if the file is damaged; its message is only the reason.  Raises OutputError or MemoryError if the
+    system cannot read the file, which does not mean that it is damaged.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -57,19 +58,19 @@ def read(path: Path) -> tuple[Notes, Arrays]:
             raise OutputError(f"{path}: cannot be read ({error.strerror}); check disk and permissions") from error
         if isinstance(error, DataError):
             raise
-        empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
+        is_empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
         reason = shorten(
             (error.strerror if isinstance(error, OSError) else "") or one_line(error) or type(error).__name__
         )
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"the disk cannot read it: {error.strerror}") from error
-        raise DataError("is empty" if empty else f"does not match its checksum ({reason})") from error
+        raise DataError("is empty" if is_empty else f"does not match its checksum ({reason})") from error
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
-    """Split arrays into those with the prefix `folder`, which is removed from their names, and the others."""
-    part = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
-    return part, {name: array for name, array in arrays.items() if not name.startswith(folder)}
+    """Return the arrays with the prefix `folder`, which is removed from their names, and the remaining arrays."""
+    members = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
+    return members, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
@@ -78,14 +79,14 @@ def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(values))
     digest = hashlib.sha256()
     with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-        for part in (memoryview(header.getvalue()), values.reshape(-1).view(np.uint8).data):
-            digest.update(part)
-            member.write(part)
+        for chunk in (memoryview(header.getvalue()), values.reshape(-1).view(np.uint8).data):
+            digest.update(chunk)
+            member.write(chunk)
     return digest.hexdigest()
 
 
 def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
-    """Raise DataError if the members declare more bytes than the file has, or are compressed or encrypted."""
+    """Raise DataError if members declare more bytes than the file has, or are compressed or encrypted."""
     members = archive.infolist()
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
         raise DataError("its contents are compressed or encrypted")
@@ -94,7 +95,7 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:
-    """Check and return the notes."""
+    """Read the notes and check them against their SHA-256."""
     data = archive.read(f"{META}.npy")
     if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
         raise DataError("its notes do not match their checksum")

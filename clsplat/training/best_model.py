@@ -1,4 +1,4 @@
-"""Record the best model of a training, chosen by its validation views: its metrics, and its tables on the host."""
+"""Record the best model by validation during training: its metrics, and its tables on the host."""
 
 from typing import Annotated, Any, Literal
 
@@ -18,7 +18,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class Scores(BaseModel):
-    """The mean PSNR of one model, dB, over all or some training views, and over the validation views."""
+    """The mean PSNR of a model over training views, all or a sample, and over the validation views, dB."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -31,59 +31,59 @@ class Scores(BaseModel):
         return self.train - self.validation > OVERFIT_GAP
 
     def text(self, views: str) -> str:
-        """Describe the model in a sentence.  views: name of the views that were not trained on."""
+        """Return a sentence with the scores.  views: name of the views that were not used in training."""
         figures = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
         return f"At step {self.step:,} the model has {figures}{self.overfit_text()}."
 
     def overfit_text(self, first: "Scores | None" = None) -> str:
-        """Return a clause for a model that overfits, else "".  first: the first model that did."""
+        """Return a clause that says that the model overfits, else "".  first: scores of the first model that did."""
         since = f" since step {first.step:,}" if first and first.step < self.step else ""
         return f", more than {OVERFIT_GAP:g} dB apart{since}: the model overfits" if self.is_overfit else ""
 
 
 class Best(BaseModel):
-    """The best model so far, and the progress of validation."""
+    """The best model so far, and the state of validation."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     measured: Scores
-    """The scores of the best model so far."""
+    """Scores of the best model so far."""
     degree: Annotated[int, Field(ge=0, le=3)]
     """Active degree of its spherical harmonics."""
     metrics: dict[str, dict[str, dict[str, Any]]]
     """Average metrics of the best model, by split and downscale."""
     scalars: dict[str, float] = {}
-    """The scalars of the run at the step of the best model."""
+    """Scalars of the run at the step of the best model."""
     modules: dict[str, dict[str, float]] = {}
-    """The scalars of the modules at that step, by type."""
+    """Scalars of the modules at that step, by type."""
     evaluations: Count
     """Number of evaluations so far."""
     since_best: Count
-    """Number of evaluations after the best model."""
+    """Number of evaluations since the best model."""
     first_overfit: Scores | None
-    """The scores of the first model that overfitted."""
+    """Scores of the first model that overfitted; None if none did."""
     last: Scores
-    """The scores of the last model."""
+    """Scores of the last model."""
     growth_ended: Count | None = None
-    """Global step at which growth stopped, because validation no longer improved; None: growth continues."""
+    """Global step at which growth stopped, because validation no longer improved; None while it continues."""
     ended: Count | None = None
-    """Global step at which the training ended with this model; None: it continues."""
+    """Global step at which training ended with this model; None while it continues."""
     refit: Literal["none", "due", "begun"] = "none"
-    """Whether training is repeated on all training photographs, for the same number of steps."""
+    """State of the refit, which repeats training on all training photographs for the same number of steps."""
 
     def with_last(self, last: Scores) -> "Best":
-        """Return the record after one more evaluation, which was not better."""
-        more = {"last": last, "evaluations": self.evaluations + 1, "since_best": self.since_best + 1}
+        """Return the record after an evaluation in which the model did not improve."""
+        changes = {"last": last, "evaluations": self.evaluations + 1, "since_best": self.since_best + 1}
         first_overfit = self.first_overfit or (last if last.is_overfit else None)
-        return self.model_copy(update=more | {"first_overfit": first_overfit})
+        return self.model_copy(update=changes | {"first_overfit": first_overfit})
 
     def figures(self) -> dict[str, Any]:
         """Return the entry of the best model in metrics.json."""
-        facts = self.model_dump(include={"evaluations", "last", "first_overfit", "growth_ended", "ended"})
-        return {**self.measured.model_dump(), **facts, "refit": self.refit != "none"}
+        progress = self.model_dump(include={"evaluations", "last", "first_overfit", "growth_ended", "ended"})
+        return {**self.measured.model_dump(), **progress, "refit": self.refit != "none"}
 
     def text(self) -> str:
-        """Describe the outcome in one or two sentences."""
+        """Return a few sentences about the outcome."""
         best, last = self.measured, self.last
         figures = f"{best.train:.1f} dB at training views and {best.validation:.1f} dB at validation views"
         text = f"By the validation views, the model of step {best.step:,} is the best: {figures}{best.overfit_text()}."
@@ -96,7 +96,7 @@ class Best(BaseModel):
 
 
 def model_tables(model: DeviceModel) -> Tables:
-    """Copy to the host the tables that are needed to render a model, and to train it with new moments."""
+    """Copy to the host the tables needed to render a model, or to train it further with new Adam moments."""
     gaussians = model.gaussians
     names = (*gaussians.trained, "filter_variance", *({INTERVAL2} & gaussians.tables.keys()))
     return {name: gaussians.get(name) for name in names}

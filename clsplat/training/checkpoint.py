@@ -1,7 +1,7 @@
 """Save and restore a run, bit for bit: parameters, Adam moments, statistics, and counters, without pickle.
 
-Random numbers and the order of views depend only on (seed, step), so the step is their state.  A state with values that
-are not finite is saved as failed_N.npz, which is never resumed.
+Random numbers and the order of views depend only on (seed, step), so the step is their state.  A state with NaN or
+infinity is saved as failed_N.npz, which is never resumed.
 """
 
 import logging
@@ -49,9 +49,9 @@ from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
 
-# The notes of a checkpoint: the state of a run without its tables.
+# The notes of a checkpoint contain the state of a run without its tables.
 
-LARGEST = 10**15  # counts and seconds above are damage; float64 holds all smaller whole numbers
+LARGEST = 10**15  # larger counts and seconds are damage; float64 represents all smaller integers
 Count = Annotated[int, Field(ge=0, le=LARGEST)]
 Seconds = Annotated[float, Field(ge=0, le=LARGEST)]
 Metrics = dict[str, dict[str, dict[str, Any]]]  # averages by split and downscale factor
@@ -88,13 +88,13 @@ class State(BaseModel):
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
-        """Return whether the training in progress has done all steps of a resolved pipeline."""
+        """Return whether the current stage has done all its steps in a resolved pipeline."""
         (stage,) = pipeline["stages"][self.stage_index].values()
         return bool(stage.get("steps") == self.stage_step)
 
 
 def check_tables(state: State, tables: Arrays) -> None:
-    """Raise DataError if tables cannot be those of a run."""
+    """Raise DataError if the tables of Gaussians are incomplete, have wrong shapes, or do not fit the state."""
     if missing := [name for name in PARAMETERS if name not in tables]:
         raise DataError(f"lacks {', '.join(missing)}")
     count = len(tables["means"])
@@ -103,71 +103,71 @@ def check_tables(state: State, tables: Arrays) -> None:
             raise DataError(f"{name} is not [{count}, components] of float32")
     if count == 0:
         raise DataError("it has no Gaussians")
-    trained = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
-    for name in trained:
+    parameters = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
+    for name in parameters:
         if tables[name].shape[1] not in WIDTHS[name]:
             raise DataError(f"{name} has {tables[name].shape[1]} components")
         if name == "sh_rest" and tables[name].shape[1] < 3 * (sh_coefficients(state.degree) - 1):
             raise DataError(f"{name} has {tables[name].shape[1]} components, too few for degree {state.degree}")
         moments = [moment for moment in moment_tables(name) if moment in tables]
-        if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
-            raise DataError(f"{broken[0]} has values that are not finite")
+        if non_finite := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
+            raise DataError(f"{non_finite[0]} has values that are not finite")
         if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
             raise DataError(f"the moments of {name} do not have its shape")
-    if state.updates and state.updates.keys() != set(trained):
+    if state.updates and state.updates.keys() != set(parameters):
         raise DataError("its update counts belong to other parameters")
 
 
-# The tables of a run's modules in a checkpoint, and in the best model.
+# The tables of a run's modules, in a checkpoint and in the best model.
 
 MODULES = "modules/"  # prefix of module names, which are prefixes of table names
 
 
 def module_tables(run: Run, full: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables of modules with their keys in the file.  full: include tables that only training needs."""
+    """Yield the keys in the file and the tables of a run's modules.  full: include tables that only training needs."""
     for module, state in run.modules.items():
         if full or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(full).items())
 
 
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Raise DataError if tables do not fit the modules.  scalars: by module; tables: named without MODULES."""
+    """Raise DataError if tables do not fit the modules.  scalars: by module; tables: by key without prefix MODULES."""
     for name in scalars:
-        module_tables, tables = split(tables, f"{name}/")
-        module_class(name).check_saved(scalars[name], module_tables)
+        saved_tables, tables = split(tables, f"{name}/")
+        module_class(name).check_saved(scalars[name], saved_tables)
     if tables:
         raise DataError(f"it has tables of modules that its notes do not list: {', '.join(tables)}")
 
 
 def reload_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Load the modules of a run from copies of an earlier step."""
+    """Restore a run's modules from the scalars and tables of an earlier step."""
     for name, values in scalars.items():
         if name in run.modules and name in modules_so_far(run):
             run.modules[name].load(values, split(tables, f"{name}/")[0])
 
 
-# The tables of the best model of a run: copied to the host, and restored.
+# Copies of the best model of a run, on the host.
 
 
 def copy_model(run: Run) -> Tables:
-    """Copy to the host the tables that are needed to render the run's model and to train it further."""
+    """Copy to the host the tables needed to render the run's model, or to train it further."""
     return {**model_tables(run.model), **dict(module_tables(run, full=False))}
 
 
 def restore_best(run: Run, tables: Tables, best: Best) -> None:
-    """Make the copy of the best model the run's model."""
+    """Replace the run's model by the copy of its best model."""
     from_modules, parameters = split(tables, MODULES)
     reload_modules(run, best.modules, from_modules)
     run.model = run.model_settings.model(Gaussians(run.device, parameters), best.degree)
 
 
-# The tables of a run in a checkpoint: those of a field; or those of Gaussians, modules, and the best model.
+# A checkpoint has either the tables of a field, or those of Gaussians, modules, and the best model.
 
 UPDATES = "field"  # key of a field's number of updates
 
 
 def run_tables(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield all tables of a run with their keys in the file, copied to the host one at a time."""
+    """Yield the keys in the file and the tables of a run; the tables are copied to the host one at a time."""
     if run.learned_field:
         yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
         return
@@ -178,7 +178,7 @@ def run_tables(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
 
 
 def update_counts(run: Run) -> dict[str, int]:
-    """Return the number of Adam updates of each parameter."""
+    """Return the number of Adam updates of each parameter, or of a field."""
     if run.learned_field:
         return {UPDATES: run.learned_field.updates}
     return run.adam.updates if run.adam else {}
@@ -199,14 +199,14 @@ def check_run_tables(state: State, tables: Arrays) -> None:
 
 
 def _check_and_remove_modules(modules: Mapping[str, Scalars], tables: Arrays) -> Arrays:
-    """Check the tables of modules; return the others."""
-    from_modules, others = split(tables, MODULES)
+    """Check the tables of modules, and return the remaining tables."""
+    from_modules, remaining = split(tables, MODULES)
     check_modules(modules, from_modules)
-    return others
+    return remaining
 
 
 def restore_tables(run: Run, state: State, tables: Arrays) -> None:
-    """Restore the tables of a run."""
+    """Restore a run's Gaussians, modules, and optimizer, or its field, from the tables of a checkpoint."""
     if state.field:
         tables, _ = split(tables, field.FOLDER)
         kind = field.field_class(state.field)
@@ -223,8 +223,8 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         make_room(run, gaussians.count)
         run.adam = Adam(gaussians)
         run.adam.updates = state.updates
-        columns = [name for name in tables if name.startswith(STATS_PREFIX) and name != SEEN]
-        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_PREFIX) for name in columns])
+        statistics = [name for name in tables if name.startswith(STATS_PREFIX) and name != SEEN]
+        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_PREFIX) for name in statistics])
     for key, table in tables.items():  # including those of rules, penalties and plug-ins
         name = key.removeprefix("gaussians/")
         if name not in gaussians.tables:
@@ -239,21 +239,23 @@ def _key(table: str) -> str:
 
 # A remedy for parameters that are not finite.
 
-RATE_FACTOR = 0.1  # by which a rate is lowered
+RATE_FACTOR = 0.1  # multiplies a rate to lower it
 VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
 
 
 def lower_rate(run: Run, broken: Collection[str]) -> str:
-    """Return 'key=value' for `--set` to lower the rate that exceeds its default most, among the broken parameters.
+    """Return `key=value` for `--set` that lowers a rate: of the broken parameters, the one furthest above its default.
 
-    The value is a tenth of the current rate, or the default if that is smaller.  A field has one rate.
+    The value is a tenth of the current rate, or the default if that is smaller.  A field has only one rate.
     """
     if run.learned_field:
         (stage,) = run.pipeline["stages"][run.stage_index]
         return f"{stage}.rate={RATE_FACTOR * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
-    trainings = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
-    index, stage = next((train for train in reversed(trainings) if train[0] <= run.stage_index), (0, "optimize"))
+    stages_with_rates = [
+        (i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields
+    ]
+    index, stage = next((item for item in reversed(stages_with_rates) if item[0] <= run.stage_index), (0, "optimize"))
     current = Rates.model_validate(stages[index].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
@@ -261,9 +263,9 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
 
     names = [VELOCITY if name == MOTION else name for name in broken or PARAMETERS]
     name = max(names, key=lambda name: rate(current, name) / rate(default, name))
-    is_only = [other for _, other in trainings].count(stage) <= 1
+    is_unique = [stage_name for _, stage_name in stages_with_rates].count(stage) <= 1
     value = min(RATE_FACTOR * rate(current, name), rate(default, name))
-    return f"{stage if is_only else f'stages.{index}'}.rates.{name}={value:.2g}"
+    return f"{stage if is_unique else f'stages.{index}'}.rates.{name}={value:.2g}"
 
 
 FORMAT = 5
@@ -271,10 +273,11 @@ LOG = logging.getLogger("clsplat")
 
 
 def save(run: Run, keep: int | None = None) -> Path:
-    """Write checkpoints/step_N.npz atomically.  keep: number of newest checkpoints to keep; older ones are removed.
+    """Write checkpoints/step_N.npz atomically, and return its path.
 
-    Raises NotFiniteError, after writing failed_N.npz, if the model is not finite; then nothing is removed.  Raises
-    ClsplatError in the middle of a step or an edit.
+    keep: number of newest checkpoints to keep; older ones are removed.  Raises NotFiniteError, after writing
+    failed_N.npz, if the model is not finite; then nothing is removed.  Raises ClsplatError in the middle of a step or
+    an edit.
     """
     if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
@@ -291,23 +294,23 @@ def save(run: Run, keep: int | None = None) -> Path:
 
 
 def save_failed(run: Run, broken: list[str]) -> str:
-    """Save a state that is not finite as failed_N.npz, replacing older ones; return the end of an error message."""
+    """Save a state that is not finite as failed_N.npz, replacing older files; return the end of the error message."""
     try:
         path = _write(run, "failed")
-        _remove(other for other in path.parent.glob("failed_*.npz") if other != path)
+        _remove(file for file in path.parent.glob("failed_*.npz") if file != path)
         state = f"the state is in {path}"
     except OutputError as error:
         state = f"the state is lost: {error}"
-    good = list_files(run.out)
+    checkpoints = list_files(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
         f"`clsplat resume {shell_quote(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
-        f"{f'resumes from {good[-1].name}' if good else 'starts over'}"
+        f"{f'resumes from {checkpoints[-1].name}' if checkpoints else 'starts over'}"
     )
 
 
 def list_files(out: Path) -> list[Path]:
-    """List the checkpoints of a run folder from old to new; those of a refit come last."""
+    """Return the checkpoints of a run folder from old to new; those of a refit come last."""
     by_rank = {
         (match[1] == "refit", int(match[2])): path
         for path in (out / CHECKPOINTS).glob("*.npz")
@@ -317,7 +320,7 @@ def list_files(out: Path) -> list[Path]:
 
 
 def load(path: Path) -> tuple[State, Arrays]:
-    """Read a checkpoint.  Raises DataError, with only the reason, if it is damaged; ConfigError for another format."""
+    """Read a checkpoint.  Raises DataError (only the reason) if it is damaged, and ConfigError for another format."""
     notes, tables = archive.read(path)
     if type(notes.get("format")) is int and notes["format"] != FORMAT:
         raise ConfigError(
@@ -341,18 +344,16 @@ def load(path: Path) -> tuple[State, Arrays]:
 
 
 def _check_metrics(metrics: Metrics) -> None:
-    """Raise DataError if metrics are not those of a run: numbers, except for reasons and the origin of LPIPS."""
+    """Raise DataError if metrics are invalid.  All values are numbers, except reasons and the origin of LPIPS."""
     averages = [figures for by_downscale in metrics.values() for figures in by_downscale.values()]
-    numbers = [
-        value for figures in averages for name, value in figures.items() if not re.search("_reason$|lpips_", name)
-    ]
+    values = [x for figures in averages for name, x in figures.items() if not re.search("_reason$|lpips_", name)]
     is_complete = all(figures.get(name) is not None for figures in averages for name in ("psnr", "ssim", "views"))
-    if not (metrics.keys() <= set(SPLITS) and is_complete and all(isinstance(x, int | float | None) for x in numbers)):
+    if not (metrics.keys() <= set(SPLITS) and is_complete and all(isinstance(x, int | float | None) for x in values)):
         raise DataError("its metrics are not those of a run")
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:
-    """Restore the newest valid checkpoint; return its file (None if there is none) and remarks to log.
+    """Restore the newest valid checkpoint; return its path, or None without a checkpoint, and remarks to log.
 
     The remarks report changes of settings and of the device.  Raises ConfigError for a change of a setting that cannot
     change on resume, or for another format; OutputError if all checkpoints are damaged or missing.
@@ -379,7 +380,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
 
 
 def rename_damaged(out: Path, restored: Path | None) -> None:
-    """Rename the damaged checkpoints after the restored one, so that they do not count as checkpoints to keep."""
+    """Rename the damaged checkpoints that follow the restored one, so that `save` does not count them."""
     files = list_files(out)
     for damaged in files[files.index(restored) + 1 :] if restored else ():
         try:
@@ -389,7 +390,7 @@ def rename_damaged(out: Path, restored: Path | None) -> None:
 
 
 def _remove(files: Iterable[Path]) -> None:
-    """Remove older states; on Windows, a state that another program is reading stays until the next call."""
+    """Remove older states; on Windows, a file that another program is reading stays until the next call."""
     for file in files:
         try:
             file.unlink(missing_ok=True)
@@ -445,10 +446,10 @@ def _field_entry(run: Run) -> dict[str, Any] | None:
 def _record_changes(run: Run, path: Path, state: State) -> list[str]:
     """Record and return the changed settings.  Raises ConfigError for one that cannot change on resume."""
     changes, remedy = [], "restore it, or start over with `clsplat run --restart` or another --out"
-    old = state.pipeline
+    previous = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved
-        old = {**old, "scene": {**old["scene"], "path": run.pipeline["scene"]["path"]}}
-    for difference in differences(old, run.pipeline, run.settings):
+        previous = {**previous, "scene": {**previous["scene"], "path": run.pipeline["scene"]["path"]}}
+    for difference in differences(previous, run.pipeline, run.settings):
         if difference.kind == "output" or difference.is_moved_file(state.file_hashes, run.file_hashes):
             continue
         if difference.key_path == "model.near" and state.inputs != run.inputs:
@@ -461,8 +462,8 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} is of a refit, whose steps were chosen by validation: {difference}; {remedy}")
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
-            more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"
-            raise ConfigError(f"{path}: no steps are left after step {state.step}: {difference}; {more}")
+            advice = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"
+            raise ConfigError(f"{path}: no steps are left after step {state.step}: {difference}; {advice}")
         changes.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changes]
     return changes
@@ -479,7 +480,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.records.lines, run.resumed_inputs, run.model_hashes = state.records, state.inputs, state.model_hashes
 
 
-# Saving the state of a run that fails.
+# Save the state of a run that fails.
 
 
 @contextmanager
@@ -496,7 +497,7 @@ def save_on_failure(run: Run) -> Iterator[None]:
 
 
 def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float]:
-    """Read the loss and the PSNR, dB, of a step.
+    """Return the loss and the PSNR (dB) of a step; waits for the device.
 
     Raises NotFiniteError, after saving the state as failed_N.npz, if the loss or the model is not finite.
     """
@@ -507,7 +508,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 
 
 def _save_if_consistent(run: Run) -> str:
-    """Save the state if it is consistent and finite; return a sentence about it."""
+    """Save the state if it is consistent and finite; return a clause that reports the result."""
     try:
         if run.is_consistent and not run.not_finite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"

@@ -1,6 +1,6 @@
 """Plan the device memory of training before it is allocated.
 
-Bytes are counted per Gaussian for tables, and per Gaussian, pair, and pixel for a frame.
+The plan counts bytes per Gaussian for tables, and per Gaussian, pair, and pixel for a frame.
 """
 
 import math
@@ -30,18 +30,18 @@ Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; au
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """Bytes on the device."""
+    """The device memory that training needs and has, in bytes."""
 
-    gaussian: int  # for each Gaussian, tables and frame
-    pair: int
+    gaussian: int  # per Gaussian, in tables and the frame
+    pair: int  # per pair
     fixed: int  # photographs and planes of pixels
-    largest_table: int  # for each Gaussian, in the largest single buffer
-    memory: int  # of the device
-    allocation: int  # of a single buffer
-    host: int = 0  # for each Gaussian, in the memory of the host
+    largest_table: int  # per Gaussian, in the largest single buffer
+    memory: int  # total memory of the device
+    allocation: int  # largest size of a single buffer
+    host: int = 0  # per Gaussian, in the memory of the host
 
     def required_bytes(self, gaussians: int) -> int:
-        """Return the bytes for a number of Gaussians, with room for growth and for moving one table."""
+        """Return the bytes for a number of Gaussians, including growth and a copy of the largest table."""
         return self.fixed + int(gaussians * self._per_gaussian)
 
     @property
@@ -50,14 +50,14 @@ class MemoryPlan:
 
     @property
     def limit(self) -> int:
-        """The largest number of Gaussians that fits, in total and in single buffers."""
+        """The largest number of Gaussians that fits in the total memory and in single buffers."""
         by_total = (self.memory - self.fixed) / self._per_gaussian
         by_table = self.allocation // self.largest_table // ALIGNMENT * ALIGNMENT
         by_pairs = self.allocation / (PAIRS_PER_GAUSSIAN * 4 * RECORD)
         return max(0, int(min(by_total, by_table, by_pairs)))
 
     def text(self, gaussians: int) -> str:
-        """Return a line with the memory needed and the number of Gaussians that fit."""
+        """Return a line with the required memory and the number of Gaussians that fit."""
         mib = 2**20
         on_host = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
         return (
@@ -67,7 +67,7 @@ class MemoryPlan:
         )
 
     def check(self, gaussians: int, more: str = "") -> None:
-        """Raise MemoryLimitError if the Gaussians do not fit.  more: another remedy for the message."""
+        """Raise MemoryLimitError if the Gaussians do not fit.  more: an additional remedy for the message."""
         if gaussians > self.limit:
             raise MemoryLimitError(
                 f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale), or keep fewer "
@@ -80,11 +80,11 @@ class DeviceLimits(Protocol):
 
     @property
     def memory(self) -> int:
-        """Bytes in total."""
+        """Total bytes."""
 
     @property
     def allocation(self) -> int:
-        """Bytes of a single buffer."""
+        """Largest size of a single buffer, bytes."""
 
     @property
     def unified(self) -> bool:
@@ -92,23 +92,23 @@ class DeviceLimits(Protocol):
 
 
 def offload_target(harmonics: Harmonics, limits: DeviceLimits) -> Location:
-    """Return the memory to which harmonics may move; a device that shares the host's memory cannot offload them."""
+    """Return where harmonics may be stored; `auto` does not offload them if the device shares the host's memory."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
 
 
 def max_pixels(views: Sequence[View], tile: int) -> int:
-    """Return the number of pixels of the largest view, rounded up to whole tiles.  tile: side, px."""
+    """Return the number of pixels of the largest view, rounded up to full tiles.  tile: side, px."""
     return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
 
 
 def module_bytes(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
-    """Return the device bytes of the modules in the training that needs the most memory."""
+    """Return the device bytes of modules in the stage where they need the most."""
     lists = [getattr(stage, "modules", ()) for stage in stages]
     return max((sum(module.device_bytes(views, tile) for module in modules) for modules in lists), default=0)
 
 
 def table_widths(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the number of components of each parameter and moment.  motion: its columns; 0 for static models."""
+    """Return the number of components of each parameter and moment.  motion: number of its columns."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
@@ -123,11 +123,11 @@ def plan(
     harmonics: Location = "device",
     visible: float = VISIBLE_FRACTION,
 ) -> MemoryPlan:
-    """Return the plan for Gaussians with tables of these components, by name.
+    """Return the memory plan for Gaussians.  components: number of components of each table, by name.
 
-    photographs: their bytes on the device; pixels: of the largest view, in whole tiles; pixel_sums: sums over pixels
-    per Gaussian in the backward pass; harmonics: the memory of the bands above 0; visible: the fraction of Gaussians
-    whose harmonics are on the device for a view.
+    photographs: bytes of photographs on the device; pixels: number of pixels of the largest view, in full tiles;
+    pixel_sums: number of sums over pixels per Gaussian in the backward pass; harmonics: where the bands above 0 are
+    stored; visible: fraction of Gaussians whose harmonics are on the device for a view, if they are offloaded.
     """
     fractions = dict.fromkeys(HARMONICS, visible) if harmonics == "host" else {}
     bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}

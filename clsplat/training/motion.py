@@ -28,22 +28,22 @@ class MotionRates(Settings):
     training_keys: ClassVar[frozenset[str]] = frozenset({"min_duration"})
 
     velocity: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of velocities, in units of the scene's extent; decaying, as in FreeTimeGS."""
+    """Learning rate of velocities, in units of the scene's extent; it decays, as in FreeTimeGS."""
     time_center: Rate = 1.0e-3
-    """Of the times of largest opacity."""
+    """Learning rate of time centers, at which opacities are largest."""
     log_duration: Rate = 1.0e-2
-    """Of the logarithms of durations."""
+    """Learning rate of the logarithms of durations."""
     acceleration: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of accelerations, in units of the scene's extent."""
+    """Learning rate of accelerations, in units of the scene's extent."""
     jerk: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of the cubic coefficients, in units of the scene's extent."""
+    """Learning rate of the cubic coefficients, in units of the scene's extent."""
     turn: Rate = 1.0e-3
-    """Of the time derivatives of quaternions."""
+    """Learning rate of the time derivatives of quaternions."""
     min_duration: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Lower bound of durations; a Gaussian that is much shorter than a frame is invisible between two frames."""
 
     def times(self, factor: float) -> "MotionRates":
-        """Return the rates multiplied by a factor."""
+        """Return all rates multiplied by a factor."""
         return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 
     @property
@@ -51,7 +51,7 @@ class MotionRates(Settings):
         return [name for name in type(self).model_fields if name != "min_duration"]
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates at a global step by field name, and `min_duration`.  extent: scene extent, scene units."""
+        """Return the rates at a global step, keyed by field, and `min_duration`.  extent: of the scene, scene units."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
         return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
 
@@ -66,8 +66,8 @@ def update_motion(
 ) -> None:
     """Update the motion from gradients in memory.
 
-    depth_key: [S], of the view; rates: from MotionRates.at; updates: their number, including this one; every: all bits
-    set to update all rows, 0 for visible rows only.
+    depth_key: depth keys of the view, [S]; rates: from MotionRates.at; updates: number of updates, including this one;
+    every: all bits set to update all rows, 0 to update only visible rows.
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)
     beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]

@@ -1,4 +1,4 @@
-"""Write and read the records of a run, metrics.jsonl, and estimate the remaining time from them."""
+"""Write and read metrics.jsonl, the records of a run, and estimate the remaining training time."""
 
 import json
 import logging
@@ -32,7 +32,7 @@ FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # what pages and `cls
 
 
 class Records:
-    """The records in a run folder; each line of metrics.jsonl has its step.
+    """The records of a run: lines of metrics.jsonl, each with a step and a kind.
 
     Lines are buffered until their stage is done, because a failed stage is repeated on resume.
     """
@@ -42,12 +42,12 @@ class Records:
         self.out = out
         self._require_held = require_lock
         self.path, self.trial = out / RECORDS, out / TRIAL
-        self.lines = 0  # of metrics.jsonl in the state of the run, including buffered ones
-        self.lines_at_stage = 0  # of them at the start of the stage, which a resumed run repeats
+        self.lines = 0  # number of lines in the state of the run, including buffered ones
+        self.lines_at_stage = 0  # number of lines at the start of the stage, which a resumed run repeats
         self._pending: list[str] = []
 
     def move_to_trial(self) -> None:
-        """Move all lines to trial.jsonl before a refit.  Raises OutputError."""
+        """Move all lines to trial.jsonl before a refit.  Raises OutputError if the file cannot be moved."""
         self.write()
         self._require_held()
         with raising_output_error(self.trial):
@@ -55,7 +55,7 @@ class Records:
         self.lines = 0
 
     def start(self, is_refit: bool = False) -> None:
-        """Drop the lines after the restored state, which the resumed run writes again.
+        """Drop the lines that were written after the restored state; the resumed run writes them again.
 
         If the state is from before a refit, the lines in trial.jsonl are moved back.  A line that cannot be read is
         dropped with all lines after it, and a warning is logged.
@@ -76,12 +76,12 @@ class Records:
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
-        """Add a line, which `write` or the end of the stage appends to the file."""
+        """Add a line; `write` or the end of the stage appends it to the file."""
         self._pending.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
         self.lines += 1
 
     def write(self) -> None:
-        """Append the buffered lines, and sync the file, because a checkpoint counts them.
+        """Append the buffered lines, and sync the file, because a checkpoint contains their number.
 
         If this raises OutputError, the lines stay buffered, and the file is unchanged.
         """
@@ -93,7 +93,7 @@ class Records:
 
     @contextmanager
     def stage(self) -> Iterator[None]:
-        """Write the lines of the block at its end; if it fails, drop them."""
+        """Write the lines that the block adds when it ends; drop them if it fails."""
         lines, pending = self.lines, len(self._pending)
         try:
             yield
@@ -104,10 +104,10 @@ class Records:
             raise
 
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
-        """Return the lines, of one kind or all, without an incomplete last line from a crash.
+        """Return the lines of one kind, or all lines.  An incomplete last line, left by a crash, is ignored.
 
-        Lines of a kind in FIELDS that lack one of its fields are skipped: a stage of a plug-in has recorded them.
-        trial: return the lines from before a refit.  Raises DataError, with file and line, for any other damage.
+        Lines that lack a field that FIELDS lists for their kind are skipped, since a plug-in wrote them.  trial: return
+        the lines from before a refit.  Raises DataError, with file and line, for any other damage.
         """
         fields = FIELDS.get(kind or "", {})
         return [
@@ -134,7 +134,7 @@ class Records:
             yield line
 
 
-# The time of a training step on the device, by stage of the step.
+# The device time of a training step, by stage of the step.
 
 KERNELS = {
     "project": "project_forward",
@@ -168,7 +168,7 @@ STAGES = {kernel: stage for stage, kernels in KERNELS.items() for kernel in kern
 
 
 def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
-    """Return the mean milliseconds of each stage over the `steps` sampled since the last call."""
+    """Return the mean time of each stage of a step, ms.  steps: number of steps sampled since the last call."""
     totals: dict[str, float] = defaultdict(float)
     for (label, section), seconds in timings.take().items():
         totals[STAGES.get(label.partition(":")[2], section)] += 1e3 * sum(seconds) / steps
@@ -176,27 +176,27 @@ def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
 
 
 def clocks() -> tuple[float, float]:
-    """Return wall-clock time, and CPU time of all threads, in s."""
+    """Return the wall-clock time and the CPU time of all threads, s."""
     return time.perf_counter(), time.process_time()
 
 
-# The progress of a training: PSNR averaged over reports, and the remaining time.
+# The progress of training: PSNR averaged over reports, and the remaining time.
 
 VIEWS = 5  # reports over which PSNR is averaged
 LATEST = 3  # reports over which step time is averaged
 TREND = 4  # reports from which growth is extrapolated
 MIN_RATIO = 2.0  # between Gaussian counts, so that the cost of one can be fitted
-DEFAULT_COST = 0.6  # of an additional Gaussian, relative to the mean time per Gaussian, if it cannot be fitted
+DEFAULT_COST = 0.6  # time of an additional Gaussian, relative to the mean, if it cannot be fitted
 MIN_COST = 0.4  # likewise; fits are unreliable on a busy machine
 
 
 def moving_average(psnrs: Sequence[float]) -> list[float]:
-    """Average PSNR over the last VIEWS reports, since a report covers one view and views differ by many dB."""
+    """Return the moving average of PSNR over VIEWS reports; a report covers one view, and views differ by many dB."""
     return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
 class Forecast:
-    """Estimate the remaining time of a training that ends at `last_step`, with growth until `growth_end`."""
+    """Estimator of the remaining training time.  Training ends at step `last_step`, and growth at `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end
@@ -205,18 +205,18 @@ class Forecast:
 
     @classmethod
     def from_rules(cls, step: int, last_step: int, due: Sequence[Callable[[int], bool]]) -> "Forecast":
-        """Create the forecast of a training after `step`.  due: for each density rule, whether it acts at a step."""
+        """Create a forecast for training after `step`.  due: for each density rule, whether it acts at a given step."""
         later = range(last_step - 1, step, -1)  # no rule acts after the last step
         return cls(last_step, next((later_step for later_step in later if any(rule(later_step) for rule in due)), step))
 
     def add(self, step: int, psnr: float, gaussians: int, seconds: float) -> None:
-        """Add a report.  seconds: mean time of a step since the last report."""
+        """Add a report.  psnr: dB; seconds: mean time of a step since the last report."""
         self._psnrs.append(psnr)
         self._reports.append((step, gaussians, seconds))
 
     @property
     def psnr(self) -> float:
-        """The PSNR of the last reports, averaged, dB."""
+        """The mean PSNR of the last reports, dB."""
         return moving_average(self._psnrs[-VIEWS:])[-1]
 
     @property
@@ -227,20 +227,20 @@ class Forecast:
 
     @property
     def seconds_left(self) -> float:
-        """The time until the last step, s.
+        """The estimated time until the last step, s.
 
-        It assumes that the time of a step is linear in the number of Gaussians, and that growth continues at the rate
-        of the last reports until `growth_end`.
+        The estimate assumes that the time of a step is linear in the number of Gaussians, and that growth continues at
+        the rate of the last reports until `growth_end`.
         """
         steps, counts, seconds = (np.array(column, np.float64) for column in zip(*self._reports, strict=True))
-        cost, left = self._cost(counts, seconds), self.last_step - steps[-1]
-        current = float(seconds[-LATEST:].mean() + cost * (counts[-1] - counts[-LATEST:].mean()))
-        growing = min(max(0.0, self.growth_end - steps[-1]), left)
-        if growing == 0 or len(steps) < 2:
-            return current * float(left)
+        cost, steps_left = self._cost(counts, seconds), self.last_step - steps[-1]
+        current_seconds = float(seconds[-LATEST:].mean() + cost * (counts[-1] - counts[-LATEST:].mean()))
+        growth_steps = min(max(0.0, self.growth_end - steps[-1]), steps_left)
+        if growth_steps == 0 or len(steps) < 2:
+            return current_seconds * float(steps_left)
         growth = (counts[-1] - counts[-TREND:][0]) / (steps[-1] - steps[-TREND:][0])
-        later = current + max(0.0, cost * growth * growing)
-        return float(growing * (current + later) / 2 + (left - growing) * later)
+        final_seconds = current_seconds + max(0.0, cost * growth * growth_steps)
+        return float(growth_steps * (current_seconds + final_seconds) / 2 + (steps_left - growth_steps) * final_seconds)
 
     @staticmethod
     def _cost(counts: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:

@@ -1,4 +1,4 @@
-"""Hold the state of a pipeline while it runs."""
+"""Define the state of a pipeline while it runs."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -53,7 +53,7 @@ class Run:
     model_settings: ModelSettings
     harmonics: Harmonics = "device"  # memory for the bands above 0 in training
     identity: Identity | None = None  # of the original scene and its photographs
-    file_hashes: dict[str, str] = field(default_factory=dict)  # of the files that settings name, by path
+    file_hashes: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by path
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     preparation: dict[str, dict[str, Any]] = field(default_factory=dict)  # results of the steps of `prepare:`
     losses: list[Loss] = field(default_factory=list)  # from Python, in addition to those of the pipeline
@@ -91,7 +91,7 @@ class Run:
 
     @property
     def model(self) -> DeviceModel:
-        """The model.  Raises ConfigError if no stage has created one."""
+        """The Gaussians and their rendering settings.  Raises ConfigError if no stage has created a model."""
         if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
         for state in self.modules.values():
@@ -103,7 +103,7 @@ class Run:
         self._model, self.learned_field = model, None
 
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
-        """Return the renderer of views.  rasterizer: None for that of training.  Raises ConfigError like `model`."""
+        """Return the renderer of views.  rasterizer: default: that of training.  Raises ConfigError like `model`."""
         if self.learned_field:
             return self.learned_field.painter
         return SplatPainter(rasterizer or self.rasterizer, self.model, self.photographs.background)
@@ -114,7 +114,7 @@ class Run:
         return None if self.learned_field else self.model.gaussians.count
 
     def not_finite(self) -> list[str]:
-        """Return the names of trained tables with NaN or infinity."""
+        """Return the names of the trained tables that contain NaN or infinity."""
         return self.learned_field.not_finite() if self.learned_field else self.model.gaussians.not_finite()
 
     def next_stage(self, index: int) -> None:
@@ -137,7 +137,7 @@ class Run:
         return self.best is not None and self.best.refit == "begun"
 
     def restart_for_refit(self, best: Best) -> None:
-        """Return to the start of the pipeline, to train again for the number of steps of the best model."""
+        """Reset the run to the start of its pipeline, to train again for the number of steps of the best model."""
         self._model = None
         self.adam = self.stats = None
         self.modules = {}
@@ -153,19 +153,19 @@ class Run:
         self.use_split(self.original.merge_validation())
 
     def use_split(self, original: Scene) -> None:
-        """Replace the original scene by one whose views are split differently."""
+        """Replace the original scene by one with a different split of its views."""
         self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager
     def editing_tables(self) -> Iterator[None]:
-        """Mark the run as inconsistent while the block edits its tables; the mark stays if the block fails."""
-        before, self.is_consistent = self.is_consistent, False
+        """Mark the run as inconsistent while the block edits its tables; it stays inconsistent if the block fails."""
+        was_consistent, self.is_consistent = self.is_consistent, False
         yield
-        self.is_consistent = before
+        self.is_consistent = was_consistent
 
     def add_training_time(self, start: tuple[float, float]) -> float:
-        """Add the time since `start` to the training time; return the wall-clock seconds."""
+        """Add the time since `start`, a result of `clocks`, to the training time; return the wall-clock seconds."""
         seconds, cpu = (end - begin for end, begin in zip(clocks(), start, strict=True))
         self.train_seconds += seconds
         self.cpu_seconds += cpu
@@ -173,12 +173,12 @@ class Run:
 
     @property
     def scene_name(self) -> str:
-        """The name of the scene on pages."""
+        """The name of the scene in reports."""
         return scene_name(self.pipeline["scene"]["path"] or self.scene.path)
 
     @property
     def inputs(self) -> str:
-        """A hash of the photographs, cameras, and points; "" if they were not hashed."""
+        """The hash of the photographs, cameras, and points; "" if they were not hashed."""
         return self.identity.digest if self.identity else ""
 
     @property
@@ -207,7 +207,7 @@ class Run:
     ) -> MemoryPlan:
         """Plan the device memory for training with the current tables, or those in `components`.
 
-        harmonics: the memory of the bands above 0; None for their current one; visible: as in `plan`.
+        harmonics: where the bands above 0 are stored; None for their current location; visible: as in `plan`.
         """
         if harmonics is None:
             harmonics = "host" if self.model.gaussians.on_host else "device"
@@ -229,30 +229,30 @@ class Run:
             measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
 
     def survey(self) -> Survey:
-        """Return a survey of the training views, for the rules of an edit."""
+        """Return a survey of the training views for the rules of an edit."""
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
     def texture_quantile(self, q: float) -> float:
-        """Return the quantile `q` of the gradient magnitude, per px, over all training photographs."""
+        """Return the quantile `q` of the gradient magnitude, px⁻¹, over the pixels of all training photographs."""
         if q not in self._texture_quantiles:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
             self._texture_quantiles[q] = texture_quantile(self.rasterizer.workspace, photographs, q)
         return self._texture_quantiles[q]
 
     def training_images(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield the photographs of the training views, each [height, width, 3], and count them as progress."""
+        """Yield the photographs of the training views, each [height, width, 3], and report the progress."""
         views = self.scene.split("train")
         for view in self.status.counted(views, "photographs", len(views)):
             yield self.photographs.get(view).image()
 
 
-# The model of a run for files: its tables on the host, and its rendering settings in training.
+# A run's model for files: its tables on the host, and the rendering settings of training.
 
 
 def host_model(run: Run) -> Model:
     """Copy the model to the host, with its world filter as a separate table, not baked into the scales.
 
-    Raises ConfigError if no stage has created one.
+    Raises ConfigError if no stage has created a model.
     """
     model, gaussians = run.model, run.model.gaussians
     tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}
@@ -263,12 +263,12 @@ def host_model(run: Run) -> Model:
 
 
 def sky_center(run: Run) -> NDArray[np.float64]:
-    """Return the point, [3], from which Gaussians of the sky agree with its map: the middle of the cameras."""
+    """Return the median camera position, [3]; seen from there, Gaussians of the sky agree with its map."""
     return np.median([view.position for view in run.scene.views], axis=0)
 
 
 def _rendering(run: Run) -> dict[str, Any]:
-    """Return the settings with which viewers render the model file as in training."""
+    """Return the settings with which viewers render the model as in training."""
     model = run.model
     rendering: dict[str, Any] = {
         "near": model.near,

@@ -1,4 +1,4 @@
-"""Compare two resolved pipelines, and classify which differences a resumed run allows."""
+"""Compare two resolved pipelines, and classify the differences by whether a resumed run allows them."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -22,7 +22,7 @@ class Difference(NamedTuple):
         return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"
 
     def is_moved_file(self, old_hashes: Mapping[str, str], new_hashes: Mapping[str, str]) -> bool:
-        """Return whether a file was only moved.  old_hashes, new_hashes: hashes of input files, by path."""
+        """Return whether a file was only moved.  old_hashes, new_hashes: hashes of input files by path."""
         is_text = isinstance(self.old, str) and isinstance(self.new, str)
         return is_text and self.old in old_hashes and old_hashes[self.old] == new_hashes.get(self.new)
 
@@ -46,7 +46,7 @@ def differences(
             path = f"{key_path}.{key}" if key_path else str(key)
             yield from differences(old.get(key), new.get(key), inner, path, kind or inner_kind)
     elif isinstance(old, list) and isinstance(new, list) and (kinds := _kinds([*old, *new])):
-        before, after = ({item["type"]: item for item in part} for part in (old, new))
+        before, after = ({item["type"]: item for item in entries} for entries in (old, new))
         items = {item.type: item for item in settings or ()}
         for name in dict.fromkeys([*before, *after]):
             item_kind = kind or (
@@ -62,7 +62,7 @@ def differences(
 
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
-    """Return the classes of a list's items by type, if the items are addressed by type."""
+    """Return the settings classes of a list's items by type; empty unless all items are addressed by type."""
     classes = {tag[1]: kind for kind in Settings.subclasses if kind.keyed_by_type and (tag := variant_tag(kind))}
     types = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
     return {name: classes[name] for name in types} if all(name in classes for name in types) else {}
@@ -74,7 +74,7 @@ def first_difference(old: Any, new: Any) -> Difference | None:
 
 
 def _child(settings: Any, key: str) -> tuple[Any, Kind]:
-    """Return the settings below a key, and the kind of a change of the key."""
+    """Return the settings under a key, and the kind of a difference of that key."""
     if not isinstance(settings, Settings):
         return None, None
     if key in type(settings).model_fields:

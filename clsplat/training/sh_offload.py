@@ -1,4 +1,4 @@
-"""Offload the harmonics of a training to the host, if the device cannot hold them."""
+"""Offload spherical harmonics to the host during training if they do not fit on the device."""
 
 import logging
 import math
@@ -9,14 +9,14 @@ from clsplat.training.memory import VISIBLE_FRACTION, Location, MemoryPlan, offl
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-FACTOR = 2  # on the number of Gaussians; an edit rarely adds more
-VIEWS = 16  # rendered to measure how many Gaussians a view sees
+FACTOR = 2  # largest expected growth of the number of Gaussians in an edit
+VIEWS = 16  # number of views rendered to measure the fraction of visible Gaussians
 
 
 def offload_harmonics(run: Run) -> None:
-    """Move the harmonics to the host before a training, if the settings require it or the device is too small.
+    """Move the harmonics to the host before training, if the settings require it or they do not fit on the device.
 
-    Must be called before Adam allocates their moments, which are larger.
+    Call this before Adam allocates their moments, which need twice the memory of the harmonics.
     """
     gaussians = run.model.gaussians
     if gaussians.on_host is None and gaussians.count <= device_capacity(run, gaussians.count):
@@ -24,7 +24,7 @@ def offload_harmonics(run: Run) -> None:
 
 
 def make_room(run: Run, count: int) -> None:
-    """Move the harmonics to the host if the device cannot hold those of `count` Gaussians.  Bits stay the same."""
+    """Move the harmonics to the host if those of `count` Gaussians do not fit on the device.  Results do not change."""
     gaussians = run.model.gaussians
     if gaussians.on_host or offload_target(run.harmonics, run.device.info) == "device":
         return
@@ -38,10 +38,10 @@ def make_room(run: Run, count: int) -> None:
 
 
 def device_capacity(run: Run, needed: float = math.inf) -> int:
-    """Return how many Gaussians fit on the device, with harmonics offloaded if that is allowed and helps.
+    """Return the number of Gaussians that fit on the device, with offloaded harmonics if the settings allow it.
 
-    With `auto`, the result depends only on the Gaussians, not on where their harmonics are now.  needed: the number of
-    Gaussians that suffices, so that the search may stop.
+    With `auto`, the result does not depend on where the harmonics are now.  needed: number of Gaussians that must fit;
+    if they fit without offloading, the fraction of visible Gaussians is not measured.
     """
     location = offload_target(run.harmonics, run.device.info)
     capacity = _plan(run, location if run.harmonics == "host" else "device").limit
@@ -52,20 +52,20 @@ def device_capacity(run: Run, needed: float = math.inf) -> int:
 
 
 def offload_advice(run: Run) -> str:
-    """Return a further remedy for an error message if the settings keep harmonics on the device, else ""."""
+    """Return the advice to offload harmonics, as the end of an error message; "" if it would not help."""
     helps = run.pipeline["rasterizer"]["harmonics"] == "device" and not run.device.info.unified
     return ", or rasterizer.harmonics=auto" if helps else ""
 
 
 def _plan(run: Run, harmonics: Location, visible: float = VISIBLE_FRACTION) -> MemoryPlan:
-    """Return the memory plan including Adam moments, even if they are not allocated yet."""
+    """Return the memory plan, including Adam moments that are not allocated yet."""
     widths, trained = run.model.gaussians.components, run.model.gaussians.trained
     moments = {moment: widths[name] for name in trained for moment in moment_tables(name)}
     return run.memory_plan({**widths, **moments}, harmonics, visible)
 
 
 def _visible_fraction(run: Run) -> float:
-    """Return the largest fraction of row blocks visible in one of VIEWS training views, with a margin."""
+    """Return the largest fraction of row blocks visible in one view, over VIEWS training views, with a margin."""
     survey, gaussians = run.survey(), run.model.gaussians
     lanes, largest = int(run.device.tuning["LANES"]), 0.0
     for view in survey.render(survey.sample_views(VIEWS)):

@@ -1,4 +1,4 @@
-"""Define the base classes of stages: settings, the parts of a run that they need and create, and `run`."""
+"""Define the base classes of stages, which declare the parts of a run that they need and create."""
 
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Sequence
@@ -22,13 +22,13 @@ CADENCE = frozenset({"every", "start", "stop"})
 
 @dataclass(frozen=True)
 class PathInRun(AfterValidator):
-    """Mark a field that holds a path inside the run folder: a file if there are suffixes, else a folder."""
+    """Marker of a field that is a path inside the run folder: of a file if there are suffixes, else of a folder."""
 
     suffixes: tuple[str, ...] = ()
 
 
 def path_in_run(*suffixes: str) -> PathInRun:
-    """Mark a field that holds a file in the run folder, with one of `suffixes`, or a folder."""
+    """Return the marker of a field that is the path of a file with one of `suffixes`, or of a folder."""
 
     def check(text: str) -> str:
         fault = invalid_output_reason(text)
@@ -42,13 +42,15 @@ def path_in_run(*suffixes: str) -> PathInRun:
 
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
-    """Return the marks in metadata, and in the metadata of a type's arguments."""
+    """Return the markers in metadata and in the metadata of a type's arguments."""
     marks = [mark for mark in metadata if isinstance(mark, PathInRun)]
-    return marks + [mark for part in get_args(kind) for mark in _marks(part, getattr(part, "__metadata__", ()))]
+    return marks + [
+        mark for argument in get_args(kind) for mark in _marks(argument, getattr(argument, "__metadata__", ()))
+    ]
 
 
 class Stage(Settings):
-    """One stage of a pipeline, which changes the run and returns nothing."""
+    """A stage of a pipeline, which changes the run and returns nothing."""
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
@@ -75,12 +77,12 @@ class Stage(Settings):
 
     @classmethod
     def named_outputs(cls) -> dict[str, tuple[str, ...]]:
-        """Return the fields that hold a path inside the run folder, each with its suffixes."""
+        """Return the suffixes of each field that is a path inside the run folder, by field."""
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
         return {name: files[0].suffixes for name, files in marks.items() if files}
 
     def act(self, run: Run) -> None:
-        """Run the stage under its name in status.json.  A failure during an edit leaves the run inconsistent.
+        """Run the stage and report it in status.json.  A failure during an edit leaves the run inconsistent.
 
         A failed stage is repeated from its start on resume, so its records are dropped.
         """
@@ -103,7 +105,7 @@ class Scheduled(Stage):
 
     training_keys: ClassVar[frozenset[str]] = CADENCE
     step_keys: ClassVar[frozenset[str]] = CADENCE
-    ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
+    ends: ClassVar[bool] = False  # whether it also runs after the last step of training
 
     every: EverySteps | None = None
     """Steps from one run of the stage to the next, may be fractional; only in `during`."""
@@ -116,10 +118,10 @@ class Scheduled(Stage):
         """Add the tables that the stage needs, before the first step; a resumed run already has them."""
 
     def finish(self, run: Run) -> None:
-        """Finish after the last step of the training; a resumed run may call this again."""
+        """Finish after the last step of training; a resumed run may call this again."""
 
     def is_due(self, step: int, is_last: bool = False) -> bool:
-        """Return whether the stage runs at a global step.  is_last: whether it is the last of the training."""
+        """Return whether the stage runs at a global step.  is_last: whether it is the last step of training."""
         if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
@@ -134,11 +136,11 @@ class Scheduled(Stage):
 
 
 def find_output_conflict(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write as a file, or one as a file and one as a folder; None if there is none.
+    """Return a path that two stages would write, at least one of them as a file; None without such a path.
 
     Stages may share a folder.  Names are compared without case, since some file systems ignore it.
     """
-    written: list[tuple[tuple[str, ...], bool]] = []  # the parts of a path, and whether it is a file
+    earlier_paths: list[tuple[tuple[str, ...], bool]] = []  # components of each path, and whether it is a file
     for stage in stages:
         if not (outputs := stage.named_outputs()):  # other stages write its files
             continue
@@ -148,10 +150,12 @@ def find_output_conflict(stages: Sequence[Stage]) -> str | None:
             for path in stage.outputs(Path())
         ]
         for parts, is_file in paths:
-            for other, other_is_file in written:
-                if (is_file and other[: len(parts)] == parts) or (other_is_file and parts[: len(other)] == other):
+            for earlier_parts, earlier_is_file in earlier_paths:
+                if (is_file and earlier_parts[: len(parts)] == parts) or (
+                    earlier_is_file and parts[: len(earlier_parts)] == earlier_parts
+                ):
                     return "/".join(parts)
-        written += paths
+        earlier_paths += paths
     return None
 
 
@@ -159,12 +163,12 @@ def find_output_conflict(stages: Sequence[Stage]) -> str | None:
 
 
 class Training(Stage):
-    """A training with a number of steps, and stages that run between steps."""
+    """A stage that trains for a number of steps, and runs other stages between steps."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    rehearsal_steps: ClassVar[int] = 200  # timed for `--minutes`; also the minimum number of steps trained
+    rehearsal_steps: ClassVar[int] = 200  # steps timed for `--minutes`; also the minimum number of training steps
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
@@ -193,10 +197,10 @@ class Training(Stage):
         return [path for stage in self.during for path in stage.outputs(out)]
 
     def active_stages(self, step: int) -> list[Scheduled]:
-        """Return the stages of `during` that will run in a training that starts after a global step."""
+        """Return the stages of `during` that will run if training starts after a global step."""
         last = step + self.steps
-        before = range(step + 1, last)  # no edit runs after the last step
-        return [s for s in self.inner if any(map(s.is_due, before)) or (not s.edits and s.is_due(last, True))]
+        inner_steps = range(step + 1, last)  # no edit runs after the last step
+        return [s for s in self.inner if any(map(s.is_due, inner_steps)) or (not s.edits and s.is_due(last, True))]
 
     @property
     def inner(self) -> list[Scheduled]:
@@ -208,21 +212,21 @@ class Training(Stage):
         return list(during)
 
     def has_ended(self, run: Run) -> bool:
-        """Return whether all steps of the training are done."""
+        """Return whether all steps of the stage are done."""
         return run.stage_step >= self.steps
 
     def after_stage(self, run: Run, stage: Scheduled) -> None:
         """Called after a stage of `during` has run."""
 
     def finish(self, run: Run) -> None:
-        """Finish the training after its last step."""
+        """Finish training after the last step."""
 
     def act(self, run: Run) -> None:
         with run.status.stage(self.stage):  # no records are dropped: it resumes in the middle
             self.run(run)
 
     def act_between(self, run: Run) -> None:
-        """Run the due stages that do not edit; a failed stage runs again on resume."""
+        """Run the stages that are due and do not edit; a failed stage runs again on resume."""
         for index, stage in enumerate(self.inner):
             due = run.stage_step > 0 and (stage.is_due(run.step, self.has_ended(run)) or stage.is_overdue(run))
             if index < run.during_index or stage.edits or not due:

@@ -58,11 +58,11 @@ class Status(BaseModel):
     step: Count | None = None
     """Training steps done, of all stages; not of a matrix."""
     steps: Count | None = None
-    """Step at which the training in progress ends."""
+    """Step at which the current training ends."""
     gaussians: Count | None = None
     """Number of Gaussians at the last report."""
     seconds_left: Seconds | None = None
-    """Estimated remaining time of the training at the last report; in a preparation, only of reading the scene."""
+    """Estimated remaining training time at the last report; during preparation, the time to read the scene."""
     checkpoint: str | None = None
     """Newest checkpoint, the name of a file in the folder `checkpoints`."""
     cells: Count | None = None
@@ -72,11 +72,11 @@ class Status(BaseModel):
     failed: dict[str, str] | None = None
     """Failed cells of a matrix, with reasons."""
     store: str | None = None
-    """Store of the cells of a matrix, if it has one; `store` if it is in the folder of the matrix."""
+    """Path of the store of a matrix's cells, if it has a store; `store` if it is in the folder of the matrix."""
     exit_code: int | None = None
     """Exit code of a run that ended."""
     message: str | None = None
-    """The reason why a run failed or was interrupted."""
+    """Reason why a run failed or was interrupted."""
     device: str | None = None
     """OpenCL device and runtime."""
     version: str
@@ -100,7 +100,7 @@ class Status(BaseModel):
 def parse_status(content: Any) -> Status | None:
     """Validate the contents of a status.json; return None if a newer version wrote it.
 
-    Raises DataError with the first wrong field.
+    Raises DataError, which names the first invalid field.
     """
     if isinstance(content, dict) and type(version := content.get("format")) is int and version > FORMAT:
         return None
@@ -165,7 +165,7 @@ class StatusFile:
         self._start_heartbeat()
 
     def require_lock(self) -> None:
-        """Raise OutputError if the run no longer holds its folder; called before each write there."""
+        """Raise OutputError if the run no longer holds the lock of its folder; called before each write to it."""
         try:
             self._require_held()
         except OutputError as error:
@@ -200,11 +200,11 @@ class StatusFile:
             pass
 
     def count(self, unit: str, done: int, total: int, **values: Any) -> None:
-        """Set the progress of the stage, and other fields."""
+        """Set the progress of the stage and other fields.  unit: what is counted, in words."""
         self.note(progress=Amount(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
-        """Yield the items and count them as progress; an item is done when the next one is requested."""
+        """Yield the items and report the progress; an item is done when the next one is requested."""
         for number, item in enumerate(items):
             self.count(unit, number, total)
             yield item
@@ -218,7 +218,7 @@ class StatusFile:
         """
         self.require_lock()
         outer = {"stage": self.now.stage, "progress": self.now.progress}
-        start, nested_before = time.perf_counter(), self._nested_seconds
+        start, outer_nested_seconds = time.perf_counter(), self._nested_seconds
         self._nested_seconds = 0.0
         self._depth += 1
         self.note(stage=name, progress=None)
@@ -226,7 +226,7 @@ class StatusFile:
         self._depth -= 1
         seconds = time.perf_counter() - start
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds - self._nested_seconds
-        self._nested_seconds = nested_before + seconds
+        self._nested_seconds = outer_nested_seconds + seconds
         if self._depth:
             self.note(**outer)
 

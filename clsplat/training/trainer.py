@@ -61,7 +61,7 @@ class StepTrainer:
     losses: Sequence[Loss]
     rates: Rates
     extent: float = 1.0  # scene units
-    rows: Rows = "all"  # Gaussians that a step changes
+    rows: Rows = "all"  # Gaussians that a step updates
     views_per_update: Schedule = 1  # Adam updates with the mean of their gradients
     modules: Sequence[ModuleState] = ()  # forward in this order, backward in reverse
 
@@ -126,7 +126,7 @@ class StepTrainer:
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
-        """Return the result of `compare` with the gradient of its losses, as sums over pixels."""
+        """Differentiate the losses that `compare` returned; return them with the gradient, as sums over pixels."""
         data, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
         mask = data.planes.mask
         if mask is not None:
@@ -153,23 +153,23 @@ class StepTrainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion,
-        depths, and gradients of several views, a fused kernel is used, which writes no gradients to memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  If there are no penalties, stale parameters, motion,
+        depths, or gradients of several views, a fused kernel updates without writing gradients to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
         gaussians, has_depth = self.model.gaussians, view.frame.content == "inverse_depth"
-        has_views = self.views_per_update != 1
-        if not (penalties or stale or gaussians.is_moving or has_depth or has_views):
+        has_several_views = self.views_per_update != 1
+        if not (penalties or stale or gaussians.is_moving or has_depth or has_several_views):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         is_deferred = self.rows == "deferred" or gaussians.on_host
-        current = gradients.without_deferred() if is_deferred else gradients
-        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, current, self.extent, step)
+        view_gradients = gradients.without_deferred() if is_deferred else gradients
+        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, view_gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(require_loss_value(penalty, penalty.add(inputs)) for penalty in penalties)
-        if has_views:
+        if has_several_views:
             attach_gradients(gaussians)
             gradients = add_gradients(gaussians, gradients)
             if step % int(at_step(self.views_per_update, step)):
