@@ -1,8 +1,8 @@
-"""Read depth maps of other programs, one image per photograph, and fit them to the points of the scene.
+"""Read depth maps that other programs created, one image per photograph, and fit them to the points of the scene.
 
-A value is an inverse depth (bright is near) up to a scale and an offset per map, as networks for monocular depth
-predict it.  Both are fitted to the points that the photograph shows, by least absolute differences, since some points
-are wrong.
+The values of a map are inverse depths (bright is near) up to an unknown scale and offset, as predicted by networks for
+monocular depth.  The scale and the offset are fitted to the points that are visible in the photograph.  The fit
+minimizes absolute differences, since some points are wrong.
 """
 
 import logging
@@ -25,12 +25,12 @@ from clsplat.scene.scene import Tracks
 
 LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.floating]
-MIN_POINTS = 10  # per photograph, to fit a map
-MAX_PIXELS = 32_768  # of a map, used as supervision
+MIN_POINTS = 10  # points of a photograph that are required to fit a map
+MAX_PIXELS = 32_768  # pixels of a map that are used as supervision
 ROUNDS = 20
-EXACT = 1e-3  # of the points' spread: smaller differences do not get larger weights
+EXACT = 1e-3  # fraction of the points' spread; smaller differences do not get larger weights
 TINY = 1e-12  # scene units⁻¹, against division by zero if all points have the same depth
-MAX_RESIDUAL = 0.5  # of the points' spread; a map that leaves more does not fit
+MAX_RESIDUAL = 0.5  # fraction of the points' spread; a map with a larger residual does not fit
 
 
 def _png_names(name: str) -> list[str]:
@@ -39,22 +39,25 @@ def _png_names(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """A folder of depth maps: `b/a.png`, of 8 or 16 bits and any size, for the photograph `b/a.jpg`."""
+    """A folder of depth maps.  The map of the photograph `b/a.jpg` is `b/a.png`, with 8 or 16 bits and of any size."""
 
     folder: Path
     _files: dict[str, Path] = field(default_factory=dict, compare=False)
 
     def require(self, names: Iterable[str]) -> None:
         """Raise DataError if a photograph has no map."""
-        new = [name for name in names if name not in self._files]
-        files = FileLookup(self.folder, self.folder, new, _png_names, strict=True)
-        for name, file in zip(new, files.paths, strict=True):
+        new_names = [name for name in names if name not in self._files]
+        files = FileLookup(self.folder, self.folder, new_names, _png_names, strict=True)
+        for name, file in zip(new_names, files.paths, strict=True):
             if not file.is_file():
                 raise DataError(f"{file}: the depth map of {name} is missing; add it, or --set another folder")
-        self._files.update(zip(new, files.paths, strict=True))
+        self._files.update(zip(new_names, files.paths, strict=True))
 
     def read(self, name: str, width: int, height: int) -> Floats:
-        """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError if it is missing."""
+        """Read the depth map of a photograph, resized to [height, width], with values in [0, 1].
+
+        name: the name of the photograph.  Raises DataError if the map is missing.
+        """
         self.require([name])
         pixels = read_image(self._files[name])[:, :, 0]
         values: NDArray[Any] = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
@@ -65,10 +68,10 @@ class DepthMaps:
     def sample(
         self, name: str, size: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp], inverse: Floats
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats] | None:
-        """Return rows, columns and inverse depths at an even grid of pixels of a photograph of size (width, height).
+        """Sample a photograph's depth map on a regular grid of pixels; return their rows, columns, and inverse depths.
 
-        rows, columns: [K] pixels of points, with their inverse depths [K].  Returns None, with a warning, if the map
-        does not fit these depths.  Raises DataError like `read`.
+        size: (width, height) of the photograph; rows, columns, inverse: the pixels of points and their inverse depths,
+        each [K].  Logs a warning and returns None if the map does not fit these depths.  Raises DataError like `read`.
         """
         values = self.read(name, *size)
         fit = fit_scale_and_offset(values[rows, columns], inverse)
@@ -83,45 +86,45 @@ class DepthMaps:
 
 
 def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
-    """Return scale and offset from values of a map to inverse depths, [K] each; None if they do not fit.
+    """Return the scale and the offset that convert values of a depth map to inverse depths; None if they do not fit.
 
-    Least absolute differences, by iteratively reweighted least squares.
+    values, inverse: [K].  The fit minimizes absolute differences by iteratively reweighted least squares.
     """
     if len(values) < MIN_POINTS:
         return None
     x, y = np.asarray(values, np.float64), np.asarray(inverse, np.float64)
     spread = float(np.abs(y - np.median(y)).mean())
-    weights, factor, offset = np.ones(len(x)), 0.0, 0.0
+    weights, scale, offset = np.ones(len(x)), 0.0, 0.0
     for _ in range(ROUNDS):
         total = weights.sum()
         mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
         variance = (weights * (x - mean_x) ** 2).sum()
-        factor = float((weights * (x - mean_x) * (y - mean_y)).sum() / variance) if variance > 0 else 0.0
-        offset = float(mean_y - factor * mean_x)
-        weights = 1 / np.maximum(np.abs(factor * x + offset - y), EXACT * spread + TINY)
-    residual = float(np.median(np.abs(factor * x + offset - y)))
-    return (factor, offset) if factor > 0 and residual <= MAX_RESIDUAL * spread else None
+        scale = float((weights * (x - mean_x) * (y - mean_y)).sum() / variance) if variance > 0 else 0.0
+        offset = float(mean_y - scale * mean_x)
+        weights = 1 / np.maximum(np.abs(scale * x + offset - y), EXACT * spread + TINY)
+    residual = float(np.median(np.abs(scale * x + offset - y)))
+    return (scale, offset) if scale > 0 and residual <= MAX_RESIDUAL * spread else None
 
 
 # Known depths at some pixels of the training photographs, from points or depth maps.
 
-FULL_WEIGHT_VIEWS = 4  # photographs that must show a point for full weight
+FULL_WEIGHT_VIEWS = 4  # number of photographs that must show a point for its full weight
 
 
 @dataclass(frozen=True)
 class KnownDepths:
-    """Depths at pixels of one view, on the device."""
+    """Known depths at some pixels of one view, on the device."""
 
     pixels: Array  # [K] indices into a plane [rows, stride], each once
     inverse: Array  # [K] 1 / depth, scene units⁻¹
     weights: Array  # [K] in (0, 1]
-    extent: float  # of the scene, scene units: makes the loss unitless
+    extent: float  # extent of the scene, in scene units, which makes the loss unitless
 
 
 class PointDepths:
-    """The depths of the structure-from-motion points in each training view, by index of the view.
+    """The depths of the structure-from-motion points in each training view.
 
-    maps: depth maps, which are fitted to the points and used instead of them.
+    names: the names of the training views, by index; maps: depth maps to fit to the points and to use instead of them.
     """
 
     def __init__(
@@ -134,7 +137,7 @@ class PointDepths:
         self._cache: dict[tuple[int, int, int], KnownDepths | None] = {}
 
     def at(self, camera: DeviceCamera) -> KnownDepths | None:
-        """Return the known depths for a training camera; None if there are none.
+        """Return the known depths of the camera's training view.  None if there are none, or for other cameras.
 
         Raises DataError if a depth map cannot be read.
         """
@@ -164,10 +167,10 @@ class PointDepths:
 def nearest_in_pixels(
     camera: DeviceCamera, positions: NDArray[np.floating]
 ) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.intp]]:
-    """Return the ascending plane indices, [K], that positions, [M, 3], project to, and their depths and rows.
+    """Project positions, [M, 3], to pixels, and return the nearest position in each pixel.
 
-    In each pixel, only the nearest position counts, the first of equally near ones; others, and positions outside the
-    image, are dropped.
+    Returns three arrays, [K]: the ascending indices of the pixels in a plane, and the depths and the rows of their
+    positions.  Among equally near positions, the first is used.  Positions outside the image are dropped.
     """
     values = camera.values
     pose = np.asarray(values["world_to_camera"], np.float64).reshape(3, 4)

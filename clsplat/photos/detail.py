@@ -1,4 +1,4 @@
-"""Choose the resolution of photographs by step, from their frequency content (DashGaussian, Chen et al. 2025)."""
+"""Choose the resolution of photographs in each step from their frequency content (DashGaussian, Chen et al. 2025)."""
 
 from collections.abc import Iterable, Sequence
 from typing import Annotated, ClassVar, Literal
@@ -12,14 +12,14 @@ from clsplat.core.schedule import EverySteps, Points, count_fired, fire_step
 from clsplat.core.settings import Settings
 
 Floats = NDArray[np.float64]
-LEVELS = 2048  # frequency bounds, from 0 to the highest frequency of each direction
-KNOTS = 32  # as published
-NO_DETAIL = 1e-3  # of the amplitudes: the rounding of an image of one color
-MIN_FRACTION = 0.25  # of the amplitudes, kept at the smallest size of any photograph; as published
+LEVELS = 2048  # number of frequency bounds from 0 to the highest frequency in each direction
+KNOTS = 32  # number of knots of the schedule; as published
+NO_DETAIL = 1e-3  # fraction of the amplitudes that is due to rounding in an image of a single color
+MIN_FRACTION = 0.25  # fraction of the amplitudes that each photograph keeps at the smallest size; as published
 
 
 class Spectrum:
-    """The amplitudes of images, summed over channels and all frequencies up to a bound."""
+    """The cumulative amplitudes of an image, summed over its channels and all frequencies up to a bound."""
 
     def __init__(self, cumulative: Floats) -> None:
         """cumulative: sums up to equally spaced bounds from 0 to 1 times the highest frequency, [LEVELS + 1]."""
@@ -27,24 +27,24 @@ class Spectrum:
 
     @classmethod
     def from_image(cls, image: NDArray[np.uint8]) -> "Spectrum":
-        """Return the spectrum of an image, [height, width, 3]."""
+        """Compute the spectrum of an image, [height, width, 3]."""
         height, width = image.shape[:2]
         amplitudes = np.abs(scipy.fft.rfft2(image.astype(np.float32), axes=(1, 0))).sum(axis=2, dtype=np.float64)
-        down, right = (np.abs(scipy.fft.fftfreq(size)) * 2 for size in (height, width))
-        down = down[: height // 2 + 1]
-        multiplicity = np.where((down == 0) | (down == 1), 1, 2)  # rfft returns only one of each conjugate pair
-        bound = np.maximum(down[:, None], right[None, :])
+        vertical, horizontal = (np.abs(scipy.fft.fftfreq(size)) * 2 for size in (height, width))
+        vertical = vertical[: height // 2 + 1]
+        multiplicity = np.where((vertical == 0) | (vertical == 1), 1, 2)  # rfft returns only one of each conjugate pair
+        bound = np.maximum(vertical[:, None], horizontal[None, :])
         level = np.ceil(bound * LEVELS).astype(np.int64)
         sums = np.bincount(level.ravel(), (amplitudes * multiplicity[:, None]).ravel(), LEVELS + 1)
         return cls(np.cumsum(sums))
 
     @property
     def total(self) -> float:
-        """The sum over all frequencies."""
+        """The sum of the amplitudes of all frequencies."""
         return float(self.cumulative[-1])
 
     def divisor(self, amplitude: float) -> float:
-        """Return the downscale factor that keeps frequencies with this sum of amplitudes; inf for 0."""
+        """Return the downscale factor that keeps frequencies with this sum of amplitudes; infinity for a sum of 0."""
         bounds = np.linspace(0, 1, LEVELS + 1)
         bound = float(np.interp(amplitude, self.cumulative, bounds))
         return 1 / bound if bound else np.inf
@@ -55,9 +55,9 @@ class Spectrum:
 
 
 def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
-    """Return steps and downscale factors, which fall from at most `largest` to 1 at step `until`.
+    """Return the knots of a schedule: steps, and downscale factors that fall from at most `largest` to 1 at `until`.
 
-    Equal increments of the amplitudes take less and less time.  Without detail to gain, the factor is 1.
+    Equal increments of the amplitudes take fewer and fewer steps.  If there is no detail to gain, the factor is 1.
     """
     first = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
     mean = Spectrum(np.mean([spectrum.cumulative for spectrum in spectra], axis=0))
@@ -72,8 +72,8 @@ def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Fl
 class DetailDivisor(Settings):
     """Increase the resolution with the frequency content of the photographs (DashGaussian, Chen et al. 2025).
 
-    Training starts at a size that keeps a quarter of the amplitudes of the spectrum; equal increments of the amplitudes
-    take less and less time.  The downscale factor is an integer that changes at edits.
+    Training starts at a size that keeps a quarter of the amplitudes of the spectrum.  Equal increments of the
+    amplitudes then take fewer and fewer steps.  The downscale factor is an integer that changes at edits.
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})
@@ -91,35 +91,35 @@ class DetailDivisor(Settings):
 
     @property
     def changes(self) -> list[int]:
-        """The steps after which the size may change; after the last one, it is the full size."""
+        """The global steps after which the size may change.  After the last of them, photographs are at full size."""
         first, last = count_fired(self.every, self.start) + 1, count_fired(self.every, self.until - 1) + 1
         return [fire_step(self.every, number) for number in range(first, last + 1)]
 
     def to_schedule(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
-        """Return the downscale factor by step for training photographs, each [height, width, 3]."""
-        steps, divisors = knots([Spectrum.from_image(image) for image in photographs], self.until, self.largest)
+        """Compute the schedule of the downscale factor from the training photographs, each [height, width, 3]."""
+        knot_steps, divisors = knots([Spectrum.from_image(image) for image in photographs], self.until, self.largest)
 
-        def at(positions: Floats) -> Floats:
-            """Interpolate linearly in the number of pixels."""
-            pixels = np.interp(positions, steps, divisors**-2.0)
-            return np.where(positions < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
+        def interpolate(steps: Floats) -> Floats:
+            """Return the downscale factors at steps, interpolated linearly in the number of pixels."""
+            pixels = np.interp(steps, knot_steps, divisors**-2.0)
+            return np.where(steps < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
 
-        candidates = np.array([1.0, *self.changes])
-        sizes = at(candidates)
-        changes = np.flatnonzero(np.diff(sizes)) + 1
-        points = [[0.0, float(sizes[0])], *([float(candidates[i]) + 1, float(sizes[i])] for i in changes)]
+        steps = np.array([1.0, *self.changes])
+        factors = interpolate(steps)
+        changes = np.flatnonzero(np.diff(factors)) + 1
+        points = [[0.0, float(factors[0])], *([float(steps[i]) + 1, float(factors[i])] for i in changes)]
         return Points(points=points, between="steps")
 
 
 def describe_sizes(sizes: Points) -> str:
-    """Describe the sizes of the photographs during training."""
-    (_, first), *others = sizes.points
-    if not others and first == 1:
+    """Return a sentence about the sizes of the photographs during training.  sizes: the downscale factor by step."""
+    (_, first), *changes = sizes.points
+    if not changes and first == 1:
         return "photographs are trained on at full size, since smaller ones would lose too much detail"
-    later = [f"{_size_text(divisor)} from step {step:.0f}" for step, divisor in others]
-    return f"photographs are trained on at {', '.join([f'{_size_text(first)} of their size', *later])}"
+    clauses = [f"{_describe_size(divisor)} from step {step:.0f}" for step, divisor in changes]
+    return f"photographs are trained on at {', '.join([f'{_describe_size(first)} of their size', *clauses])}"
 
 
-def _size_text(divisor: float) -> str:
-    """Return the name of a size."""
+def _describe_size(divisor: float) -> str:
+    """Return a downscale factor in words, such as `1/2`."""
     return "full size" if divisor == 1 else f"1/{divisor:g}"

@@ -1,9 +1,9 @@
 """Estimate the relative exposures of photographs from pixels that show the same points.
 
-For each channel, ln y = e + a, with the exposure e of a photograph and the color a of a point.  They minimize the sum
-of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced points, and weights differences by their size
-in the image, where haze on a dark point is small.  The solver is iteratively reweighted least squares, with conjugate
-gradients on sums in a fixed order.
+For each channel, a pixel y is modeled by ln y = e + a, where e is the exposure of the photograph and a is the color of
+the point.  The estimate minimizes the sum of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced
+points.  The factor exp(a) weights differences by their size in the image, where haze on a dark point is small.  The
+solver is iteratively reweighted least squares with conjugate gradients.  All sums have a fixed order.
 """
 
 import math
@@ -22,31 +22,31 @@ from clsplat.scene.view import View, load_exposures
 DARKEST, BRIGHTEST = 0.05, 0.95  # bounds of valid values; beyond them, noise and clipping dominate
 SIDE = 3  # px, side of the square around a point that is averaged
 GAMMA = 2.2  # of image values
-MIN_VALUES = 20  # per photograph and channel
-ROUNDS = 10  # of reweighting
+MIN_VALUES = 20  # valid values that a photograph needs in each channel
+ROUNDS = 10  # rounds of reweighting
 EXACT = 0.01  # log units: smaller differences do not get larger weights
 TOLERANCE = 1e-6  # relative to the first residual
 ROUNDING = 1e-9  # log units: differences that count as zero
 Integers = NDArray[np.intp]
-Read = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
+PhotographReader = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """Log gains of red, green, and blue, [3], by view name; their mean is 0."""
+    """The exposures of photographs relative to their mean, as logarithms of color gains."""
 
-    log_gains: dict[str, Floats]
-    source: str  # in words
-    explained_variance: float = 1.0  # fraction of the differences between photographs of a point that gains remove
+    log_gains: dict[str, Floats]  # of red, green, and blue, [3], by view name; their mean over the views is 0
+    source: str  # for messages
+    explained_variance: float = 1.0  # fraction of the differences between photographs of a point that the gains remove
 
     @property
     def spread(self) -> float:
-        """The standard deviation of log exposures; 0 if none is known."""
+        """The standard deviation of the log exposures; 0 if no exposure is known."""
         return float(np.std([LUMINANCE @ gains for gains in self.log_gains.values()])) if self.log_gains else 0.0
 
     @property
     def text(self) -> str:
-        """A summary in words."""
+        """A summary for messages."""
         if not self.log_gains:
             return self.source
         return f"exposures of {len(self.log_gains)} photographs differ by {self.spread:.1%} {self.source}"
@@ -56,9 +56,9 @@ UNKNOWN = Exposures({}, "neither tracks nor EXIF give exposures")
 
 
 def exif_exposures(views: Sequence[View]) -> Exposures:
-    """Return exposures from EXIF, EV = log2(t ISO / N²), with a gamma of 2.2.
+    """Compute exposures from EXIF data, EV = log2(t ISO / N²), for image values with a gamma of 2.2.
 
-    Real tone curves differ, so this is only an initial value.
+    Real tone curves differ, so the result is only an initial value.
     """
     values = {view.name: exif.value for view, exif in zip(views, load_exposures(views), strict=True) if exif}
     if not values:
@@ -71,54 +71,55 @@ def exif_exposures(views: Sequence[View]) -> Exposures:
 def complete_exposures(measured: Exposures, exif: Exposures) -> Exposures:
     """Add exposures from EXIF for photographs without exposures measured on tracks.
 
-    Exposures from EXIF are shifted by the mean difference over the photographs that have both; without such
-    photographs, they are not used.
+    Exposures from EXIF are shifted by the mean difference over the photographs that have both kinds.  If no photograph
+    has both, exposures from EXIF are not used.
     """
     if not measured.log_gains:
         return exif
-    shared, new = ([name for name in exif.log_gains if (name in measured.log_gains) is flag] for flag in (True, False))
-    if not shared or not new:
+    shared_names = [name for name in exif.log_gains if name in measured.log_gains]
+    new_names = [name for name in exif.log_gains if name not in measured.log_gains]
+    if not shared_names or not new_names:
         return measured
-    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in shared], axis=0)
-    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in new}}
+    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in shared_names], axis=0)
+    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in new_names}}
     mean = np.mean(list(combined.values()), axis=0)
-    source = f"{measured.source}, those of {len(new)} {exif.source}"
+    source = f"{measured.source}, those of {len(new_names)} {exif.source}"
     return Exposures({name: gains - mean for name, gains in combined.items()}, source, measured.explained_variance)
 
 
-def measure_exposures(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
-    """Measure the exposures of photographs on tracks; of views with the same name, only the first is used.
+def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographReader) -> Exposures:
+    """Measure the exposures of photographs on tracks.  Of several views with the same name, only the first is used.
 
-    read: returns the photograph of a view, [height, width, 3], and its mask.
+    read: a function that returns the photograph of a view, [height, width, 3], and its mask.
     """
     by_name: dict[str, View] = {}
     for view in views:
         by_name.setdefault(view.name, view)
-    per_view = [sample_points(tracks, view, *read(view)) for view in by_name.values()]
-    photograph = np.repeat(np.arange(len(per_view)), [len(rows) for rows, _ in per_view])
-    point, values = (np.concatenate([part[i] for part in per_view]) for i in (0, 1))
-    log_gains, shared, residuals = np.full((len(per_view), 3), np.nan), 0, np.zeros(2)
+    samples = [sample_points(tracks, view, *read(view)) for view in by_name.values()]
+    photograph = np.repeat(np.arange(len(samples)), [len(rows) for rows, _ in samples])
+    point, values = (np.concatenate([sample[i] for sample in samples]) for i in (0, 1))
+    log_gains, shared_count, residuals = np.full((len(samples), 3), np.nan), 0, np.zeros(2)
     for channel in range(3):
         usable = (values[:, channel] > DARKEST) & (values[:, channel] < BRIGHTEST)
-        photographs = np.bincount(point[usable], minlength=len(tracks.positions))
-        usable &= photographs[point] > 1
-        shared = max(shared, int(np.count_nonzero(photographs > 1)))
-        arguments = photograph[usable], point[usable], values[usable, channel], len(per_view)
-        log_gains[:, channel], with_gains = _fit(*arguments)
-        residuals += with_gains, _fit(*arguments, rounds=0)[1]
+        photograph_counts = np.bincount(point[usable], minlength=len(tracks.positions))
+        usable &= photograph_counts[point] > 1
+        shared_count = max(shared_count, int(np.count_nonzero(photograph_counts > 1)))
+        arguments = photograph[usable], point[usable], values[usable, channel], len(samples)
+        log_gains[:, channel], residual = _fit(*arguments)
+        residuals += residual, _fit(*arguments, rounds=0)[1]
     is_known = np.isfinite(log_gains).all(axis=1)
     log_gains -= log_gains[is_known].mean(axis=0) if is_known.any() else 0
     fraction = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
-    source = f"at {shared:,} points, which explains {fraction:.0%} of the variance between photographs of a point"
+    source = f"at {shared_count:,} points, which explains {fraction:.0%} of the variance between photographs of a point"
     return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, fraction)
 
 
 def sample_points(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
-    """Return the rows of the points that a photograph shows, [S], and their colors there, [S, 3] in [0, 1]."""
+    """Return the rows of the points that a photograph shows, [S], and their colors in it, [S, 3] in [0, 1]."""
     rows = tracks.rows.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
-    rotated = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # independent of threads
-    x, y, z = rotated + view.world_to_camera[:, 3:]
+    points = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # independent of threads
+    x, y, z = points + view.world_to_camera[:, 3:]
     in_front = z > 0
     depth = np.where(in_front, z, 1)
     xy = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
@@ -133,14 +134,14 @@ def sample_points(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Ma
 def _fit(
     photograph: Integers, point: Integers, values: Floats, count: int, rounds: int = ROUNDS
 ) -> tuple[Floats, float]:
-    """Return the exposures of photographs, [count], NaN where there are too few values, and the sum of residuals.
+    """Return the exposures of photographs, [count], and the sum of the residuals.
 
-    rounds: 0 keeps all exposures equal.
+    An exposure is NaN if its photograph has too few values.  rounds: number of updates; 0 keeps all exposures equal.
     """
     exposures, logarithms, weights = np.zeros(count), np.log(values), np.ones(len(values))
     residuals = np.zeros(len(values))
-    for number in range(ROUNDS):
-        if number < rounds:
+    for round_index in range(ROUNDS):
+        if round_index < rounds:
             exposures += _corrections(photograph, point, logarithms - exposures[photograph], weights, count)
         colors = _means(point, logarithms - exposures[photograph], weights)[point]
         residuals = np.abs(logarithms - exposures[photograph] - colors)
@@ -150,7 +151,7 @@ def _fit(
 
 
 def _corrections(photograph: Integers, point: Integers, target: Floats, weights: Floats, count: int) -> Floats:
-    """Return the exposures, [count], that fit `target` best with a color per point, by conjugate gradients."""
+    """Solve by conjugate gradients for the exposures, [count], that fit `target` best, with one color per point."""
 
     def apply(values: Floats) -> Floats:
         differences = weights * (values - _means(point, values, weights)[point])
@@ -166,8 +167,8 @@ def _corrections(photograph: Integers, point: Integers, target: Floats, weights:
         product = apply(direction[photograph])
         step = squared_norm / float((direction * product).sum())
         solution, residual = solution + step * direction, residual - step * product
-        previous, squared_norm = squared_norm, float((residual**2).sum())
-        direction = residual + squared_norm / previous * direction
+        previous_norm, squared_norm = squared_norm, float((residual**2).sum())
+        direction = residual + squared_norm / previous_norm * direction
     return solution
 
 

@@ -1,4 +1,4 @@
-"""Hold photographs on the device, 8 bits per channel, and convert them to float planes for losses."""
+"""Cache photographs on the device, with 8 bits per channel, and convert them to float planes for losses."""
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -25,13 +25,13 @@ BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph on the device, and its camera."""
+    """A photograph and its camera on the device."""
 
     camera: DeviceCamera
     colors: Array  # [3, height, width] uint8
-    mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
+    mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None if all pixels count
     empty: bool = False  # whether the mask excludes every pixel
-    transparency: Array | None = None  # [1, height, width] uint8, 255: only the background; None: opaque, or not kept
+    transparency: Array | None = None  # [1, height, width] uint8, 255 for only background; None if opaque or not loaded
 
     @property
     def nbytes(self) -> int:
@@ -42,7 +42,7 @@ class Photograph:
         return np.asarray(self.colors.get().transpose(1, 2, 0))
 
     def counted_pixels(self) -> Mask | None:
-        """Return the mask of unmasked pixels, [height, width]; None if there is no mask."""
+        """Return an array, [height, width], that is true in unmasked pixels; None if there is no mask."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
     def planes(
@@ -52,9 +52,9 @@ class Photograph:
         step: int = 0,
         backgrounds: tuple[Array, Array] | None = None,
     ) -> Planes:
-        """Return the photograph as float planes of whole tiles, after the transforms of a global step.
+        """Return the photograph as float planes, padded to full tiles, after the transforms of a global step.
 
-        backgrounds: the background of the photographs, and the one that replaces it; each [3] in [0, 1].
+        backgrounds: the background color of the photographs, and the color that replaces it, each [3] in [0, 1].
         """
         colors = unpack(workspace, self.camera, self.colors, 1 / 255, "photograph")
         if backgrounds and self.transparency:
@@ -67,7 +67,7 @@ class Photograph:
 
 
 class Pixels(NamedTuple):
-    """A photograph on the host, uint8 planes."""
+    """A photograph on the host, as uint8 planes."""
 
     colors: NDArray[np.uint8]  # [3, height, width]
     mask: NDArray[np.uint8]  # [0 or 1, height, width]
@@ -82,16 +82,17 @@ def _key(view: View) -> Key:
 
 
 class Photographs:
-    """A cache of the photographs of a scene, up to `budget` bytes on the device; others are read again.
+    """A cache of the photographs of a scene, which uses at most `budget` bytes on the device.
 
-    A thread prefetches photographs, which does not change results.
+    Photographs that do not fit are read again when they are used.  A thread prefetches photographs, which does not
+    change results.
     """
 
     def __init__(
         self, device: Device, background: Background, budget: int | None = None, undistorted: Path | None = None
     ) -> None:
         self.device = device
-        self.undistorted = undistorted  # folder that keeps undistorted photographs
+        self.undistorted = undistorted  # folder in which undistorted photographs are cached
         self.background_name = background
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
@@ -101,14 +102,14 @@ class Photographs:
         self._transparency = False
 
     def keep_transparency(self) -> None:
-        """Keep the transparency of photographs too, for random backgrounds."""
+        """Load the transparency of photographs too, which random backgrounds need."""
         if not self._transparency:
             self._transparency = True
             self._cache.clear()
             self._reading.clear()
 
     def empty_copy(self) -> "Photographs":
-        """Return an empty cache, for views that are used once."""
+        """Return an empty cache with the same background, for views that are used only once."""
         return Photographs(self.device, self.background_name, undistorted=self.undistorted)
 
     def camera(self, view: View) -> DeviceCamera:
@@ -127,9 +128,9 @@ class Photographs:
             future = self._reading.pop(key, None)
             colors, mask, alpha = future.result() if future else self._read(view)
             self._make_room(colors.nbytes + mask.nbytes + (0 if alpha is None else alpha.nbytes))
-            mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
+            device_mask, is_empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
             transparency = None if alpha is None else self.device.upload(alpha)
-            photograph = Photograph(self.camera(view), self.device.upload(colors), mask_on_device, empty, transparency)
+            photograph = Photograph(self.camera(view), self.device.upload(colors), device_mask, is_empty, transparency)
         elif (camera := update_camera(photograph.camera, view)) is not photograph.camera:
             photograph = replace(photograph, camera=camera)
         self._cache[key] = photograph
@@ -138,7 +139,7 @@ class Photographs:
     def get_usable(self, view: View, original: View, number: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger `original` if the mask excludes all pixels of the smaller.
 
-        number: index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
+        number: the index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
         """
         photograph = self.get(view)
         if photograph.empty and view is not original:
@@ -171,7 +172,10 @@ class Photographs:
 
 
 def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:
-    """Return 8-bit pixels [C, height, width] times `factor` as float planes [C, rows, stride], zero outside."""
+    """Return 8-bit pixels, [C, height, width], times `factor` as float planes, [C, rows, stride].
+
+    The planes are zero outside the image.
+    """
     channels = pixels.shape[0]
     planes = workspace.array(name, (channels, camera.rows, camera.stride))
     lanes = int(workspace.device.tuning["LANES"])
@@ -190,19 +194,19 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 def change_background(
     workspace: Workspace, camera: DeviceCamera, colors: Array, transparency: Array, background: Array, behind: Array
 ) -> None:
-    """Replace the color `background` by `behind`, [3], in colors [3, rows, stride].
+    """Replace the color `background` by `behind`, both [3], in the planes `colors`, [3, rows, stride].
 
     transparency: [1, height, width] uint8, 255 where only the background is visible.
     """
-    shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
+    planes = unpack(workspace, camera, transparency, 1 / 255, "transparency")
     pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").change_background(
-        items=(pixels, 3), colors=colors, transparency=shown, background=background, behind=behind, pixels=pixels
+        items=(pixels, 3), colors=colors, transparency=planes, background=background, behind=behind, pixels=pixels
     )
 
 
 def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
-    """Set `planes` [channels, rows, stride] to zero where the mask [1, rows, stride] is zero."""
+    """Set planes, [channels, rows, stride], to zero where the mask, [1, rows, stride], is zero."""
     assert planes.shape[1:] == mask.shape[1:] == (camera.rows, camera.stride)
     pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").apply_mask(
@@ -212,12 +216,12 @@ def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: 
 
 # The texture of images: their gradient magnitude, |Sobel| / 8 of the luminance, per px.
 
-MAX_MAGNITUDE = 0.75  # per px: above the largest possible magnitude
+MAX_MAGNITUDE = 0.75  # per px; larger than any possible magnitude
 BINS = 3000
 
 
 def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, name: str = "texture") -> Array:
-    """Return the gradient magnitudes, [rows, stride] per px, of an image [3, rows, stride] in [0, 1]."""
+    """Compute the gradient magnitudes, [rows, stride] per px, of an image, [3, rows, stride] in [0, 1]."""
     magnitude = workspace.array(name, (camera.rows, camera.stride))
     device = workspace.device
     device.program("texture.cl").image_gradient(
@@ -230,7 +234,7 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
 
 
 def unmasked_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
-    """Return gradient magnitudes, and -1 at masked pixels and their neighbors.  mask: [1, rows, stride]."""
+    """Compute gradient magnitudes, which are -1 at masked pixels and their neighbors.  mask: [1, rows, stride]."""
     magnitude = image_gradient(workspace, camera, image)
     if mask is not None:
         workspace.device.program("texture.cl").hide_masked(
@@ -245,11 +249,11 @@ def unmasked_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, 
 
 
 def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], quantile: float) -> float:
-    """Return a quantile of the gradient magnitude over all pixels that count, per px, in steps of 1 / 4000."""
+    """Compute a quantile of the gradient magnitude over all unmasked pixels, per px, rounded up to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)
-        inside = unmasked_gradient(workspace, camera, planes.colors, planes.mask).get()[: camera.height, : camera.width]
-        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # without values below 0
-    below = np.searchsorted(np.cumsum(counts), quantile * counts.sum())
-    return float(below + 1) * MAX_MAGNITUDE / BINS
+        values = unmasked_gradient(workspace, camera, planes.colors, planes.mask).get()[: camera.height, : camera.width]
+        counts += np.histogram(values, BINS, (0, MAX_MAGNITUDE))[0]  # excludes the -1 of masked pixels
+    index = np.searchsorted(np.cumsum(counts), quantile * counts.sum())
+    return float(index + 1) * MAX_MAGNITUDE / BINS

@@ -1,4 +1,4 @@
-"""Choose the sample of each training step: a view, its size, and transforms of its photograph."""
+"""Choose the sample of each training step: a view, its size, and the transforms of its photograph."""
 
 import logging
 from abc import abstractmethod
@@ -19,11 +19,11 @@ from clsplat.scene.view import View
 
 # The view of each step depends only on the seed and the step, so a resumed run uses the same views.
 
-FINEST_FRACTION = 0.3  # of steps with a random view of the finest size (released code of Mip-Splatting)
+FINEST_FRACTION = 0.3  # fraction of steps with a random view of the finest size (released code of Mip-Splatting)
 
 
 class ViewPool:
-    """The training views, possibly at several sizes, and permutations of them."""
+    """The training views, possibly at several sizes, and their random permutations."""
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
         finest = min(view.downscale for view in views)
@@ -32,7 +32,7 @@ class ViewPool:
         self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
     def shuffled_view(self, entries: Sequence[int], step: int) -> View:
-        """Return the view of a step; each epoch uses all `entries`, indices into `views`, in a new order."""
+        """Return the view of a step.  Each epoch visits all `entries`, which index `views`, in a new order."""
         epoch, index = divmod(step - 1, len(entries))
         return self.views[entries[int(self._shuffle(epoch, len(entries))[index])]]
 
@@ -48,11 +48,11 @@ class ViewPool:
 
 
 class Order(Settings):
-    """Which view a step trains on."""
+    """The order in which training visits the views."""
 
     @abstractmethod
     def view_at(self, pool: ViewPool, step: int) -> View:
-        """Return the view of a step, counted from 1; it must depend only on the pool, its seed and the step."""
+        """Return the view of a step, counted from 1.  It must depend only on the pool, its seed, and the step."""
 
 
 class Uniform(Order):
@@ -65,8 +65,8 @@ class Uniform(Order):
 
 
 class ShuffleOrder(Order):
-    """Draw views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021,
-    whose protocol Mip-Splatting follows)."""
+    """Draw views of the finest size twice as often as other views: 40, 20, 20, and 20 % of the steps for four sizes
+    (Barron et al. 2021, whose protocol Mip-Splatting follows)."""
 
     type: Literal["shuffle"] = "shuffle"
 
@@ -75,8 +75,8 @@ class ShuffleOrder(Order):
 
 
 class StackOrder(Order):
-    """Replace 30 % of the steps by a random view of the finest size: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
-    released code of Mip-Splatting)."""
+    """Draw a random view of the finest size in 30 % of the steps, and any view in the others: 47.5, 17.5, 17.5, and
+    17.5 % of the steps for four sizes (the released code of Mip-Splatting)."""
 
     type: Literal["stack"] = "stack"
 
@@ -91,17 +91,20 @@ LOG = logging.getLogger("clsplat")
 
 
 class ViewSettings(Settings):
-    """The view of each step, its size, and transforms of its photograph."""
+    """The view of each training step, its size, and the transforms of its photograph."""
 
     order: OneOf[Order] = Uniform()
-    """Which view a step trains on."""
+    """Order in which training visits the views."""
     resolution: Annotated[DetailDivisor | AtLeastOne, explain_schedule(", or {follows: detail, until, …}")] = 1.0
     """Downscale factor on top of `scene.downscale`, at least 1; may be scheduled, or follow the photographs' detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""
 
     def resolve(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
-        """Return settings whose resolution is a schedule.  photographs: of training, each [height, width, 3]."""
+        """Return settings in which the resolution is a schedule.
+
+        photographs: a function that returns the training photographs, each [height, width, 3].
+        """
         if not isinstance(self.resolution, DetailDivisor):
             return self
         resolution = self.resolution.to_schedule(photographs())
@@ -116,7 +119,7 @@ class ViewSettings(Settings):
 
     @property
     def changes(self) -> list[float]:
-        """The global steps between which the size is constant or linear; empty if it never changes."""
+        """The global steps between which the downscale factor is constant or linear; empty if it never changes."""
         resolution = self.resolution
         if isinstance(resolution, DetailDivisor):
             return [float(step) for step in resolution.changes]
@@ -129,30 +132,30 @@ class ViewSettings(Settings):
         return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
 
     def full_size(self, last: int) -> int:
-        """Return the first step with photographs larger than half their size, or `last`."""
+        """Return the first step with photographs larger than half their full size, or `last` if there is none."""
         return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The sample of one step."""
+    """The sample of a training step."""
 
     view: View  # at the size of the step
     original: View  # at full training size
-    number: int  # its index among the training views
+    number: int  # index of the view among the training views
     transforms: Sequence[PhotographTransform]
     step: int  # global
 
 
 class Sampler:
-    """The samples of all steps; each depends only on the views, the seed and the step."""
+    """The samples of all steps.  Each depends only on the views, the settings, the seed, and the step."""
 
     def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
         self.settings, self._pool = settings, ViewPool(views, seed)
-        self._numbers = {id(view): number for number, view in enumerate(views)}
+        self._indices = {id(view): index for index, view in enumerate(views)}
 
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.view_at(self._pool, step), self.settings.divisor(step)
         resized = view.resized(view.downscale * divisor)
-        return Sample(resized, view, self._numbers[id(view)], self.settings.transforms, step)
+        return Sample(resized, view, self._indices[id(view)], self.settings.transforms, step)

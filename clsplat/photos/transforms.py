@@ -1,4 +1,4 @@
-"""Transform the photograph of a step before the comparison, depending on the step."""
+"""Transform the photograph of a training step before it is compared with the render."""
 
 import math
 from abc import abstractmethod
@@ -11,7 +11,7 @@ from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 
-REACH = 3  # radius of a blur's window, standard deviations
+REACH = 3  # radius of the window of a blur, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Planes:
     workspace: Workspace
     camera: DeviceCamera
     colors: Array  # [3, rows, stride] in [0, 1]
-    mask: Array | None  # [1, rows, stride], 1 in pixels that count, else 0; None: all count
+    mask: Array | None  # [1, rows, stride], 1 in pixels that count, else 0; None if all count
 
 
 class PhotographTransform(Settings):
@@ -29,7 +29,7 @@ class PhotographTransform(Settings):
 
     @abstractmethod
     def apply(self, planes: Planes, step: int) -> Planes:
-        """Return the photograph at a global step; the result must depend only on the arguments."""
+        """Return the photograph, transformed for a global step.  The result must depend only on the arguments."""
 
 
 class Blur(PhotographTransform):
@@ -56,7 +56,7 @@ class MeanFilter(PhotographTransform):
 
 
 def _average(planes: Planes, reach: int, falloff: float) -> Planes:
-    """Average the pixels within `reach` px in x and y, with weights exp(-falloff distance²).  falloff: px⁻²."""
+    """Average the pixels within `reach` px in x and y, weighted by exp(-falloff distance²).  falloff: in px⁻²."""
     if reach == 0:
         return planes
     camera, device = planes.camera, planes.workspace.device
