@@ -1,9 +1,12 @@
-"""Read SOG of PlayCanvas, versions 1 and 2, and write version 2: lossless WebP images and meta.json in a ZIP or folder.
+"""Read SOG files of PlayCanvas, versions 1 and 2, and write version 2.
+
+A SOG is a ZIP or a folder with lossless WebP images and a meta.json.
 
     means_l, means_u  low and high bytes of 65535 (t - min) / (max - min), t = sign(x) log(1 + |x|)
     quats   the three smallest of w x y z as 255 (c / sqrt 2 + 1/2); alpha is 252 + the index of the largest
-    scales  indices into a codebook of logarithms · sh0  indices into one of f_dc, and 255 opacity
-    shN     a palette: labels in 16 bits, and centroids, 64 a row, as indices into a codebook
+    scales  indices into a codebook of log scales
+    sh0     indices into a codebook of f_dc, and 255 opacity
+    shN     a palette: labels of 16 bits, and centroids, 64 per row, as indices into a codebook
 
 In version 1, scales, sh0, the opacity logit, and shN are 8-bit values between a minimum and a maximum.
 """
@@ -55,19 +58,19 @@ from clsplat.formats.splats import (
     unit,
 )
 
-# The files of a SOG, in a ZIP or next to a meta.json.
+# The files of a SOG, in a ZIP or in the folder of a meta.json.
 
 META = "meta.json"
-PARTS = ("means", "scales", "quats", "sh0")  # in meta.json, as well as shN
+PARTS = ("means", "scales", "quats", "sh0")  # required keys of meta.json; shN is optional
 MAX_META = 1 << 24  # bytes
 MAX_IMAGE = 1 << 30
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 RATIO = 2  # largest accepted compression ratio of images in a ZIP; they are already compressed
-SLACK = 1 << 16  # bytes or px allowed beyond what is needed
+SLACK = 1 << 16  # bytes or px allowed in addition to the required ones
 
 
 def sog_folder_files(path: Path) -> list[Path]:
-    """Return a meta.json and the existing images that it names; only itself if it is damaged."""
+    """Return a meta.json and those of its images that exist; only the meta.json if it is damaged."""
     try:
         meta = read_json(path, limit=MAX_META)
     except DataError:
@@ -80,12 +83,15 @@ def sog_folder_files(path: Path) -> list[Path]:
 
 
 def is_sibling(name: str) -> bool:
-    """Return whether a name is a file in the same folder."""
+    """Return whether a file name has no folder part, so that it names a file next to the meta.json."""
     return name == Path(name).name and "\\" not in name and bool(name.strip("."))
 
 
 class Files:
-    """The files of a SOG, each read once: members of a ZIP, in any of its folders, or files next to a meta.json."""
+    """The files of a SOG, each of which is read only once.
+
+    They are members of a ZIP, in any folder inside it, or files in the folder of a meta.json.
+    """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, size: int = MAX_FILE) -> None:
         self.path, self.archive, self.max_size = path, archive, size
@@ -93,11 +99,11 @@ class Files:
 
     @property
     def size(self) -> int:
-        """Bytes read so far, at most the size on disk."""
+        """The number of bytes read so far, at most the size on disk."""
         return min(self.max_size, sum(map(len, self.contents.values())))
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file.  Raises DataError."""
+        """Return the content of a file.  Raises DataError if it is missing, too large, or damaged."""
         if name not in self.contents:
             self.contents[name] = self._member(self.archive, name) if self.archive else self._sibling(name)
         return self.contents[name]
@@ -124,7 +130,7 @@ class Files:
 
 @contextmanager
 def sog_files(path: Path) -> Iterator[Files]:
-    """Open the files of a folder or of a ZIP.  Raises DataError."""
+    """Open the files of a SOG folder or ZIP.  Raises DataError if the ZIP is missing or damaged."""
     if path.suffix.lower() == ".json":
         yield Files(path)
         return
@@ -136,22 +142,22 @@ def sog_files(path: Path) -> Iterator[Files]:
         raise DataError(f"{path}: a damaged ZIP ({quote(error)}); copy or export the file again") from error
 
 
-PIXELS_PER_BYTE = 2  # of all images; real files have less than one
-MIN_LIMIT = 1 << 19  # splats that any file may have: 0.1 GB in memory
+PIXELS_PER_BYTE = 2  # largest accepted number of splats per byte of all images; real files have less than one
+MIN_LIMIT = 1 << 19  # splats that a file of any size may have: 0.1 GB in memory
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
-WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
-LIMIT = 1e30  # of numbers in meta.json
-ROTATED = 252  # alpha of a quaternion whose largest component is w
+WIDTHS = {3: 1, 8: 2, 15: 3}  # SH degree by number of coefficients of a centroid
+LIMIT = 1e30  # of the absolute values in meta.json
+LARGEST_W = 252  # alpha of a quaternion whose largest component is w; 253 to 255 for x, y, z
 
 
 def looks_like_sog(data: bytes) -> bool:
-    """Return whether the first bytes are those of a ZIP or of a SOG folder's meta.json."""
+    """Return whether data starts like a ZIP or like the meta.json of a SOG folder."""
     return data.startswith(b"PK\3\4") or (data.lstrip()[:1] == b"{" and b'"means"' in data)
 
 
 def read_sog(path: Path) -> SplatFile:
-    """Read a `.sog`, or the meta.json of a folder.  Raises DataError if it is missing or damaged."""
+    """Read a `.sog` file, or a folder from its meta.json.  Raises DataError if a file is missing or damaged."""
     with sog_files(path) as files:
         try:
             meta = json.loads(files.read(META))
@@ -161,7 +167,7 @@ def read_sog(path: Path) -> SplatFile:
 
 
 def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
-    """Raise DataError if files of `size` bytes cannot have `count` splats, and MemoryLimitError."""
+    """Raise DataError if `size` bytes cannot contain `count` splats, and MemoryLimitError if memory cannot."""
     if count > MIN_LIMIT + PIXELS_PER_BYTE * size:
         raise DataError(f"{path}: declares {count} splats, but its files have only {size} bytes; copy it again")
     require_memory(path, count, degree)
@@ -172,21 +178,21 @@ class _Sog:
 
     def __init__(self, path: Path, meta: Any, files: Files) -> None:
         self.path, self.meta, self.files = path, meta, files
-        first = self._part("means").get("shape")
-        self.old = "version" not in meta and isinstance(first, list)
-        version = 1 if self.old else meta.get("version")
+        shape = self._part("means").get("shape")
+        self.is_version_1 = "version" not in meta and isinstance(shape, list)
+        version = 1 if self.is_version_1 else meta.get("version")
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
-        self.count = self._require_count("count", first[0] if self.old and first else meta.get("count"))
+        self.count = self._require_count("count", shape[0] if self.is_version_1 and shape else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
 
     def splats(self) -> SplatFile:
-        """Decode the parameters of all splats."""
+        """Decode all splats."""
         base = self._pixels("sh0", 0)
         scales, opacity = self._decode("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
         logit = logits(opacity[:, None] / 255.0)
-        if self.old:
+        if self.is_version_1:
             minimum, maximum = self._ranges("sh0", 4)
             logit = (minimum[3] + (maximum[3] - minimum[3]) * (opacity[:, None] / 255.0)).astype(np.float32)
         parameters = {
@@ -205,15 +211,15 @@ class _Sog:
         minimum, maximum = self._ranges("means", 3)
         span = np.where(maximum > minimum, maximum - minimum, 1)
         t = minimum + (low | high << np.uint16(8)) / 65535.0 * span
-        with np.errstate(over="ignore"):  # infinity is refused later
+        with np.errstate(over="ignore"):  # infinite positions raise DataError later
             return (np.sign(t) * np.expm1(np.abs(t))).astype(np.float32)
 
     def _quats(self) -> NDArray[np.float32]:
         pixels = self._pixels("quats", 0)
-        valid = pixels[:, 3] >= ROTATED
-        largest = np.where(valid, pixels[:, 3], ROTATED).astype(np.intp) - ROTATED
+        is_valid = pixels[:, 3] >= LARGEST_W
+        largest = np.where(is_valid, pixels[:, 3], LARGEST_W).astype(np.intp) - LARGEST_W
         quats = from_smallest_three(largest, (pixels[:, :3] / 255.0 - 0.5) * 2**0.5)
-        quats[~valid] = [1, 0, 0, 0]
+        quats[~is_valid] = [1, 0, 0, 0]
         return quats
 
     def _rest(self) -> NDArray[np.float32]:
@@ -223,9 +229,9 @@ class _Sog:
         if len(files) != 2:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels; export it again")
         labels = packing.decode(self.path, "labels of shN", files[1], self.count, SLACK + 4 * self.count)
-        chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
-        used_entries = entries = 1 + int(chosen.max(initial=0))
-        if self.old:
+        splat_labels = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
+        used_entries = entries = 1 + int(splat_labels.max(initial=0))
+        if self.is_version_1:
             degree = self._degree_of_width(files[0])
         else:
             entries = self._require_count("shN.count", self._part("shN").get("count", used_entries), MAX_PALETTE)
@@ -238,10 +244,10 @@ class _Sog:
         limit = SLACK + 4 * size * MAX_PALETTE
         centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, limit)
         table = centroids[: entries * size, :3].reshape(entries, 3 * size)
-        return np.asarray(self._decode("shN", table)[chosen])
+        return np.asarray(self._decode("shN", table)[splat_labels])
 
     def _degree_of_width(self, data: bytes) -> int:
-        """Return the SH degree of a version 1 file, from the width of its centroids, 64 per row."""
+        """Return the SH degree of a version 1 file, from the width of its image of centroids, 64 per row."""
         width, _ = packing.size(self.path, "centroids of shN", data)
         if width // PER_ROW not in WIDTHS:
             raise DataError(
@@ -250,8 +256,8 @@ class _Sog:
         return WIDTHS[width // PER_ROW]
 
     def _decode(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Decode bytes of a part: indices into its codebook, or, in version 1, fractions of its range."""
-        if not self.old:
+        """Decode the bytes of a part, [N, c], to values: codebook indices, or, in version 1, 255ths of its range."""
+        if not self.is_version_1:
             entries = self._numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
         part = self._part(name)
@@ -261,15 +267,15 @@ class _Sog:
             minimum, maximum = (values[: levels.shape[1]] for values in self._ranges(name, 3))
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
-    def _pixels(self, name: str, number: int) -> NDArray[np.uint8]:
-        """Return the first pixels of an image, one per splat, [count, 4]."""
-        group = self.images[name]
-        if number >= len(group):
+    def _pixels(self, name: str, index: int) -> NDArray[np.uint8]:
+        """Return the pixels of a part's image, one per splat, [count, 4]."""
+        images = self.images[name]
+        if index >= len(images):
             raise DataError(
-                f"{self.path}: {name} names {len(group)} files; expected at least {number + 1}; export it again"
+                f"{self.path}: {name} names {len(images)} files; expected at least {index + 1}; export it again"
             )
-        label, limit = f"image {number} of {name}", SLACK + 4 * self.count
-        return packing.decode(self.path, label, group[number], self.count, limit)[: self.count]
+        label, limit = f"image {index} of {name}", SLACK + 4 * self.count
+        return packing.decode(self.path, label, images[index], self.count, limit)[: self.count]
 
     def _part(self, name: str) -> dict[str, Any]:
         part = self.meta.get(name) if isinstance(self.meta, dict) else None
@@ -280,15 +286,15 @@ class _Sog:
         return part
 
     def _data(self, name: str) -> list[bytes]:
-        """Return the files of a part.  Raises DataError for names outside of the folder."""
+        """Return the contents of the files of a part.  Raises DataError for names outside the folder."""
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(file, str) for file in names):
             raise DataError(
                 f"{self.path}: {name}.files is {quote(names)}; expected one or two file names; export it again"
             )
-        if wrong := [file for file in names if not is_sibling(file)]:
+        if outside_names := [file for file in names if not is_sibling(file)]:
             raise DataError(
-                f"{self.path}: {name}.files has {quote(wrong[0])}; "
+                f"{self.path}: {name}.files has {quote(outside_names[0])}; "
                 "expected the name of a file in the same folder; export it again"
             )
         return [self.files.read(file) for file in names]
@@ -299,9 +305,9 @@ class _Sog:
         return minimum, maximum
 
     def _numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
-        """Validate a list of at least `count` numbers."""
-        fits = isinstance(value, list) and count <= len(value) <= 256
-        if not fits or not all(isinstance(number, int | float) and abs(number) < LIMIT for number in value):
+        """Return a list of at least `count` numbers as an array.  Raises DataError for another value."""
+        is_list = isinstance(value, list) and count <= len(value) <= 256
+        if not is_list or not all(isinstance(number, int | float) and abs(number) < LIMIT for number in value):
             raise DataError(
                 f"{self.path}: {key_path} is {quote(value)}; expected {count} numbers below {LIMIT:g}; export it again"
             )
@@ -317,22 +323,23 @@ class _Sog:
 
 # Writing SOG version 2; the same model gives the same bytes.
 
-PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # largest palette for training
-RELATIVE_PALETTES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries per splat, if not for training
-MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in 128ths
-TURN_STEP = 4  # of quaternions, in levels of 255
+PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # maximum palette entries in training
+RELATIVE_PALETTES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # palette entries per splat, outside training
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in levels of 1/128
+QUAT_STEP = 4  # of quaternions, in levels of 1/255
 SIZE_STEP = 0.25  # step of positions of median weight, relative to the Gaussian's size
 SCALE_STEP = 0.1  # of log scales
 COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
-SMALLEST = 1024  # palette entries for 1,024 splats; grows in proportion
-DIGITS = 16  # of the SHA-256 in the name of an image in a folder
+SMALLEST = 1024  # palette entries in training for 1,024 splats; they grow with the number of splats
+DIGITS = 16  # digits of the SHA-256 in the names of images in a folder
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in the ZIP, fixed so that the same model gives the same bytes
 
 
 def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.sog`, or the files of a folder if the name is meta.json.  Raises OutputError, DataError.
+    """Write a `.sog` file, or a folder if the name is meta.json, and return the SHA-256 of that file.
 
     The names of images in a folder include a hash, so that images of another model are never replaced.
+    Raises OutputError, and DataError if the model is empty or has values outside the range of the format.
     """
     require_gaussians(path, splats)
     require_in_range(path, splats, "SOG")
@@ -343,7 +350,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
 def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
     """Write a SOG as `write_sog` does, but keep the order of the splats.
 
-    weights: base-2 logarithms, [N], of `log_weights` of the whole model, of which the splats may be a part.
+    weights: base-2 logarithms, [N], from `log_weights` of the entire model, of which the splats may be a subset.
     """
     in_folder = path.name == META
     p, harmonics = _quantize(splats.parameters, weights, options)
@@ -364,9 +371,9 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
         return name
 
     meta["means"] = _means(p, image)
-    largest, others = smallest_three(unit(p["quats"]))
-    levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5)), 0, 255)
-    meta["quats"] = {"files": [image("quats", *levels.T, ROTATED + largest)]}
+    largest, components = smallest_three(unit(p["quats"]))
+    levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5)), 0, 255)
+    meta["quats"] = {"files": [image("quats", *levels.T, LARGEST_W + largest)]}
     for name, table, alpha in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
         entries = codebook(p[table])
         planes = nearest_entries(p[table], entries).T
@@ -378,7 +385,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
 
 
 def _write_folder(path: Path, images: dict[str, bytes]) -> str:
-    """Write images and then meta.json, so that the old model stays valid until then; remove unused images."""
+    """Write the images and then meta.json, so that an old model stays valid until then; remove unused images."""
     old_files, new_files = set(sog_folder_files(path)), {path.with_name(name) for name in images}
     unused = new_files - old_files
     try:
@@ -404,17 +411,17 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
 
 
 def _alpha(p: Parameters) -> NDArray[np.float64]:
-    """Return opacities in levels of 255, at least 1, because lossless WebP drops the color under 0."""
+    """Return opacities from 1 to 255, [N]; not 0, because lossless WebP drops the colors of transparent pixels."""
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 
 @dataclass(frozen=True)
 class Harmonics:
-    """The SH of a SOG: a codebook [256], a palette [E, c] of indices into it, and a label per splat."""
+    """The SH coefficients of a SOG, above band 0."""
 
-    numbers: NDArray[np.float64]
-    palette: NDArray[np.uint8]
-    labels: NDArray[np.int64]
+    codebook: NDArray[np.float64]  # [256] values
+    palette: NDArray[np.uint8]  # [E, c] indices into the codebook
+    labels: NDArray[np.int64]  # [N] rows of the palette, one per splat
 
     @classmethod
     def fit(
@@ -425,10 +432,10 @@ class Harmonics:
         refine: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Fit a small palette to SH [N, c], for training; writing a model with its `values` does not change them.
+        """Fit a small palette to SH [N, c], for training; a model with its `values` is written without loss.
 
         weights: weights of errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
-        step: rounding of codebook numbers, used if few enough remain.
+        step: multiple to which codebook values are rounded if at most 256 of them remain.
         """
         vectors, labels = palette(rest, _training_entries(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
@@ -439,32 +446,32 @@ class Harmonics:
     def from_vectors(
         cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None
     ) -> "Harmonics":
-        """Return the palette of vectors [E, c] and labels [N], with their codebook."""
-        numbers = np.array([_short(number) for number in codebook(vectors, step)])
-        return cls(numbers, nearest_entries(vectors, numbers), labels)
+        """Quantize palette vectors, [E, c], with a codebook.  labels: [N] rows of `vectors`, one per splat."""
+        entries = np.array([_short(entry) for entry in codebook(vectors, step)])
+        return cls(entries, nearest_entries(vectors, entries), labels)
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """The SH coefficients as they are read back, [N, c]."""
-        return self.numbers.astype(np.float32)[self.palette][self.labels]
+        """The SH coefficients as a reader decodes them, [N, c]."""
+        return self.codebook.astype(np.float32)[self.palette][self.labels]
 
 
 def _training_entries(count: int, quality: Quality) -> int:
-    """Return the number of palette entries for training."""
+    """Return the number of palette entries in training for `count` splats."""
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 
 def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
-    """Return the rounded tables and a palette of the SH.
+    """Round the tables, and return them with a palette of the SH; None without SH bands above 0.
 
-    SH that already form a palette stay unchanged, and so do the tables, which were then rounded in training.
+    If the SH already form a palette, training has rounded all tables, and they stay unchanged.
     Quality `high` rounds tables only to the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
-    relative = int(RELATIVE_PALETTES[options.quality] * len(rest))
-    max_entries = min(MAX_PALETTE, max(_training_entries(len(rest), options.quality), relative))
-    exact = unique_points(rest, max_entries) if rest.shape[1] else None
-    harmonics = None if exact is None else Harmonics.from_vectors(*exact)
+    relative_entries = int(RELATIVE_PALETTES[options.quality] * len(rest))
+    max_entries = min(MAX_PALETTE, max(_training_entries(len(rest), options.quality), relative_entries))
+    exact_palette = unique_points(rest, max_entries) if rest.shape[1] else None
+    harmonics = None if exact_palette is None else Harmonics.from_vectors(*exact_palette)
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
@@ -472,34 +479,34 @@ def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> 
         base = compensate_base(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics
-    quats, log_scales = round_quats(p["quats"], p["log_scales"], TURN_STEP)
-    changed = {
+    quats, log_scales = round_quats(p["quats"], p["log_scales"], QUAT_STEP)
+    rounded_tables = {
         "means": round_means(p["means"], p["log_scales"], weights, SIZE_STEP),
         "quats": quats,
         "log_scales": round_to(log_scales, SCALE_STEP),
         "sh_base": round_to(base, COLOR_STEP),
     }
-    return {**p, **changed}, harmonics
+    return {**p, **rounded_tables}, harmonics
 
 
 def _write_harmonics(sh: Harmonics, bands: int, image: Any) -> dict[str, Any]:
     size = sh.palette.shape[1] // 3
     files = [image("shN_centroids", *sh.palette.reshape(-1, 3).T, columns=PER_ROW * size)]
     files.append(image("shN_labels", sh.labels & 255, sh.labels >> 8, np.zeros_like(sh.labels)))
-    return {"count": len(sh.palette), "bands": bands, "codebook": sh.numbers.tolist(), "files": files}
+    return {"count": len(sh.palette), "bands": bands, "codebook": sh.codebook.tolist(), "files": files}
 
 
 def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
-    """Round to 8 digits, because the last bits of logarithms and means differ between processors."""
+    """Round to 8 significant digits, because the last bits of logarithms and means differ between processors."""
     return float(Context(8, rounding).create_decimal(float(number)))
 
 
 def _zip(images: dict[str, bytes]) -> bytes:
-    """Return an uncompressed ZIP whose bytes depend on neither time nor operating system."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
+    """Return the bytes of an uncompressed ZIP; they depend on neither the time nor the operating system."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in images.items():
             member = zipfile.ZipInfo(name, EPOCH)
             member.create_system, member.external_attr = 3, 0o644 << 16
             archive.writestr(member, data)
-    return packed.getvalue()
+    return buffer.getvalue()

@@ -1,7 +1,7 @@
 """Round tables to fewer distinct values, so that a SOG file compresses better.
 
-SOG has 16 bits for a position and 8 for most other numbers, more than is visible.  Values are rounded to levels of the
-format, so that writing does not change them again.
+SOG has 16 bits for a coordinate and 8 for most other values, which is more precise than the eye can see.  Values are
+rounded to levels of the format, so that writing does not change them again.
 """
 
 from itertools import product
@@ -17,25 +17,25 @@ from clsplat.formats.palette import robust_max
 from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
 
 Floats = NDArray[np.floating]
-LEVELS = 65535  # of a position
+LEVELS = 65535  # of a coordinate
 TINY = 2.0**-40  # levels, replaces a size of 0
 MAX_ZERO_BITS = 8  # last bits of a position that may be zeroed
-_SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
-# rotations that map axes onto axes, [24, 4]; a quaternion and its negative are the same
-_TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
+_SIGNED = [quat for quat in product((0, 1, -1), repeat=4) if np.count_nonzero(quat) in (1, 2, 4)]
+# quaternions of the rotations that map axes onto axes, [24, 4]; q and -q are the same rotation
+_ROTATIONS = np.array([np.divide(quat, np.linalg.norm(quat)) for quat in _SIGNED if next(filter(None, quat)) > 0])
 
 
 def round_to(values: Floats, step: float) -> NDArray[np.float32]:
-    """Round values to multiples of a step."""
+    """Round values to multiples of `step`."""
     return np.asarray(np.rint(values.astype(np.float64) / step) * step, np.float32)
 
 
 def round_means(
     means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], fraction: float
 ) -> NDArray[np.float32]:
-    """Round positions [N, 3] to about `fraction` of the size of each Gaussian, for those of median weight.
+    """Round positions, [N, 3], with a step for each Gaussian, about `fraction` of its size if its weight is the median.
 
-    The step is as 1 / sqrt(weight) (see `quantization_steps`): a power of two of the levels of a SOG.
+    The step is proportional to 1 / sqrt(weight), and a power-of-two number of SOG levels.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
@@ -45,7 +45,7 @@ def round_means(
 
 
 def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in SOG levels, [N, 3], and the smallest logarithm and the level size of each axis, [3]."""
+    """Return positions in SOG levels, [N, 3], and the smallest logarithm and the size of a level per axis, [3] each."""
     positions = means.astype(np.float64)
     logarithms = np.sign(positions) * np.log1p(np.abs(positions))
     low, span = logarithms.min(axis=0), np.ptp(logarithms, axis=0)
@@ -54,7 +54,7 @@ def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
 
 def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
-    """Return geometric means of scales in the logarithmic space of positions, [N, 3]."""
+    """Return the geometric mean of each Gaussian's scales, in the logarithmic space of positions, [N, 3]."""
     size = np.exp(np.minimum(log_scales.astype(np.float64).mean(axis=1, keepdims=True), MAX_LOG))
     return np.asarray(size / (1 + np.abs(means.astype(np.float64))))
 
@@ -64,50 +64,53 @@ def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Round quaternions [N, 4] to every `step`-th level of SOG; also return the scales [N, 3], permuted to match.
+    """Round quaternions, [N, 4], to every `step`-th level of SOG; also return log scales, [N, 3], permuted to match.
 
-    A Gaussian has 24 equivalent pairs of rotation and scales, which permute and flip its axes.  The pair with the
-    smallest angle is chosen: w is then the largest component, and the others are small.
+    24 pairs of rotation and scales, which permute and flip the axes, represent the same Gaussian.  The pair with the
+    smallest rotation angle is used: w is then the largest component, and the others are small.
     """
     q, rows = unit(quats), np.arange(len(quats))
-    largest_w, turn = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
-    for number, (w, x, y, z) in enumerate(_TURNS):
-        w_size = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
-        turn, largest_w = np.where(w_size > largest_w, number, turn), np.maximum(w_size, largest_w)
-    largest, others = smallest_three(multiply(q, _TURNS[turn]))
-    levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5) / step) * step, 0, 255)
+    max_abs_w, rotations = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
+    for index, (w, x, y, z) in enumerate(_ROTATIONS):
+        abs_w = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
+        rotations, max_abs_w = np.where(abs_w > max_abs_w, index, rotations), np.maximum(abs_w, max_abs_w)
+    largest, components = smallest_three(multiply(q, _ROTATIONS[rotations]))
+    levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5) / step) * step, 0, 255)
     rounded = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
-    return rounded, log_scales[rows[:, None], _axes(_TURNS)[turn]].astype(np.float32)
+    return rounded, log_scales[rows[:, None], _axes(_ROTATIONS)[rotations]].astype(np.float32)
 
 
-def _axes(turns: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the source axis of each axis, [24, 3], under rotations that map axes onto axes."""
-    inverse = turns * [1, -1, -1, -1]
-    axes = [multiply(multiply(turns, np.eye(4)[1 + axis]), inverse) for axis in range(3)]
-    return np.stack([np.abs(image[:, 1:]).argmax(axis=1) for image in axes], axis=1)
+def _axes(rotations: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the axis onto which each rotation, [24, 4], maps each axis, [24, 3]."""
+    inverse = rotations * [1, -1, -1, -1]
+    axes = [multiply(multiply(rotations, np.eye(4)[1 + axis]), inverse) for axis in range(3)]
+    return np.stack([np.abs(quats[:, 1:]).argmax(axis=1) for quats in axes], axis=1)
 
 
-# Rounding SH with little visible error, using only the model.
+# Round SH with little visible error, from the model alone.
 
 ISOTROPIC = 0.02  # weight of a uniform distribution of directions added to the moments; 0.005 to 0.1 differ little
-USUAL = 0.028  # RMS of SH coefficients: fox after 7,000 steps; lego has 0.037, kitchen 0.043
+TYPICAL_RMS = 0.028  # of SH coefficients: fox after 7,000 steps; lego has 0.037, kitchen 0.043
 ROWS = 1 << 15  # rows rounded at once
 
 
 def quantization_steps(log_weights: NDArray[np.float64], median: float, max_step: float) -> NDArray[np.float32]:
-    """Return a step for each Gaussian, [N]: a power of two up to `max_step`, about `median` for the median weight."""
+    """Return power-of-two steps, [N], from 1 to `max_step`; Gaussians of median weight get about `median`."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(max_step))), np.float32)
 
 
-def usual_step(rest: Floats, step: float, max_step: float) -> float:
-    """Scale a step that suits SH of RMS size USUAL to the size of these SH, up to `max_step`."""
+def scaled_step(rest: Floats, step: float, max_step: float) -> float:
+    """Return `step`, which suits SH with an RMS of TYPICAL_RMS, scaled to the RMS of `rest`, and at most `max_step`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
-    return min(max_step, step * max(size / USUAL, 1e-3))
+    return min(max_step, step * max(size / TYPICAL_RMS, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
-    """Return the error metric G, [K, K] with trace K, of SH [N, 3 K]; the same bits for any number of threads."""
+    """Return the metric of visible errors of SH [N, 3 K]: a matrix [K, K] with a trace of about K.
+
+    The result is the same, bit for bit, for any number of threads.
+    """
     largest = robust_max(rest)
     count = rest.shape[1] // 3
     form = np.zeros((count, count))
@@ -121,7 +124,7 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
 
 
 def compensate_base(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Correct coefficients of band 0, [N, 3], for the mean error of the other bands over directions.
+    """Correct the coefficients of band 0, [N, 3], for the error of the other bands, averaged over directions.
 
     errors: exact minus rounded coefficients of the other bands, [N, 3 K].
     """
@@ -134,9 +137,12 @@ def compensate_base(base: Floats, errors: Floats, form: NDArray[np.float64]) -> 
 
 
 def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Round SH [N, 3 K] to multiples of each Gaussian's step, with error feedback under the metric `form`, [K, K]."""
+    """Round SH, [N, 3 K], to multiples of each Gaussian's step; later coefficients compensate for earlier errors.
+
+    form: the metric to minimize, [K, K], from `visible_form`.
+    """
     count = len(form)
-    # (G^-1) reversed = U^T U: row k of U says how later coefficients compensate an error of k
+    # with the metric G, (G^-1) reversed = U^T U: row k of U says how later coefficients compensate an error of k
     inverse = np.linalg.inv(form[::-1, ::-1])
     feedback = np.linalg.cholesky(inverse).T.astype(np.float32)
     feedback /= np.diag(feedback)[:, None].copy()
@@ -154,12 +160,12 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
     return rounded
 
 
-# A large SH palette: Gaussians are split into clusters recursively.
+# Compute a large SH palette by splitting clusters of Gaussians recursively.
 
 LLOYD_STEPS = 3  # per split
-AT_ONCE = 0.5  # largest fraction of clusters split before errors are recomputed
+SPLIT_FRACTION = 0.5  # largest fraction of clusters split before errors are recomputed
 TINY_WEIGHT = 1e-300  # replaces the weight of an empty cluster
-SH_LEVELS = 128  # per coefficient of 1
+SH_LEVELS = 128  # in a coefficient of 1
 LARGEST_STEP = 64.0  # levels
 Labels = NDArray[np.int64]
 
@@ -167,9 +173,10 @@ Labels = NDArray[np.int64]
 def tree_palette(
     rest: NDArray[np.float32], log_weights: NDArray[np.float64], entries: int, median_step: float
 ) -> tuple[NDArray[np.float64], Labels]:
-    """Return at most `entries` vectors [E, 3 K] for SH [N, 3 K], and the label of each Gaussian, [N].
+    """Return a palette of at most `entries` vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].
 
-    log_weights: from `log_weights`; median_step: median step of vectors, in LEVELS, for SH of typical size.
+    log_weights: [N], from `log_weights`.  median_step: median rounding step of vectors, in levels of 1 / SH_LEVELS, for
+    SH of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _split_clusters(_to_euclidean(rest, form), weights, entries)
@@ -177,7 +184,7 @@ def tree_palette(
     vectors = _sums(labels, weights, rest, len(totals)) / totals[:, None]
     log_totals = np.log2(totals)
     log_totals -= np.median(log_totals)
-    step = quantization_steps(log_totals, usual_step(rest, median_step, median_step), LARGEST_STEP)
+    step = quantization_steps(log_totals, scaled_step(rest, median_step, median_step), LARGEST_STEP)
     first = np.zeros(len(totals), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step))
@@ -188,7 +195,7 @@ def tree_palette(
 
 
 def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Transform SH so that the metric becomes the squared Euclidean distance, [N, 3 K]."""
+    """Transform SH, [N, 3 K], so that their squared Euclidean distances are errors in the metric `form`, [K, K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
     table, transformed = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
@@ -199,39 +206,39 @@ def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArr
 
 
 def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
-    """Split points [N, c] into at most `entries` clusters; return the label of each point."""
-    labels, parts = np.zeros(len(points), np.int64), 1
-    while parts < entries:
-        totals = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half can be empty
-        mean = _sums(labels, weights, points, parts) / totals[:, None]
+    """Split points, [N, c], into at most `entries` clusters, and return the label of each point, [N]."""
+    labels, cluster_count = np.zeros(len(points), np.int64), 1
+    while cluster_count < entries:
+        totals = np.maximum(np.bincount(labels, weights, minlength=cluster_count), TINY_WEIGHT)  # a half can be empty
+        mean = _sums(labels, weights, points, cluster_count) / totals[:, None]
         offsets = (points - mean[labels]).astype(np.float32)
-        spread = _sums(labels, weights, np.square(offsets), parts)
-        errors = np.where(np.bincount(labels, minlength=parts) > 1, spread.sum(axis=1), 0)
-        max_chosen = min(entries - parts, -(-parts // round(1 / AT_ONCE)))
-        chosen = np.argsort(-errors, kind="stable")[:max_chosen]
-        chosen = chosen[errors[chosen] > 0]
-        if not len(chosen):
+        spread = _sums(labels, weights, np.square(offsets), cluster_count)
+        errors = np.where(np.bincount(labels, minlength=cluster_count) > 1, spread.sum(axis=1), 0)
+        max_splits = min(entries - cluster_count, -(-cluster_count // round(1 / SPLIT_FRACTION)))
+        split_clusters = np.argsort(-errors, kind="stable")[:max_splits]
+        split_clusters = split_clusters[errors[split_clusters] > 0]
+        if not len(split_clusters):
             break
-        number_of = np.full(parts, -1)
-        number_of[chosen] = np.arange(len(chosen))
-        rows = np.flatnonzero(number_of[labels] >= 0)
-        cluster = number_of[labels[rows]]
+        split_index = np.full(cluster_count, -1)
+        split_index[split_clusters] = np.arange(len(split_clusters))
+        rows = np.flatnonzero(split_index[labels] >= 0)
+        cluster = split_index[labels[rows]]
         is_second = offsets[rows, spread.argmax(axis=1)[labels[rows]]] > 0
         is_second = _bisect(points[rows], weights[rows], cluster, is_second)
-        labels[rows[is_second]] = parts + cluster[is_second]
-        parts += len(chosen)
+        labels[rows[is_second]] = cluster_count + cluster[is_second]
+        cluster_count += len(split_clusters)
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
 def _bisect(
     points: NDArray[np.float32], weights: NDArray[np.float64], cluster: Labels, is_second: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Run Lloyd's iteration with two means per cluster; return which points are in the second half."""
-    parts = int(cluster.max()) + 1
+    """Split each cluster into two by Lloyd's iteration; return which points are in the second half, [N]."""
+    cluster_count = int(cluster.max()) + 1
     for _ in range(LLOYD_STEPS):
         half = 2 * cluster + is_second
-        totals = np.maximum(np.bincount(half, weights, minlength=2 * parts), TINY_WEIGHT)
-        means = (_sums(half, weights, points, 2 * parts) / totals[:, None]).reshape(parts, 2, -1)
+        totals = np.maximum(np.bincount(half, weights, minlength=2 * cluster_count), TINY_WEIGHT)
+        means = (_sums(half, weights, points, 2 * cluster_count) / totals[:, None]).reshape(cluster_count, 2, -1)
         axis = means[:, 1] - means[:, 0]
         threshold = (axis * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)
         projection = np.zeros(len(points))
@@ -242,14 +249,14 @@ def _bisect(
 
 
 def _sums(
-    labels: Labels, weights: NDArray[np.float64], points: NDArray[np.floating], parts: int
+    labels: Labels, weights: NDArray[np.float64], points: NDArray[np.floating], cluster_count: int
 ) -> NDArray[np.float64]:
-    """Return weighted sums of the points of each label, [parts, c], summed in the order of the points."""
-    columns = [np.bincount(labels, weights * column, minlength=parts) for column in points.T]
+    """Return the weighted sum of the points of each label, [clusters, c], added in the order of the points."""
+    columns = [np.bincount(labels, weights * column, minlength=cluster_count) for column in points.T]
     return np.stack(columns, axis=1)
 
 
-# Estimating how much each Gaussian contributes to renders, using only the model.
+# Estimate how much each Gaussian contributes to renders, from the model alone.
 
 LARGEST = 10.0  # limit of the absolute logarithms
 # Sky Gaussians are recognized by a gap in distance: clsplat/gaussians/conversion.py places them 10 times as far away as
@@ -259,26 +266,27 @@ MIN_INSIDE, MIN_BEHIND = 0.01, 0.05  # fractions of all Gaussians
 
 
 def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
-    """Return base-2 logarithms of the weights, [N], from -LARGEST to LARGEST, with a median of 0.
+    """Return the base-2 logarithms of each Gaussian's weight in renders, [N], from -LARGEST to LARGEST.
 
-    They do not depend on the scale of the model.  has_sky: some Gaussians are a sky, which the median excludes.
+    Their median is 0, and they do not depend on the scale of the model.  has_sky: whether some Gaussians are a sky,
+    which the median excludes.
     """
     if not len(p["means"]):
         return np.zeros(0)
     means, scales = p["means"].astype(np.float64), np.sort(p["log_scales"].astype(np.float64), axis=1)
     squares = np.square(means - np.median(means, axis=0)).sum(axis=1)
-    counted = before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
-    squares += np.maximum(np.median(squares[counted]), 1e-30)
+    is_scene = before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
+    squares += np.maximum(np.median(squares[is_scene]), 1e-30)
     opacity = -np.logaddexp(0, -p["logit_opacity"][:, 0].astype(np.float64))
     logs = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)
-    return np.asarray(np.clip(logs - np.median(logs[counted]), -LARGEST, LARGEST))
+    return np.asarray(np.clip(logs - np.median(logs[is_scene]), -LARGEST, LARGEST))
 
 
 def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which distances, [N], are before the gap that separates a sky; all if there is no gap."""
+    """Return the mask of distances, [N], below the gap that separates a sky; all are below if there is no gap."""
     ordered, count = np.sort(distances), len(distances)
     counts = np.arange(1, count + 1)
-    close_counts = np.searchsorted(ordered, ordered / GAP, side="right")
-    is_end = (close_counts >= INSIDE * counts) & (counts >= MIN_INSIDE * count) & (count - counts >= MIN_BEHIND * count)
-    is_end &= ordered > 0
-    return distances <= ordered[is_end][-1] / 2 if is_end.any() else np.ones(count, np.bool_)
+    near_counts = np.searchsorted(ordered, ordered / GAP, side="right")
+    has_gap = (near_counts >= INSIDE * counts) & (counts >= MIN_INSIDE * count) & (count - counts >= MIN_BEHIND * count)
+    has_gap &= ordered > 0
+    return distances <= ordered[has_gap][-1] / 2 if has_gap.any() else np.ones(count, np.bool_)

@@ -1,13 +1,15 @@
-"""Read SPZ of Niantic, versions 1 to 4, and write version 3: planes of bytes in gzip (1 to 3) or Zstandard (4).
+"""Read SPZ files of Niantic, versions 1 to 4, and write version 3.
+
+Planes of bytes are compressed with gzip (versions 1 to 3) or Zstandard (4):
 
     header     u32 magic, version, splats · u8 SH degree, fractional bits, flags, 0; in version 4 instead of the 0: u8
                streams, u32 offset of their table (u64 packed, u64 unpacked size each), 12 bytes of 0
     positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colors  255 (0.15 f_dc + 1/2)
-    scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the others as sign and 9 bits of
-               511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
+    scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the other three as a sign and 9 bits
+               of 511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
     harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
 
-Axes are x right, y up, z back, or those that a record of an extension names.  Some programs keep those of the PLY, and
+Axes are x right, y up, z back, unless an extension record names others.  Some programs keep the axes of the PLY, and
 the file does not say so.
 """
 
@@ -40,7 +42,7 @@ from clsplat.formats.sog_quantize import (
     log_weights,
     quantization_steps,
     round_sh,
-    usual_step,
+    scaled_step,
     visible_form,
 )
 from clsplat.formats.splats import (
@@ -66,7 +68,7 @@ from clsplat.formats.splats import (
     warn_dropped,
 )
 
-# Encoding and decoding the planes of an SPZ file.
+# Encode and decode the planes of an SPZ file.
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -75,7 +77,7 @@ HEADER = 16  # bytes
 COLOR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
-COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units have more bits, up to those that readers take
+COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units get more bits; readers accept up to 23
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
 # steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
@@ -85,7 +87,7 @@ SMALLEST_FRACTION = {"small": 0.5, "balanced": 0.5, "high": 0.0}
 # steps of colors, in levels of 255: for a Gaussian of median weight, and at most
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
-TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in levels of 511
+QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in levels of 511
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class SpzHeader:
 
     @classmethod
     def parse(cls, path: Path, data: bytes) -> "SpzHeader":
-        """Parse the first bytes of a file.  Raises DataError if they are invalid."""
+        """Parse the header in the first bytes of a file.  Raises DataError if it is invalid."""
         if len(data) < HEADER or data[:4] != MAGIC:
             raise DataError(f"{path}: not an SPZ file, whose header has {HEADER} bytes; copy or export it again")
         version, count, degree, fraction, flags = struct.unpack_from("<2I3B", data, 4)
@@ -113,13 +115,13 @@ class SpzHeader:
 
     @property
     def sizes(self) -> list[int]:
-        """Sizes of the planes, bytes."""
+        """The uncompressed sizes of the planes, in bytes, in the order of the file."""
         widths = (6 if self.version == 1 else 9, 1, 3, 3, 3 if self.version < 3 else 4)
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
 def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
-    """Decode the planes to parameters; each entry of `planes` is a function that reads the next bytes of a plane."""
+    """Decode the planes of a file.  planes: functions that return the next bytes of each plane, given their number."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
         "logit_opacity": logits(np.arange(256) / 255.0),
@@ -133,14 +135,14 @@ def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Param
     order = ("means", "logit_opacity", "sh_base", "log_scales", "quats", "sh_rest")
     for name, size, plane in zip(order, header.sizes, planes, strict=False):  # degree 0 may have no last plane
         for start in range(0, header.count if size else 0, ROWS):
-            part = parameters[name][start : start + ROWS]
-            data = np.frombuffer(plane(size // header.count * len(part)), np.uint8).reshape(len(part), -1)
+            block = parameters[name][start : start + ROWS]
+            data = np.frombuffer(plane(size // header.count * len(block)), np.uint8).reshape(len(block), -1)
             if name == "means":
-                part[:] = _positions(header, data)
+                block[:] = _positions(header, data)
             elif name == "quats":
-                part[:] = _three_bytes(data) if header.version < 3 else _four_bytes(data)
+                block[:] = _three_bytes(data) if header.version < 3 else _four_bytes(data)
             else:
-                part[:] = levels[name][data[:, : widths[name]]]
+                block[:] = levels[name][data[:, : widths[name]]]
     return parameters
 
 
@@ -160,40 +162,40 @@ def _three_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
     bits = packed.view("<u4")[:, 0]
-    parts = [bits >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
-    others = np.stack([(part & 511) / 511 * 0.5**0.5 * np.where(part & 512, -1, 1) for part in parts], axis=1)
-    xyzw = from_smallest_three((bits >> np.uint32(30)).astype(np.intp), others)
+    fields = [bits >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
+    components = np.stack([(field & 511) / 511 * 0.5**0.5 * np.where(field & 512, -1, 1) for field in fields], axis=1)
+    xyzw = from_smallest_three((bits >> np.uint32(30)).astype(np.intp), components)
     return np.roll(xyzw, 1, axis=1)
 
 
 def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) -> int:
     """Return the number of fractional bits with which all positions fit into 24 bits; warn if it is small.
 
-    Raises DataError for positions that do not fit even without fractional bits.
+    Raises DataError if positions do not fit even without fractional bits.
     """
     largest = float(np.abs(means).max(initial=0))
-    extra = max(0, round(-math.log2(typical_size(means))) - COARSE)  # in a small unit of length
-    target = min((FINE_FRACTION if is_fine else FRACTION) + extra, MAX_FRACTION)
-    bits = min(target, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
+    extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # for models in a large unit of length
+    target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
+    bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
     if bits < 0:
         raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {largest:g}; crop it")
-    if bits < min(FRACTION + extra, MAX_FRACTION):
+    if bits < min(FRACTION + extra_bits, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
             "crop the model for more precision",
             path,
             largest,
             2.0**-bits,
-            2.0**-target,
+            2.0**-target_bits,
         )
     return bits
 
 
 def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
-    """Encode the planes; values outside of their range are clipped.
+    """Return the bytes of the planes; values outside their range are clipped, with a warning.
 
-    weights: base-2 logarithms, [N], of `log_weights`.  Gaussians with fine SH steps come first and otherwise keep their
-    order, because similar bytes compress better.
+    weights: base-2 logarithms, [N], from `log_weights`.  Gaussians with fine SH steps come first, because
+    similar bytes compress better; Gaussians with equal steps keep their order.
     """
     sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
@@ -211,14 +213,14 @@ def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     levels["colors"] = np.rint(levels["colors"] / step) * step
     alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in levels.values())
     positions = _encode_positions(p, weights, fraction, SMALLEST_FRACTION[options.quality])
-    rotations = _encode_rotations(p["quats"], TURN_STEP[options.quality])
+    rotations = _encode_rotations(p["quats"], QUAT_STEP[options.quality])
     return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
 
 def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
-    """Encode positions in 24 bits, with power-of-two steps of about `relative` times the smallest scale.
+    """Encode coordinates in 24 bits, rounded to power-of-two steps of about `relative` times the smallest scale.
 
-    Steps grow for small weights.
+    Gaussians of small weight have larger steps.
     """
     size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(size + np.log2(relative) + fraction), 0, MAX_ZEROS)) if relative else 1.0
@@ -229,10 +231,10 @@ def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int
 
 def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
     """Encode the three smallest components of quaternions in 9 bits each, as multiples of `step`, with signs."""
-    largest, others = smallest_three(np.roll(unit(quats), -1, axis=1))
-    multiples = np.rint(511 / step * np.abs(others) * 2**0.5) * step
+    largest, components = smallest_three(np.roll(unit(quats), -1, axis=1))
+    multiples = np.rint(511 / step * np.abs(components) * 2**0.5) * step
     levels = np.minimum(multiples, 511).astype(np.uint32)
-    levels |= (others < 0).astype(np.uint32) << np.uint32(9)
+    levels |= (components < 0).astype(np.uint32) << np.uint32(9)
     rotations = largest.astype(np.uint32) << np.uint32(30)
     for i, shift in enumerate((20, 10, 0)):
         rotations |= levels[:, i] << np.uint32(shift)
@@ -240,17 +242,17 @@ def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
-    """Return the SH step of each Gaussian, [N] levels; 1 for all if nothing is rounded."""
+    """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all are 1 for quality `high`."""
     max_step = LARGEST_STEP[options.quality]
     if max_step == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
-    return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), max_step)
+    return quantization_steps(weights, scaled_step(rest, *MEDIAN_STEP[options.quality]), max_step)
 
 
 def _round_sh_bands(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Round SH to levels, 128 for 0: multiples of each Gaussian's step.
+    """Return the SH above band 0 as bytes, 128 for 0, rounded to multiples of each Gaussian's step.
 
-    Also returns band 0, corrected for the rounding errors.
+    Also return band 0, corrected for the rounding errors.
     """
     rest = p["sh_rest"]
     levels = np.clip(rest, -1, 1) * np.float32(128)
@@ -263,20 +265,23 @@ def _round_sh_bands(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArr
     return np.asarray(np.clip(rounded + 128, 0, 255), np.uint8), base
 
 
-# Zstandard from Python 3.14, or else from the optional package zstandard.
+# Zstandard comes from Python 3.14 or newer, or else from the optional package zstandard.
 
-MAX_WINDOW = 27  # log2 of bytes, largest window that a stream may request
+MAX_WINDOW = 27  # log2 of the largest window that a stream may request, in bytes
 
 
 class ZstdFrame:
-    """A frame of `size` bytes, read in parts.  Raises DataError for another size or a damaged frame."""
+    """A Zstandard frame that is read in parts.
+
+    Reading raises DataError if the frame is damaged or does not decompress to `size` bytes.
+    """
 
     def __init__(self, path: Path, data: bytes, size: int) -> None:
         self.path, self.size, self.bytes_left = path, size, size
         self.stream, self.error = _open_zstd(data)
 
     def read(self, size: int) -> bytes:
-        """Return the next `size` bytes."""
+        """Return the next `size` decompressed bytes.  Raises DataError."""
         data = self._read(size)
         self.bytes_left -= size
         if len(data) != size or (not self.bytes_left and self._read(1)):
@@ -310,19 +315,19 @@ WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
 CODE_RATIO = 1032  # largest compression ratio of deflate
-RATIO = 32  # largest accepted compression ratio; that of real files is below 8
-MIN_LIMIT = 1 << 26  # bytes of planes that any file may decode to: 0.3 GB in memory
+RATIO = 32  # largest accepted compression ratio; real files have less than 8
+MIN_LIMIT = 1 << 26  # bytes of planes that a file of any size may decode to: 0.3 GB in memory
 BLOCK = 1 << 16  # bytes read at once
-GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without time and system, so that the same model gives the same bytes
-AXES_RECORD = 0xADBE0003  # an extension of Adobe: the number, from 1, of a name in AXES
+GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # no time or system, so that the same model is written as the same bytes
+AXES_RECORD = 0xADBE0003  # an extension of Adobe; it contains 1 + the index of a name in AXES, or 0
 AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
-USUAL_AXES = "RUB"
-QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # to a vertical y
+DEFAULT_AXES = "RUB"
+QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # makes y the vertical axis
 EXPECTED = "an SPZ file"
 
 
 def read_spz(path: Path, options: Reading) -> SplatFile:
-    """Read an SPZ file.  Raises DataError if it is missing or damaged, and MemoryLimitError."""
+    """Read an SPZ file.  Raises DataError if it is missing or damaged, MemoryLimitError if it is too large."""
     splats, axes = decode_spz(path, read_file(path, EXPECTED, limit=MAX_FILE))
     if not options.quiet:
         remedy = "if the model is upside down, use `clsplat convert --transform 'rotate=180,0,0'`"
@@ -331,23 +336,24 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
 
 
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
-    """Decode the bytes of an SPZ file; also return the axes that it declares, or ''.  Raises as `read_spz`."""
+    """Decode the bytes of an SPZ file, and return the splats and the declared axes, or ''.  Raises like `read_spz`."""
     is_new = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
     header, parameters, axes = (_decode_4 if is_new else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)
-    name = axes or USUAL_AXES
+    name = axes or DEFAULT_AXES
     if name[1] in "BF":  # z is vertical
-        turned = transform(parameters, 1.0, QUARTER_TURN, 0.0)
-        parameters |= {table: values.astype(np.float32) for table, values in turned.items()}
+        rotated_tables = transform(parameters, 1.0, QUARTER_TURN, 0.0)
+        parameters |= {table: values.astype(np.float32) for table, values in rotated_tables.items()}
         name = name[0] + name[2] + ("B" if name[1] == "F" else "F")
     flip_axes_in_place(parameters, [1.0 if letter in "RDF" else -1.0 for letter in name])
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default"), axes
 
 
 def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write splats: those with finer SH steps first, each group along a Morton curve.
+    """Write an SPZ file and return its SHA-256.
 
-    Raises OutputError, and DataError if positions are too large.
+    Splats with finer SH steps come first; splats with equal steps follow a Morton curve.
+    Raises OutputError, and DataError if the model is empty or has values outside the range of the format.
     """
     require_gaussians(path, splats)
     require_in_range(path, splats, "SPZ")  # one invalid value would spoil the SH of all Gaussians
@@ -355,8 +361,8 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     weights = log_weights(p, splats.has_sky)
     fraction = choose_fraction_bits(path, p["means"], options.quality == "high")
     planes = encode(path, flip_axes(p), weights, fraction, options)
-    numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
-    return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
+    header_values = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
+    return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *header_values, 0) + b"".join(planes)))
 
 
 def _gzip(data: bytes) -> bytes:
@@ -368,7 +374,7 @@ def _gzip(data: bytes) -> bytes:
 
 
 def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
-    """Decode header, parameters, and declared axes of versions 1 to 3, in gzip or plain."""
+    """Decode the header, parameters, and declared axes of versions 1 to 3, with or without gzip."""
     stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
     start = stream.read(HEADER)
     if start[:3] == b"ply":
@@ -394,13 +400,13 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
 
 
 class _Gzip:
-    """The members of a gzip file, read in parts.  Raises DataError if one is damaged."""
+    """The decompressed content of a gzip file, read in parts.  Reading raises DataError if a member is damaged."""
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.data, self.file, self.stream = path, data, io.BytesIO(data), zlib.decompressobj(31)
 
     def read(self, size: int) -> bytes:
-        """Return `size` bytes, or fewer at the end."""
+        """Return the next `size` decompressed bytes, or fewer at the end."""
         data = bytearray()
         while len(data) < size and (not self.stream.eof or self._start_member()):
             packed = self.stream.unconsumed_tail or self.file.read(BLOCK)
@@ -416,7 +422,7 @@ class _Gzip:
         return bytes(data)
 
     def _start_member(self) -> bool:
-        """Start the next gzip member; return False if there is none."""
+        """Start the next gzip member, and return whether there is one."""
         start = self.file.tell() - len(self.stream.unused_data)
         if self.data[start : start + 2] != b"\x1f\x8b":
             return False
@@ -433,25 +439,25 @@ class _Gzip:
 
 
 def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
-    """Decode header, parameters, and declared axes of version 4."""
+    """Decode the header, parameters, and declared axes of version 4."""
     header = SpzHeader.parse(path, data)
     if len(data) < HEADER4:
         raise DataError(f"{path}: has {len(data)} bytes; expected a header of {HEADER4}; copy or export it again")
-    streams, table = struct.unpack_from("<BI", data, HEADER - 1)
+    stream_count, table_start = struct.unpack_from("<BI", data, HEADER - 1)
     sizes = [size for size in header.sizes if size]
-    if streams != len(sizes) or not HEADER4 <= table <= len(data) - 16 * streams:
+    if stream_count != len(sizes) or not HEADER4 <= table_start <= len(data) - 16 * stream_count:
         raise DataError(
-            f"{path}: has {streams} streams and their table at byte {table}; expected {len(sizes)} streams within "
-            f"{len(data)} bytes; copy or export it again"
+            f"{path}: has {stream_count} streams and their table at byte {table_start}; expected {len(sizes)} streams "
+            f"within {len(data)} bytes; copy or export it again"
         )
     _check_size(path, header, _max_decoded(data))
-    axes = _read_axes(path, io.BytesIO(data[HEADER4:table]).read) if header.flags & EXTENSIONS else ""
-    start, frames = table + 16 * streams, []
-    for number, size in enumerate(sizes):
-        length, unpacked = struct.unpack_from("<2Q", data, table + 16 * number)
+    axes = _read_axes(path, io.BytesIO(data[HEADER4:table_start]).read) if header.flags & EXTENSIONS else ""
+    start, frames = table_start + 16 * stream_count, []
+    for index, size in enumerate(sizes):
+        length, unpacked = struct.unpack_from("<2Q", data, table_start + 16 * index)
         if unpacked != size or length > len(data) - start:
             raise DataError(
-                f"{path}: stream {number} declares {length} bytes for {unpacked}; expected {size} for {header.count} "
+                f"{path}: stream {index} declares {length} bytes for {unpacked}; expected {size} for {header.count} "
                 "splats, inside the file; copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + length], size))
@@ -462,12 +468,12 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
 
 
 def _max_decoded(data: bytes) -> int:
-    """Return how many bytes of planes a compressed file may decode to."""
+    """Return the largest accepted number of plane bytes that a compressed file decodes to."""
     return max(len(data) * RATIO, MIN_LIMIT)
 
 
 def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
-    """Raise DataError, before allocating, if a file cannot contain as many splats as it declares."""
+    """Raise DataError if the declared splats have more than `limit` bytes, MemoryLimitError if memory is too small."""
     if (total := sum(header.sizes)) > limit:
         raise DataError(
             f"{path}: declares {header.count} splats of {total} bytes, more than it can contain ({limit}); "
@@ -477,7 +483,7 @@ def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
 
 
 def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
-    """Return the declared axes, or ''; skip other extensions, as Niantic's library does.  Raises DataError."""
+    """Return the declared axes, or ''; skip other extensions, like Niantic's library.  Raises DataError."""
     axes = ""
     while len(record := read(8)) == 8:
         kind, length = struct.unpack("<2I", record)

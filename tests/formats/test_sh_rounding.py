@@ -18,8 +18,8 @@ from clsplat.formats.sog_quantize import (
     log_weights,
     quantization_steps,
     round_sh,
+    scaled_step,
     tree_palette,
-    usual_step,
     visible_form,
 )
 from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
@@ -217,7 +217,7 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     levels = 128 * actual["sh_rest"]
     np.testing.assert_array_equal(levels, np.rint(levels))
     expected = np.sort(
-        quantization_steps(log_weights(source.parameters), usual_step(source.parameters["sh_rest"], 3, 5), 64)
+        quantization_steps(log_weights(source.parameters), scaled_step(source.parameters["sh_rest"], 3, 5), 64)
     )
     np.testing.assert_array_equal(levels, np.rint(levels / expected[:, None]) * expected[:, None])
     assert len(np.unique(expected)) > 4
@@ -234,7 +234,7 @@ def test_spz_steps_depend_on_each_gaussians_weight(tmp_path, rng):
     source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
     actual = round_trip(tmp_path / "a.spz", source).parameters
     p = source.rows(morton_order(source.parameters["means"])).parameters
-    own = np.argsort(quantization_steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
+    own = np.argsort(quantization_steps(log_weights(p), scaled_step(p["sh_rest"], 3, 5), 64), kind="stable")
     p = {name: table[own] for name, table in p.items()}
     weights = log_weights(p)[:, None]
     base = compensate_base(p["sh_base"], p["sh_rest"] - actual["sh_rest"], visible_form(p["sh_rest"]))
@@ -303,9 +303,9 @@ def test_existing_palette_is_recovered(rng):
 
 def test_small_harmonics_have_smaller_steps(rng):
     rest = rng.normal(0, 0.1, (500, 45))
-    assert usual_step(rest, 4.0, 6.0) == 6
-    assert usual_step(np.zeros((0, 45)), 4.0, 6.0) < 1
-    np.testing.assert_allclose(usual_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sog_quantize.USUAL, rtol=0.05)
+    assert scaled_step(rest, 4.0, 6.0) == 6
+    assert scaled_step(np.zeros((0, 45)), 4.0, 6.0) < 1
+    np.testing.assert_allclose(scaled_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sog_quantize.TYPICAL_RMS, rtol=0.05)
 
 
 def test_sog_keeps_the_shape_and_converts_again_losslessly(tmp_path, rng):
