@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 
 
 class _CheckoutFinder:
-    """An import finder for `clsplat.data_tools` in a checkout, where its folder is next to the package."""
+    """An import finder for `clsplat.data_tools` in a source checkout, where `data_tools` is next to the package."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:

@@ -1,6 +1,7 @@
 """Export the names that plug-ins may import: base classes, and the types in their signatures.
 
-Other modules of clsplat may change between versions, but the names in this module remain.  No module imports it.
+Other modules of clsplat may change between versions, but the names in this module are stable.  No other module of
+clsplat imports it.
 """
 
 from clsplat.core.errors import (

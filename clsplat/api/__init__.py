@@ -1,1 +1,1 @@
-"""The Python API: thin objects over the packages below, NumPy in and out.  `import clsplat` offers the names."""
+"""The Python API, with NumPy arrays as inputs and outputs.  `import clsplat` provides its names."""

@@ -1,4 +1,4 @@
-"""Convert arguments of the API to the types used in the rest of the package."""
+"""Convert the arguments of the API to the types that the other packages use."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,11 +8,11 @@ from typing import Any
 from clsplat.core.errors import ConfigError
 
 PathLike = str | Path
-Overrides = Mapping[str, Any] | Sequence[str]  # values by key, or 'key=value' as for --set
+Overrides = Mapping[str, Any] | Sequence[str]  # settings by key, or 'key=value' strings as for --set
 
 
 def overrides(values: Overrides) -> list[str]:
-    """Return settings in the notation of `--set`, with paths and NumPy numbers converted to text and numbers.
+    """Return settings as `key=value` strings, the notation of `--set`.  Paths and NumPy scalars are converted.
 
     Raises ConfigError for a value that YAML cannot represent.
     """
@@ -27,7 +27,7 @@ def overrides(values: Overrides) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value for JSON.  Raises TypeError."""
+    """Convert a path to a string, or a NumPy scalar to a number.  Raises TypeError for other types."""
     import numpy as np  # slow to import, and the command line does not need it
 
     if isinstance(value, Path):
@@ -38,20 +38,20 @@ def _plain(value: Any) -> Any:
 
 
 def load_plugins() -> None:
-    """Import the plug-ins of installed packages, once."""
+    """Import the plug-ins of installed packages.  Only the first call has an effect."""
     from importlib.metadata import entry_points
 
-    if entry_points(group="clsplat.plugins"):  # without any, the command line starts without OpenCL and pydantic
+    if entry_points(group="clsplat.plugins"):  # otherwise the command line starts without OpenCL and pydantic
         from clsplat.pipeline import plugins
 
         plugins.load_installed()
 
 
 def to_path(value: PathLike | None) -> Path | None:
-    """Convert a path to `Path`; None stays None."""
+    """Convert a path to `Path`, and return None for None."""
     return None if value is None else Path(value)
 
 
 def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
-    """Return the names of the layers to render: color, and the requested ones."""
-    return ("color", *(name for name, is_wanted in (("depth", depth), ("alpha", alpha)) if is_wanted))
+    """Return the names of the layers to render: "color", and "depth" and "alpha" if requested."""
+    return ("color", *(name for name, is_requested in (("depth", depth), ("alpha", alpha)) if is_requested))

@@ -1,9 +1,11 @@
-"""Provide the commands as functions, from paths and plain values to files and plain values.
+"""Provide the commands of the command line as functions.
 
-The command line prints their results.  They raise the errors of `clsplat.core.errors`: ConfigError for a pipeline or an
-argument, DataError for a dataset or a model, DeviceError for a device, OutputError for a file that cannot be written.
-`device` is part of a device's name, as in `devices`, or a `Device`; the default is CLSPLAT_DEVICE, or else the
-strongest working GPU, or else the first CPU.
+They accept paths and plain values, write files, and return plain values, which the command line prints.  They raise the
+errors of `clsplat.core.errors`: ConfigError for a pipeline or an argument, DataError for a dataset or a model,
+DeviceError for a device, and OutputError for a file that cannot be written.
+
+`device` is part of the name of a device, as returned by `devices`, or an open `Device`.  The default is the device that
+CLSPLAT_DEVICE names, otherwise the strongest working GPU, or the first CPU if there is no such GPU.
 """
 
 import math
@@ -32,17 +34,17 @@ def run(
     minutes: float | None = None,
     on: PathLike | None = None,
 ) -> Path:
-    """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
+    """Run a pipeline or a matrix, as `clsplat run` does, and return the run folder.
 
-    pipeline: a file, or the name of a shipped one
-    scene: folder of the dataset; default: the scene of the pipeline
+    pipeline: a file, or the name of a shipped pipeline
+    scene: the dataset folder; default: the scene that the pipeline names
     out: the run folder; default: runs/NAME
     set: settings by key, such as {"optimize.steps": 3000}
-    start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" starts over if `out` has
-        a run, and removes its checkpoints and metrics
-    live: port of a web page on this machine that shows the model while it trains; 0: the default port
-    minutes: choose the number of steps to fit this time, counted from the reading of the photos
-    on: a file that says where the cells of a matrix run, instead of its `execution`
+    start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" removes the checkpoints
+        and metrics of an existing run in `out` and starts over
+    live: port of a web page on this machine that shows the model while it trains; 0 selects the default port
+    minutes: choose the number of steps so that the run takes this time, measured from when it reads the photos
+    on: an execution file, which specifies where the cells of a matrix run; it replaces the matrix's `execution`
     """
     return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
 
@@ -57,7 +59,10 @@ def describe_run(
     start: Literal["new", "resume", "restart"] = "new",
     on: PathLike | None = None,
 ) -> str:
-    """Check everything that `run` needs, and return what it would do as text; nothing is written."""
+    """Check all inputs of `run` without running it or writing files, and return a description of the run as text.
+
+    The arguments are those of `run`.
+    """
     return _job(pipeline, scene, out, set, start, on).describe(device)
 
 
@@ -71,9 +76,12 @@ def resume(
     live: int | None = None,
     on: PathLike | None = None,
 ) -> Path:
-    """Continue a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
+    """Continue a run or a matrix from its newest checkpoint, as `clsplat resume` does, and return the run folder.
 
-    scene: the new folder of the photos, if they were moved; steps: train up to this step; set, live, on: as for `run`.
+    folder: the run folder
+    scene: the new path of the dataset folder, if it was moved
+    steps: train up to this step
+    set, live, on: as for `run`
     """
     return run_job(resume_job(folder, scene, set, steps, on), device, live)
 
@@ -81,7 +89,7 @@ def resume(
 def resume_job(
     folder: PathLike, scene: PathLike | None, set: Overrides, steps: int | None, on: PathLike | None
 ) -> "Job":
-    """Return the job that `resume` runs, to describe it instead."""
+    """Return the job that `resume` runs, so that it can also be described without running it."""
     from clsplat.pipeline.execution import read_execution
     from clsplat.sweeps.experiment import Job
 
@@ -90,12 +98,15 @@ def resume_job(
 
 
 def status(folder: PathLike) -> dict[str, Any]:
-    """Return the state of a run or a matrix from its files: the content of status.json, `last` report, and `metrics`.
+    """Return the state of a run or a matrix from its files.
 
-    A matrix has `cells`, `done`, and `failed` instead of a step.  `silent` is the time since the last heartbeat of an
-    unfinished run, s, and `ahead` the time by which it is in the future, if more than a minute; the state is "killed"
-    if the process is gone.  `advice` says how to continue.  The store of a sweep has `cells`, `counts` of their states,
-    and `events`; a scene in blocks has `state` and `parts`.
+    A run has the keys of status.json, its last report as `last`, and its `metrics`.  A matrix has `cells`, `done`, and
+    `failed` instead of a step.  An unfinished run also has `silent`, the seconds since its last heartbeat, and `ahead`,
+    the seconds by which that heartbeat is in the future, if it is at least a minute.  Its state is "killed" if the
+    process no longer exists.  `advice` says how to continue.
+
+    The store of a sweep has `cells`, the `counts` of cells by state, and `events`.  A scene that is trained in blocks
+    has `state` and `parts`.
     """
     from clsplat.workflows.folder import parse_status
 
@@ -112,10 +123,12 @@ def status_schema() -> dict[str, Any]:
 def check(pipeline: PathLike) -> dict[str, Any]:
     """Validate a pipeline or a matrix, verify a run folder, or inspect a model file.
 
-    A pipeline or a matrix returns `path`, `name`, `stages` or `cells`, and `adapts`: the keys that the photos will
-    decide.  The folder of a run, or of a scene in blocks, returns `whole`, `state`, and `objects`: each file, whether
-    it is `whole`, and a `detail`.  A model file returns `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
-    and `valid`.
+    The keys of the result depend on what is checked:
+
+    - A pipeline or a matrix: `path`, `name`, `stages` or `cells`, and `adapts`, keys whose values depend on the photos.
+    - A run folder, or the folder of a scene in blocks: `whole` (whether all files are intact), `state`, and `objects`,
+      a list of files, each with `whole` and a `detail`.
+    - A model file: `format`, `ranges`, `bounds`, the counts of `degenerate` Gaussians, `findings`, and `valid`.
     """
     from clsplat.workflows.folder import check
 
@@ -124,7 +137,7 @@ def check(pipeline: PathLike) -> dict[str, Any]:
 
 
 def pipeline_schema() -> dict[str, Any]:
-    """Return the JSON schema of pipeline files, with the variants of plug-ins."""
+    """Return the JSON schema of pipeline files, including the classes that plug-ins add."""
     from clsplat.pipeline.recipes import json_schema
 
     load_plugins()
@@ -132,7 +145,10 @@ def pipeline_schema() -> dict[str, Any]:
 
 
 def pipelines(name: PathLike | None = None) -> Any:
-    """Return `name`, `summary`, and `path` of all shipped pipelines, or those and `stages` and `keys` of one."""
+    """List the shipped pipelines with their `name`, `summary`, and `path`, or describe the pipeline `name`.
+
+    A description has these keys, and also `stages` and `keys`.
+    """
     from clsplat.pipeline import recipes
 
     load_plugins()
@@ -140,7 +156,7 @@ def pipelines(name: PathLike | None = None) -> Any:
 
 
 def copy_pipeline(name: PathLike, file: PathLike) -> Path:
-    """Copy a pipeline to a file, or into a folder; return the copy.  Existing files are never replaced."""
+    """Copy a pipeline to a file or into a folder; return the path of the copy.  Existing files are never replaced."""
     from clsplat.pipeline import recipes
 
     return recipes.copy(str(name), Path(file))
@@ -156,10 +172,13 @@ def evaluate(
     lpips_input: Literal["-1..1", "0..1"] = "-1..1",
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Measure a model at the views of a scene; return metrics by split and downscale factor, as in metrics.json.
+    """Measure a model at the views of a scene.  Return metrics by split and downscale factor, as in metrics.json.
 
-    model, scene: as for `render_views`; downscales: divisors of the image size; metrics: some of psnr (dB), ssim,
-    ms_ssim and flip; lpips: an ONNX file; lpips_input: the range of pixel values that it expects.
+    model, scene: as for `render_views`
+    downscales: divisors of the image size
+    metrics: any of "psnr" (in dB), "ssim", "ms_ssim", and "flip"
+    lpips: an ONNX file of an LPIPS network
+    lpips_input: the range of the pixel values that this network expects
     """
     from clsplat.metrics.perceptual import Perceptual, metric_names
     from clsplat.runs.model_file import ModelFile
@@ -187,23 +206,23 @@ def _job(
 
 
 def run_job(job: "Job", device: "str | Device | None", live: int | None = None, minutes: float | None = None) -> Path:
-    """Run a job and return its folder; arguments as for `Job.run`.  Raises ClsplatError."""
+    """Run a job and return its folder.  The arguments are those of `Job.run`.  Raises ClsplatError."""
     from clsplat.opencl.device import Device
     from clsplat.pipeline.matrix import Experiment
 
-    work = job.work
-    if not isinstance(work, Experiment) or not work.execution.has_store:
+    experiment = job.work
+    if not isinstance(experiment, Experiment) or not experiment.execution.has_store:
         job.run(device, live, minutes)
         return job.out
     if live is not None or minutes is not None:
         raise ConfigError("--live and --minutes are for single runs; the cells of a store run in other processes")
     if isinstance(device, Device):
         raise ConfigError("device: expected a name, because the cells of a store run in other processes")
-    if device is not None and work.execution.has_workers:
+    if device is not None and experiment.execution.has_workers:
         raise ConfigError("--device: with a scheduler, workers choose the devices; use `clsplat worker --device NAME`")
     from clsplat.sweeps.batch import run_sweep  # slow to import, and not needed for a single run
 
-    run_sweep(work, job.state, work.execution, device, job.start)
+    run_sweep(experiment, job.state, experiment.execution, device, job.start)
     return job.out
 
 
@@ -221,12 +240,16 @@ def compress_model(
     steps: int | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Find the smallest file of a model within a loss of quality, or the best file of a size.
+    """Find the smallest file of a model within a limit on quality loss, or the best file within a limit on size.
 
-    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: folder for the file, a page, and all trials;
-    keep: fractions of the Gaussians to try; steps: training steps after each pruning, default 1000, and a fifth of that
-    for each palette.  Returns the content of compress.json, with `file` and `page`.  Raises ConfigError for a target
-    that no file meets.
+    model, scene: as for `render_views`
+    target: the limit, such as "-0.1dB" (of PSNR) or "5MB"
+    out: folder for the file, a page about the search, and all trials
+    format: the file format
+    keep: fractions of the Gaussians to try
+    steps: training steps after each pruning, 1000 by default; each palette is trained for a fifth of these steps
+
+    Returns the content of compress.json, with `file` and `page`.  Raises ConfigError for a target that no file meets.
     """
     from clsplat.workflows import compress
 
@@ -251,11 +274,16 @@ def write_levels(
 ) -> dict[str, Any]:
     """Write a model in levels of detail, as streamed SOG (lod-meta.json).
 
-    model, scene: as for `render_views`, but without a scene nothing is trained, and ConfigError is raised for `steps`,
-    `downscale`, or `device`; levels: their number, including the model itself; keep: fraction of the Gaussians of the
-    previous level; steps: training steps of each coarser level, default 500, 0 for none; downscale: divisor of the
-    image size in training, by default that of the run.  Returns `folder`, `bytes`, the measured `split`, and
-    `levels` with `gaussians`, `bytes`, `merged_psnr`, before training, and `psnr`, dB.
+    model, scene: as for `render_views`; without a scene, no level is trained, and `steps`, `downscale`, and `device`
+        raise ConfigError
+    folder: the new folder
+    levels: the number of levels, including the model itself
+    keep: number of Gaussians of each level, as a fraction of the previous level
+    steps: training steps of each coarser level, 500 by default; 0 turns training off
+    downscale: divisor of the image size in training; default: the downscale factor of the run
+
+    Returns `folder`, `bytes`, `split` (the views that were measured), and `levels`.  Each level has `gaussians`,
+    `bytes`, `merged_psnr` (dB, before training), and `psnr` (dB).
     """
     from clsplat.workflows.lod import LodPlan, levels_of_detail
 
@@ -270,9 +298,9 @@ def write_levels(
 def plan_in_blocks(
     scene: PathLike, pipeline: str = "blocks", *, blocks: int = 4, device: "str | Device | None" = None
 ) -> dict[str, Any]:
-    """Partition a scene by its points, without training it or writing files.
+    """Partition a scene into blocks by its points, without training or writing files.
 
-    Returns the content of partition.json, with the estimated time of each block as `seconds`.
+    Returns the content of partition.json, with the estimated training time of each block in `seconds`.
     """
     from clsplat.workflows.blocks import plan_blocks
 
@@ -297,19 +325,27 @@ def train_in_blocks(
 ) -> dict[str, Any]:
     """Train a scene in blocks: partition a coarse model, train each block with the views that see it, and merge them.
 
-    out: a folder; an interrupted call continues there; coarse: a pipeline that trains the coarse model, or a model file
-    or run; min_coverage: a view trains a block that covers more than this fraction of its pixels; steps: "each": all
-    steps of the pipeline for each block, "shared": a fraction in proportion to its number of views; overrides:
-    'stage.key=value'; only_plan: stop after the partition; on: a file that says where to train the blocks.
-    Returns the content of partition.json, `run`, the folder of the merged model, and `metrics`.
+    scene: the dataset folder
+    out: folder of all runs; an interrupted call continues there
+    pipeline: the pipeline that trains each block
+    blocks: the number of blocks
+    coarse: a pipeline that trains the coarse model, or a model file or run folder
+    min_coverage: a view belongs to a block that covers more than this fraction of its pixels
+    steps: "each" trains every block for all steps of the pipeline; "shared" trains a block for a fraction of the steps,
+        in proportion to its number of views
+    overrides, coarse_overrides: settings of the two pipelines, as 'stage.key=value'
+    only_plan: stop after the partition
+    on: an execution file, which specifies where to train the blocks
+
+    Returns the content of partition.json, `run` (the folder of the merged model), and `metrics`.
     """
     from clsplat.pipeline.execution import Execution, read_execution
     from clsplat.workflows.blocks import BlocksPlan, train_in_blocks
 
     load_plugins()
     plan = BlocksPlan(pipeline, str(coarse), blocks, min_coverage, steps, list(overrides), list(coarse_overrides))
-    values = read_execution(to_path(on))
-    execution = None if values is None else Execution.model_validate(values)
+    settings = read_execution(to_path(on))
+    execution = None if settings is None else Execution.model_validate(settings)
     return train_in_blocks(Path(scene), Path(out), plan, device, only_plan=only_plan, execution=execution)
 
 
@@ -325,9 +361,12 @@ def run_cell(
     set: Overrides = (),
     device: str | None = None,
 ) -> Path:
-    """Run a cell of a matrix, or a pipeline as a cell, and store its result; return the folder of the result.
+    """Run a cell of a matrix, or a pipeline as a single cell, and store the result.  Return the folder of the result.
 
-    index: index of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
+    store: the folder of the store
+    index: index of the cell in the matrix, from 0
+
+    A cell that already has a result in the store is not run again.
     """
     from clsplat.runs.model_file import with_scene_path
     from clsplat.sweeps.batch import run_one
@@ -337,9 +376,9 @@ def run_cell(
 
 
 def cancel(store: PathLike, cell: str | None = None) -> str:
-    """Ask running cells of a store, or one of them by name or key, to save their state and stop.
+    """Request that running cells of a store save their state and stop: all cells, or the cell with a name or key.
 
-    Return the key, or "all".
+    Returns the key of the cell, or "all".
     """
     from clsplat.sweeps.store import Store
 
@@ -353,12 +392,15 @@ def run_worker(
     tls: tuple[str | None, str | None, str | None] = (None, None, None),
     insecure: bool = False,
 ) -> None:
-    """Offer the devices of this machine to a scheduler, dask://HOST:PORT or tls://HOST:PORT, until it ends.
+    """Run cells from a scheduler on the devices of this machine until the scheduler ends.
 
-    devices: names, by default all devices that work; tls: files of the CA certificate, the certificate, and its key.
+    scheduler: its address, dask://HOST:PORT or tls://HOST:PORT
+    devices: names of devices; default: all working devices
+    tls: paths of the CA certificate, the certificate, and its private key
+    insecure: allow a connection without TLS
     """
     from clsplat.pipeline.execution import from_options
-    from clsplat.sweeps.dask import offer  # where Dask is installed
+    from clsplat.sweeps.dask import offer  # requires Dask
 
     load_plugins()
     certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None
@@ -381,13 +423,17 @@ def convert(
     frames: int | None = None,
     world: bool = False,
 ) -> dict[str, Any]:
-    """Merge models into one file, in the format of its extension; return `format`, `gaussians`, and `bytes`.
+    """Merge models into one file, whose suffix selects the format.  Return `format`, `gaussians`, and `bytes`.
 
-    crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
-    drop_below: an opacity.  Gaussians that are not finite, or without rotation, are dropped.
-    time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
-    timestamp, to the folder `out` as PLY, or to files named `out` with a number added; world: write world coordinates
-    instead of an origin.
+    Gaussians with values that are not finite, or with a zero quaternion, are dropped.
+
+    crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
+    transform: such as "scale=2 rotate=90,0,0" (degrees)
+    drop_below: drop Gaussians with a lower opacity
+    time: write a moving model as a static model at this time, in [0, 1]
+    frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
+        `out` with a number added
+    world: write world coordinates instead of an origin
     """
     from clsplat.gaussians import conversion
     from clsplat.gaussians.conversion import check_time, convert_frames
@@ -414,9 +460,9 @@ def convert(
 
 
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", published: PathLike | None = None) -> int:
-    """Write a page that compares runs; return their number.  A matrix folder is replaced by its finished runs.
+    """Write a page that compares runs; return the number of runs.  A matrix folder counts as all of its finished runs.
 
-    published: a YAML file with published metrics, which are shown in a separate table.
+    published: a YAML file of published metrics, which are shown in a separate table
     """
     from clsplat.core.files import check_result_path
     from clsplat.sweeps.compare.comparison import read_published
@@ -435,11 +481,12 @@ def view(
     photograph_budget: float = 4.0,
     splats: int | None = None,
 ) -> Path:
-    """Write a page that shows one model, or two side by side, offline in any browser; return its path.
+    """Write a page that shows one model, or two side by side, offline in any browser.  Return its path.
 
-    models: files or run folders; scene: the page includes its views and photos; default: that of a run folder;
-    photographs: which photos to include, up to `photograph_budget` MB; splats: include only this number of Gaussians,
-    the most important ones.
+    models: model files or run folders
+    scene: the dataset whose views and photos are included; default: the dataset of a run folder
+    photographs: the photos to include, up to `photograph_budget` MB
+    splats: include only this number of Gaussians, selected by importance
     """
     from clsplat.runs import video as videos
 

@@ -1,4 +1,4 @@
-"""Render images and videos, and write cameras; errors and `device` as in `clsplat.api.commands`."""
+"""Render images and videos, and write cameras.  Errors and `device` are as in `clsplat.api.commands`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -31,12 +31,14 @@ def render_views(
     time: float | None = None,
     device: "str | Device | None" = None,
 ) -> int:
-    """Render a model at the views of a scene, one file per view; return the number of files.
+    """Render a model at the views of a scene, and write one file per view.  Return the number of files.
 
-    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the image size, by
-    default that of the run, or 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth, alpha:
-    also write NAME_depth and NAME_alpha, as arrays [height, width] in scene units and in [0, 1]; time: for a moving
-    model, in [0, 1], instead of the times of the views.
+    model: a model file, which requires `scene`, or a run folder
+    scene: a dataset folder; default: the dataset of the run
+    downscale: divisor of the image size; default: the downscale factor of the run, or 1 for a model file
+    kind: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
+    depth, alpha: also write NAME_depth (scene units) and NAME_alpha (in [0, 1]), as arrays [height, width]
+    time: render a moving model at this time, in [0, 1], instead of at the times of the views
     """
     from clsplat.runs.model_file import KINDS, SPLITS, ModelFile
 
@@ -44,8 +46,8 @@ def render_views(
     for option, value, choices in (("split", split, SPLITS), ("kind", kind, KINDS)):
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
-    opened = ModelFile(Path(model), to_path(scene), device, downscale)
-    return opened.render(split, Path(out), kind, layer_names(depth, alpha), time)
+    model_file = ModelFile(Path(model), to_path(scene), device, downscale)
+    return model_file.render(split, Path(out), kind, layer_names(depth, alpha), time)
 
 
 def render_path(
@@ -68,21 +70,23 @@ def render_path(
 ) -> dict[str, Any]:
     """Render a video of a model along a camera path, as `clsplat render --path` does.
 
-    Returns `files`, the number of `frames`, `fps`, the duration in `seconds`, the `size` of a frame, and the time it
-    `took`, s.
+    Returns `files`, the number of `frames`, `fps`, the duration in `seconds`, the `size` of a frame, and the rendering
+    time `took`, in seconds.
 
-    model, scene: a file and its scene, or a run folder
-    video: a .webm file, or a .mp4 file with the extra `video`; None: images of this `kind` in the folder `out`
-    path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME of a view, or a camera_path.json file
-    frames: default 120; fps: default 30; size: even numbers; default: the image size divided by `downscale`
-    times: for a moving model, one time in [0, 1], or those of the first and last frame, such as (0, 1) or "0..1";
-        default: the whole range, or the times of the views
-    side: what to show on the right: "photograph", the photo with the nearest camera, or another model
+    model, scene: as for `render_views`
+    video: a .webm file, or a .mp4 file if the extra `video` is installed; None writes images of this `kind` to `out`
+    path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME with the name of a view, or a camera_path.json file
+    frames: 120 by default
+    fps: 30 by default
+    size: width and height, which must be even; default: the image size divided by `downscale`
+    times: for a moving model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
+        default: the full range, or the times of the views
+    side: what to show in the right half: "photograph", the photo with the nearest camera, or another model
     depth, alpha: also write videos of these layers
 
-    Raises ConfigError for values out of range, a missing scene, and files that must not be replaced; DataError for
-    unreadable files, and if the path is impossible with the cameras; NumericError for images that are not finite;
-    OutputError if files cannot be written; and errors of the device.
+    Raises ConfigError for a value out of range, a missing scene, or a file that must not be replaced; DataError for an
+    unreadable file, or a path that the cameras do not permit; NumericError for images that are not finite; OutputError
+    for a file that cannot be written; DeviceError and MemoryLimitError for a device.
     """
     from clsplat.runs import video as videos
     from clsplat.viewer.video.plan import VideoRequest
@@ -101,7 +105,9 @@ def camera_path(
 ) -> "list[View]":
     """Return the views of a camera path around or through a scene.
 
-    path: as for `render_path`.  Raises DataError if the path is impossible with the cameras of the scene.
+    path, frames, size: as for `render_path`
+
+    Raises DataError if the cameras of the scene do not permit the path.
     """
     import numpy as np
 
@@ -112,9 +118,9 @@ def camera_path(
 
 
 def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: float = 30) -> int:
-    """Write images, [height, width, 3] in [0, 1] or uint8, as a .webm or .mp4 video; return their number.
+    """Write images, [height, width, 3] in [0, 1] or uint8, as a .webm or .mp4 video.  Return the number of images.
 
-    Raises ConfigError for other suffixes and odd sizes, and ValueError for images of different sizes.
+    Raises ConfigError for another suffix or an odd size, and ValueError for images of different sizes.
     """
     from clsplat.viewer.video.encoding import write_video
 
@@ -127,11 +133,12 @@ def write_cameras(
     format: Literal["colmap", "nerfstudio", "inria"] = "colmap",
     images: Literal["none", "copy"] = "none",
 ) -> list[Path]:
-    """Write the cameras of a dataset or a run folder for other programs, as `clsplat data cameras` does.
+    """Write the cameras of a dataset or a run for other programs, as `clsplat data cameras` does; return the files.
 
-    format: sparse/0/*.txt of COLMAP, transforms.json of nerfstudio, or cameras.json of the reference implementation;
-    images: "copy" copies the photos to out/images.  Returns the camera files.  Raises DataError for a lens that the
-    format does not support, and ConfigError if a file exists.
+    format: sparse/0/*.txt of COLMAP, transforms.json of nerfstudio, or cameras.json of the reference implementation
+    images: "copy" also copies the photos to out/images
+
+    Raises DataError for a lens that the format does not support, and ConfigError if a file exists.
     """
     from clsplat.runs import model_file
     from clsplat.scene.scene import Scene

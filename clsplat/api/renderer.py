@@ -29,20 +29,20 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPEN_LOCK = threading.Lock()
-GEOMETRY = 6  # number of pixel sums for the geometry; the others are for the color (cl_kernels/splat.h)
+GEOMETRY = 6  # the first pixel sums are for the geometry, the others for the color (cl_kernels/splat.h)
 
 
 def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
-    """Open a device by name, or the default device, and check it against the reference; return it.
+    """Open a device by name, or the default device, check it against the reference, and return it.
 
-    The check runs once per device, as for a run.  Raises DeviceError if the device computes wrongly.
+    The check runs once per device, as it does for a run.  Raises DeviceError if the results of the device are wrong.
     """
     return open_verified(default_device(schedule) if device is None else device, schedule, sort)
 
 
 def default_device(schedule: Schedule = "auto") -> Device:
-    """Return the default device, which is opened on first use."""
-    with _OPEN_LOCK:  # so that all threads get the same device
+    """Return the default device, which is opened at the first call."""
+    with _OPEN_LOCK:  # all threads must get the same device
         return _open_default(schedule)
 
 
@@ -73,14 +73,14 @@ class Gradients:
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """A rendered view; the caller owns the arrays."""
+    """A rendered view.  The caller may change the arrays."""
 
-    image: Floats  # [height, width, 3], with the background
+    image: Floats  # [height, width, 3], over the background
     alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
-    depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 for empty pixels
+    depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where alpha is 0
     view: View
     background: Floats  # [3]
-    model: DeviceModel  # the rendered version, which this reference keeps on the device
+    model: DeviceModel  # the rendered model, which stays on the device as long as this result
     renderer: "Renderer"
 
     def backward(
@@ -88,10 +88,13 @@ class RenderResult:
     ) -> Gradients:
         """Return the gradients of a loss with respect to all parameters, and to the camera's pose and focal length.
 
-        image: [height, width, 3] dL/d image; alpha, depth: [height, width] dL/d alpha, and dL/d depth in
-        1 / scene units, which does not count where alpha is 0.  May be called repeatedly, also after an update of the
-        renderer: the gradients are those of the rendered model.  Raises ValueError for other shapes, and for the depth
-        of a moving model; render `model.at(time)` then.
+        image: dL/d image, [height, width, 3]
+        alpha: dL/d alpha, [height, width]
+        depth: dL/d depth, [height, width] in 1 / scene units; it is ignored where alpha is 0
+
+        This method can be called repeatedly, even after `Renderer.update`: the gradients are always those of the
+        rendered model.  Raises ValueError for arrays of another shape, and for `depth` if the model moves; use a
+        renderer of `model.at(time)` instead.
         """
         return self.renderer.backward(self, image, alpha, depth)
 
@@ -109,26 +112,26 @@ class RenderResult:
 
 
 def serialized(method: Method) -> Method:
-    """Decorate methods so that one thread at a time runs any of them; the object must have a `_lock`."""
+    """Decorate methods so that only one thread at a time runs any of them; the object must have a `_lock`."""
 
     @wraps(method)
-    def locked(self: Any, *arguments: Any, **options: Any) -> Any:
+    def call(self: Any, *arguments: Any, **options: Any) -> Any:
         with self._lock:
             return method(self, *arguments, **options)
 
-    return cast(Method, locked)
+    return cast(Method, call)
 
 
 class Renderer:
     """Renders a model on a device.
 
-    Threads may share a renderer; it renders one image at a time.  Several renderers can share a device.
+    Threads may share a renderer, which renders one image at a time.  Several renderers can share a device.
     """
 
     def __init__(self, model: Model, device: str | Device | None = None) -> None:
-        """Copy a model to a device, given by name or open; default: `default_device()`.
+        """Copy a model to a device: an open one, one with this name, or by default `default_device()`.
 
-        Raises DeviceError if there is none, or if it computes wrongly.
+        Raises DeviceError if no device is found, or if its results are wrong.
         """
         self._lock = threading.RLock()
         self.device = open_checked(device)
@@ -137,16 +140,17 @@ class Renderer:
 
     @serialized
     def update(self, model: Model) -> None:
-        """Use another model, or the same one after its arrays were changed in place."""
+        """Replace the model, or upload the same model again after its arrays were changed in place."""
         self.model, self._model = model, model.upload(self.device)
 
     @serialized
     def render(self, view: View, background: Color | None = None, depth: bool = False) -> RenderResult:
-        """Render a view, with a moving model at the time of the view.
+        """Render a view.  A moving model is rendered at the time of the view.
 
-        background: a color in [0, 1], one number or three; default: the model's sky or color, or else black; depth:
-        whether to compute the depth, in another pass.  Raises ValueError for an invalid camera or background, and
-        NumericError if a value of the result is not finite.
+        background: a color in [0, 1], as one number or three; default: the model's sky or background, or black
+        depth: also render the depth, which requires a second pass
+
+        Raises ValueError for an invalid camera or background, and NumericError if a value of the result is not finite.
         """
         view.camera.check()
         camera, color = upload_camera(self.device, view), self._color(background)
@@ -159,7 +163,7 @@ class Renderer:
     def render_batch(
         self, views: Sequence[View], background: Color | None = None, depth: bool = False
     ) -> list[RenderResult]:
-        """Render views of any sizes, one after another; see `render`."""
+        """Render views one after another; their sizes may differ.  The other arguments are those of `render`."""
         return [self.render(view, background, depth) for view in views]
 
     @serialized
@@ -215,9 +219,9 @@ class Renderer:
 
 
 def _depth_planes(frame: Frame, alpha: Floats | None, depth: Floats | None) -> Floats:
-    """Return the gradient of a render of (depth, 1, 0) on black, [height, width, 3].
+    """Return the gradient of a loss with respect to a render of (depth, 1, 0) on black, [height, width, 3].
 
-    Its first channel divided by its second, which is alpha, is the mean depth.
+    The mean depth is the first channel of this render divided by the second, which is alpha.
     """
     size = frame.camera.height, frame.camera.width
     planes = np.zeros((*size, 3), np.float32)
@@ -242,12 +246,12 @@ def _check_shape(name: str, derivative: Floats, shape: tuple[int, ...]) -> Float
 
 
 class FieldRenderer:
-    """Renders a field on a device.  Threads may share it; it renders one image at a time."""
+    """Renders a field on a device.  Threads may share a renderer, which renders one image at a time."""
 
     def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
-        """Copy a field to a device, given by name or open; default: `default_device()`.
+        """Copy a field to a device: an open one, one with this name, or by default `default_device()`.
 
-        Raises DeviceError if there is none, or if it computes wrongly.
+        Raises DeviceError if no device is found, or if its results are wrong.
         """
         self._lock = threading.RLock()
         self.model, self.device = model, open_checked(device)
@@ -255,9 +259,10 @@ class FieldRenderer:
 
     @serialized
     def render(self, view: View, depth: bool = False) -> Layers:
-        """Return `image` [height, width, 3] with the field's background, `alpha` and `depth` [height, width].
+        """Render a view: `image` [height, width, 3] over the field's background, `alpha` and `depth` [height, width].
 
-        depth: whether to compute the mean depth of each pixel, scene units; else it is None.
+        depth: also compute the mean depth of each pixel, in scene units; otherwise `depth` of the result is None
+
         Raises ValueError for an invalid camera, and NumericError if a value of the result is not finite.
         """
         view.camera.check()

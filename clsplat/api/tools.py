@@ -1,4 +1,4 @@
-"""Inspect devices and datasets, and measure speed; errors and `device` as in `clsplat.api.commands`."""
+"""Inspect devices and datasets, and measure speed.  Errors and `device` are as in `clsplat.api.commands`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +18,9 @@ ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the OpenCL devices: name, limits in bytes and items, and `fault`, the reason if it does not work, or None.
+    """Return the OpenCL devices, each with name, limits (bytes and work items), `schedule`, and `fault`.
 
-    Each device is tested once, in a separate process.
+    `fault` is the reason why a device does not work, or None.  Each device is tested once, in a separate process.
     """
     from dataclasses import asdict
 
@@ -32,9 +32,11 @@ def devices() -> list[dict[str, Any]]:
 
 
 def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "DeviceReport":
-    """Compare all kernels with the reference on a device; return a report with `verdict`, `usable`, and `data()`.
+    """Compare all kernels with the reference on a device.  Return a report with `verdict`, `usable`, and `data()`.
 
-    This takes a minute or two on a CPU.  page: an HTML report to write, for attaching to an issue.
+    The comparison takes a minute or two on a CPU.
+
+    page: an HTML report to write, which can be attached to an issue
     """
     from clsplat.conformance.doctor import check_html_path, examine, write_page
 
@@ -48,10 +50,12 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
 
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
-    """Inspect a dataset; return an inspection with `verdict`, `findings`, `trainable`, and `data()`.
+    """Inspect a dataset.  Return an inspection with `verdict`, `findings`, `trainable`, and `data()`.
 
-    scene: a dataset folder, or a run folder, for the scene it was trained on; page: an HTML page to write, with the
-    cameras and points in 3D.  Raises DataError only if the folder does not exist.
+    scene: a dataset folder, or a run folder, whose dataset is inspected
+    page: an HTML page to write, which shows the cameras and points in 3D
+
+    Raises DataError only if the folder does not exist.
     """
     from clsplat.core.files import check_result_path
     from clsplat.prepare.inspect.findings import Inspection
@@ -77,10 +81,12 @@ def measure_speed(
     schedule: ScheduleName = "auto",
     device: "str | Device | None" = None,
 ) -> "Measurement":
-    """Time the stages of a training step, as `clsplat bench` does; return times in ms, with `data()` and `text()`.
+    """Time the stages of a training step, as `clsplat bench` does.  Return times in ms, with `data()` and `text()`.
 
-    scenes: any of the fixed scenes A, B, and C; model, scene: a splat or point cloud and its scene, to time as well;
-    pipeline: the source of losses, statistics, and filters; repeats: steps per scene.
+    scenes: any of the fixed scenes A, B, and C
+    model, scene: a splat file or point cloud and its dataset, which are timed as well
+    pipeline: defines the losses, statistics, and filters
+    repeats: number of steps per scene
     """
     from clsplat.conformance.bench.measurement import measure
 
@@ -97,7 +103,7 @@ def measure_speed(
 
 
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
-    """Read the `data()` of an earlier measurement from JSON, to compare it with another of the same pipeline."""
+    """Read the `data()` of an earlier measurement from a JSON file, to compare it with another of the same pipeline."""
     from clsplat.conformance.bench import measurement
 
     load_plugins()
@@ -105,7 +111,7 @@ def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, 
 
 
 def load_plugin(file: PathLike) -> None:
-    """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, if that fails."""
+    """Import a plug-in file, as `--plugin` does.  Raises ConfigError with its file and line if the import fails."""
     from clsplat.pipeline import plugins
 
     plugins.load_file(Path(file))

@@ -44,9 +44,9 @@ from clsplat.training.status import StatusFile
 class Report:
     """The result of a training step."""
 
-    step: int  # global, from 1
+    step: int  # of the training, from 1
     gaussians: int
-    view: ViewGradients  # of this step; valid until the next step
+    view: ViewGradients  # the gradients of this step, valid until the next step
 
     @property
     def loss(self) -> float:
@@ -58,11 +58,12 @@ class Report:
 
 
 class Trainer:
-    """Trains a scene with a pipeline; a trainer and `clsplat run` give the same bits.
+    """Trains a scene with a pipeline.  The result is bit-identical to that of `clsplat run`.
 
-    Stages before the training run in the constructor, and those that edit the model after it run with its last step.
-    Other stages, such as `evaluate` and `export`, do not run; use the methods `evaluate` and `model`.  On Ctrl-C a step
-    finishes, and training can continue.  Threads may share a trainer; calls run one at a time.
+    Stages before the training run in the constructor, and later stages that edit the model run with the last step.
+    Other stages, such as `evaluate` and `export`, do not run; use the method `evaluate` and the property `model`.
+    Ctrl-C takes effect after the current step, and training can continue.  Threads may share a trainer; their calls
+    run one at a time.
     """
 
     def __init__(
@@ -77,14 +78,14 @@ class Trainer:
     ) -> None:
         """Prepare training.
 
-        scene: a folder, or a scene of `read_scene`, with its split
-        pipeline: a file, or the name of a shipped one
+        scene: a dataset folder, or a scene returned by `read_scene`, which keeps its split
+        pipeline: a file, or the name of a shipped pipeline
         set: settings by key, such as {"optimize.steps": 3000}
-        device: part of its name, or an open device with the schedule of the pipeline
-        out: the run folder; default: a temporary one that is deleted with the trainer
+        device: part of the name of a device, or an open device with the schedule of the pipeline
+        out: the run folder; default: a temporary folder that is deleted with the trainer
         start: as for `clsplat.run`
 
-        A trainer locks its folder until its training ends, or until `close()`, or until it is deleted.
+        A trainer locks its folder until the training ends, `close()` is called, or the trainer is deleted.
         Raises ConfigError, DataError, and DeviceError.
         """
         self._lock = threading.RLock()
@@ -105,12 +106,12 @@ class Trainer:
         state = RunState.read(self.out)
         outputs.check_output_paths(self.pipeline, state)
         rasterizer = self.pipeline.settings.rasterizer
-        opened = open_checked(device, rasterizer.schedule, rasterizer.sort)
+        open_device = open_checked(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as stack:
             status = stack.enter_context(run_folder.open_run_folder(state, start, step=0))
             with recording_failures(status, reraise=True):
                 run_scene = RunScene.from_scene(self.pipeline.settings.scene, self.scene)
-                self._run = opening.make_run(self.pipeline, run_scene, opened, self.out, status)
+                self._run = opening.make_run(self.pipeline, run_scene, open_device, self.out, status)
                 self.pipeline = resolve_choices(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
                 (self.out / CHECKSUMS).unlink(
@@ -127,10 +128,10 @@ class Trainer:
 
     @serialized
     def close(self) -> None:
-        """Unlock the run folder and end the training, which can be resumed from `out`.
+        """End the training and unlock the run folder.  The training can be resumed from `out`.
 
-        If it is called before the last step, the state in status.json is "interrupted".  After the last step, and after
-        an error, a trainer closes automatically.
+        Before the last step, the state in status.json becomes "interrupted".  After the last step, or after an error, a
+        trainer closes automatically.
         """
         if self._state == "open":
             self._state = "closed"
@@ -139,10 +140,10 @@ class Trainer:
 
     @serialized
     def step(self) -> Report:
-        """Train one step.  Raises StopIteration when the training is finished.
+        """Train for one step.  Raises StopIteration when the training is finished.
 
-        After an error in a step, the trainer cannot continue.  The state in status.json is "failed" after an error, and
-        "done" after the last step.
+        After an error in a step, the trainer cannot continue.  The state in status.json becomes "failed" after an
+        error, and "done" after the last step.
         """
         interrupts: list[bool] = []
 
@@ -175,17 +176,17 @@ class Trainer:
         return Report(self._run.step, self._run.model.gaussians.count, view)
 
     def steps(self, count: int | None = None) -> Iterator[Report]:
-        """Train step by step, for `count` steps or to the end of the training."""
-        done = 0
-        while count is None or done < count:
+        """Train step by step, for `count` steps or to the end of the training, and yield the report of each step."""
+        step_count = 0
+        while count is None or step_count < count:
             try:
                 yield self.step()
             except StopIteration:
                 return
-            done += 1
+            step_count += 1
 
     def run(self, count: int | None = None) -> Report | None:
-        """Train `count` steps, or to the end of the training; return the last report, or None."""
+        """Train for `count` steps, or to the end of the training; return the last report, or None without steps."""
         report = None
         for report in self.steps(count):  # noqa: B007
             pass
@@ -194,15 +195,17 @@ class Trainer:
     @property
     @serialized
     def model(self) -> Model:
-        """A copy of the current model; `model.baked()` bakes a world filter into its scales, as a run does."""
+        """A copy of the current model.  `model.baked()` bakes in its world filter, as a run does for its files."""
         return host_model(self._run)
 
     @serialized
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Add a loss in NumPy: `function(image, photograph) -> (value, gradient with respect to the image)`.
 
-        Arrays are [height, width, 3] float32 in [0, 1]; weight: a number or schedule.  Each step copies both images to
-        the host and the gradient back; a plug-in with a kernel avoids these copies.
+        function: receives and returns arrays [height, width, 3] float32; images are in [0, 1]
+        weight: a number or a schedule
+
+        Each step copies both images to the host and the gradient back; a plug-in with a kernel avoids these copies.
         Raises ConfigError for a negative weight.  A step raises ValueError if the function returns anything else, and
         NumericError for values that are not finite.
         """
@@ -210,9 +213,9 @@ class Trainer:
 
     @serialized
     def evaluate(self, split: str = "test") -> dict[str, Any]:
-        """Return the metrics of a split at the image size of training, with the keys of metrics.json.
+        """Return the metrics of a split at the image size of the training, with the keys of metrics.json.
 
-        psnr is in dB; a split without views returns only `views`.  Raises ValueError for an unknown split.
+        PSNR is in dB.  A split without views has only the key `views`.  Raises ValueError for an unknown split.
         """
         run = self._run
         views = learned_scene(run).downscaled(run.downscale).split(split)
@@ -222,15 +225,16 @@ class Trainer:
 
     @serialized
     def checkpoint(self) -> Path:
-        """Save a checkpoint from which training continues to the same bits, without added losses; return the file.
+        """Save a checkpoint and return its file.  Training that resumes from it yields the same bits.
 
-        The newest two are kept in `out`.  Raises OutputError if it cannot be written.
+        Losses from `add_loss` are not saved.  The newest two checkpoints are kept in `out`.  Raises OutputError if the
+        file cannot be written.
         """
         with nullcontext() if self._state == "open" else lock.lock_folder(self.out):
             return checkpoint.save(self._run, keep=2)
 
     def _record_end(self) -> None:
-        """Set the state in status.json to "done" if no steps are left."""
+        """Set the state in status.json to "done" if no steps remain."""
         if is_trained(self.pipeline, self._run):
             self._run.status.end("done", exit_code=0)
             self._state = "done"
@@ -241,14 +245,14 @@ class Trainer:
 
 
 def _record_closed(status: StatusFile) -> None:
-    """Record that a trainer was closed or deleted before its end, unless its folder was removed."""
+    """Record that a trainer was closed or deleted before its last step, unless its folder was removed."""
     if status.now.state not in END_STATES and status.out.is_dir():
         with suppress(OutputError):
             status.end("interrupted", Interrupted.exit_code, "the trainer was closed before its last step")
 
 
 def _check_pipeline(pipeline: Pipeline) -> None:
-    """Raise ConfigError if a pipeline has no training, or has `prepare` steps."""
+    """Raise ConfigError if a pipeline has no training stage, or if it has `prepare` steps."""
     if pipeline.settings.prepare:
         raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train with the result")
     if not any(isinstance(stage, Optimize) for stage in pipeline.stages):
