@@ -1,4 +1,4 @@
-"""Blur the photos, less over training: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
+"""Blur the photos less and less: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
 
 from dataclasses import replace
 from pathlib import Path

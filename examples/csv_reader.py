@@ -1,6 +1,6 @@
 """Train on cameras.csv: `clsplat --plugin csv_reader.py run splat_7k --scene DIR`.
 
-One line per photo: its path below DIR, its pose (world to camera, translation in scene units), and its camera in px.
+One line per photo: its path relative to DIR, its pose (world to camera, in scene units), and its camera in px.
 """
 
 import csv

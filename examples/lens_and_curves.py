@@ -25,7 +25,7 @@ class CameraResponse(TrainingModule):
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
     center_y are its offset from the principal point.  f is a monotone spline for each channel (Ramsay 1988), f(0) = 0
     and f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3, and 4 are the logarithms of the slope at 0, 1/4, 3/4, and
-    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and curves of powers.  All
+    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and power curves.  All
     parameters start at 0, the identity.
 
     Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are evaluated with the
@@ -33,17 +33,17 @@ class CameraResponse(TrainingModule):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
-    order: ClassVar[int] = 25  # before modules for colors, which clip white
+    order: ClassVar[int] = 25  # before color modules, which clamp at white
     device_planes: ClassVar[int] = 8  # the image after the response, and its gradient, four channels each
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "the responses of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["lens_and_curves"] = "lens_and_curves"
     rate: NonNegative = 1e-3
-    """Learning rate (Adam) of the parameters; may be scheduled. Trainings of a few hundred steps need 5e-3."""
+    """Learning rate (Adam) of the parameters; may be scheduled. Runs of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It makes the Gaussians learn
-    what all photos have in common."""
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves what all photos
+    have in common to the Gaussians."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)

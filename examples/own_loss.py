@@ -1,4 +1,4 @@
-"""Train with a loss written in NumPy, in addition to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
+"""Train with a loss written in NumPy, next to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
 
 import sys
 

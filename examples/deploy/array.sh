@@ -1,7 +1,7 @@
 #!/bin/bash
 # Run the cells of a matrix as a SLURM job array, one cell per task:
 #   sbatch --array=0-11 array.sh filters.yaml /shared/store
-# Cells are numbered from 0; the store is on the shared file system. Resubmit tasks that were stopped or lost: they resume
+# Cells are numbered from 0; the store is on the shared file system. Resubmit tasks that were stopped or lost; they resume
 # from their checkpoints, and cells that are already in the store are skipped.
 #SBATCH --job-name=clsplat
 #SBATCH --cpus-per-task=4

@@ -228,33 +228,35 @@ def differentiate(
     planes[:, :height, :width] = weights
     count, capacity = model.gaussians.count, model.gaussians.capacity
     sums = rasterizer.pixel_sums(model, frame, device.upload(planes))
-    depths = rasterizer.workspace.array(INVERSE_DEPTHS, capacity).get()[:count]
-    means = rasterizer.gradients(model, frame, sums)["means"].get()[:, :count].T
-    return frame.image.get()[:, :height, :width], sums.get()[:, :count].T.astype(np.float64), depths, means
+    depth_sums = rasterizer.workspace.array(INVERSE_DEPTHS, capacity).get()[:count]
+    grad_means = rasterizer.gradients(model, frame, sums)["means"].get()[:, :count].T
+    return frame.image.get()[:, :height, :width], sums.get()[:, :count].T.astype(np.float64), depth_sums, grad_means
 
 
 def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Results:
     """Compare the inverse depth, the sums over pixels and the gradients.  weights: as in `differentiate`."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
-    image, m, depths, means = differentiate(device, case, weights)
+    image, pixel_sums, depth_sums, grad_means = differentiate(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
     yield from check_image("blend_forward", f"inverse depth, {label}", image[3:], expected[None])
     from_image = ref.blend_backward(splats, width, height, background, weights[:3])
     from_depth, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
     mean2d, conic = (getattr(from_image, name) + getattr(from_depth, name) for name in ("mean2d", "conic"))
     opacity = from_image.opacity + from_depth.opacity
-    actual = sums_to_gradients(splats, m)
+    actual = sums_to_gradients(splats, pixel_sums)
     yield compare("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
     yield compare("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
-    yield compare("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
-    yield compare("blend_backward", f"colors with depths, {label}", m[:, 6:9], from_image.color, GRADIENT)
+    yield compare(
+        "blend_backward", f"opacities with depths, {label}", pixel_sums[:, 0], opacity * splats.opacity, GRADIENT
+    )
+    yield compare("blend_backward", f"colors with depths, {label}", pixel_sums[:, 6:9], from_image.color, GRADIENT)
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
-    yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
+    yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depth_sums, sums, GRADIENT)
     upstream = mean2d, conic, opacity, from_image.color
     settings = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *settings, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]
-    yield compare("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
+    yield compare("inverse_depth_backward", f"gradients of means, {label}", grad_means, truth, CONIC)
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")

@@ -100,7 +100,7 @@ class VariantRow:
 
     @property
     def downscale(self) -> str:
-        """The divisor of the image size in training; with several sizes, the divisor of the largest."""
+        """The divisor of the image size in training, as text; for several sizes, that of the largest one."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
