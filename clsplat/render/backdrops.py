@@ -22,9 +22,10 @@ class EnvironmentMap(Backdrop):
     """Learn a sky: a color for each direction, infinitely far away, together with the Gaussians.
 
     A pixel has the color C + T b, where C is the blended color of the Gaussians, T their transmittance, and b the map's
-    color in the direction of the pixel's ray.  The map is octahedral with bilinear interpolation, and has its own Adam.
-    Texels in directions without sky in any photograph keep their initial color.  Where a photograph shows the map's
-    color, a loss on alpha removes Gaussians in front of the sky (splatfacto-w, Xu et al. 2024).
+    color in the direction of the pixel's ray.  The map is octahedral with bilinear interpolation, and has
+    a separate Adam optimizer.  Texels in directions without sky in any photograph keep their initial color.  Where a
+    photograph shows the map's color, a loss on alpha removes Gaussians in front of the sky (splatfacto-w, Xu et al.
+    2024).
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "cover", "difference"})

@@ -72,7 +72,7 @@ def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoo
 
 
 def update_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
-    """Upload the camera of a view of the same size as `camera`; return `camera` if its values are equal."""
+    """Return `camera` with the values of a view of the same image size, uploaded if they differ."""
     values = camera_values(view, camera.tile)
     if values == camera.values:
         return camera
@@ -90,7 +90,7 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
 
 
 def camera_values(view: View, tile: int) -> NDArray[Any]:
-    """Return a view's camera_t, [].
+    """Return the camera_t of a view, a scalar record.
 
     Rays are clamped at 30% of half the field of view beyond the image's edges (gsplat's off-center form).  Raises
     DataError if the image has more tiles per side, or more pixels, than kernels can index.

@@ -1,7 +1,7 @@
 """Define the settings of `model:`: the degree of the harmonics, and two low-pass filters.
 
 A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
-filter is three numbers of the model.  Rendering reads only these numbers, and does not depend on the filters.
+filter sets three parameters of the model.  Rendering reads only these values, and does not depend on the filters.
 """
 
 from abc import abstractmethod
@@ -57,7 +57,7 @@ class NoWorldFilter(WorldFilter):
 class Smoothing(WorldFilter):
     """Blur Gaussians to the training views' resolution (3D smoothing filter of Mip-Splatting, Yu et al. 2024).
 
-    A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` takes the smallest
+    A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` uses the smallest
     such interval (eq. 6); `global_max` uses the smallest z and the largest f of all views, as in the paper's code.
     """
 
@@ -100,7 +100,7 @@ def measure_intervals(
 class ScreenFilter(Settings):
     """A blur of splats in the image; a subclass with further keys overrides `numbers`."""
 
-    pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the two numbers are for viewers
+    pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the fields below are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
     """Variance added to every splat, px²."""
     compensate: Literal[0, 1]
@@ -114,7 +114,7 @@ class ScreenFilter(Settings):
             raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.numbers")
 
     def numbers(self) -> tuple[float, float, float]:
-        """Return the numbers for rendering: variance, compensate, and 1 to integrate over the pixel's box."""
+        """Return `variance`, `compensate`, and 1 to integrate splats over the pixel's box, otherwise 0."""
         return self.variance, float(self.compensate), float(self.pixel_box)
 
 
@@ -197,9 +197,9 @@ class ModelSettings(Settings):
         in_one_sentence(f"expected 'auto' or a depth above 0 and below {MAX_NUMBER:g}"),
     ] = "auto"
     """Smallest depth in scene units that is rendered; `auto`: 4% of the scene's extent, or half of the 1% quantile of
-    the depths of observed points, if that is less.  A run writes the number."""
+    the depths of observed points, if that is less.  A run writes the value."""
     near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
-    """Written by a run: the number that `auto` chose.  While `near` equals it, other photos lead to a new choice."""
+    """Written by a run: the value that `auto` chose.  While `near` equals it, other photos lead to a new choice."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()
@@ -215,6 +215,6 @@ class ModelSettings(Settings):
         return self.background.sky if self.background else None
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
-        """Return the Gaussians with the numbers of these settings.  degree: the active SH degree."""
+        """Return the Gaussians with the rendering parameters of these settings.  degree: the active SH degree."""
         assert self.near != "auto"  # a run chooses it before its first stage
         return DeviceModel(gaussians, degree, self.near, *self.screen_filter.numbers())

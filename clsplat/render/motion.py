@@ -18,7 +18,7 @@ DEFAULT_TIME = 0.0  # for cameras without a time
 
 
 def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:
-    """Return the model at the time of a camera, in memory that the next call reuses; a static model is unchanged.
+    """Return the model at the time of a camera, in memory that the next call reuses; return a static model unchanged.
 
     A camera without a time shows the first timestamp, and a warning is logged once.
     """
@@ -35,13 +35,13 @@ def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCame
         logit_opacity=gaussians["logit_opacity"],
         moved_means=means,
         moved_logit=logit,
-        degree=_shape(gaussians)[0],
+        degree=_degree_and_rotation(gaussians)[0],
     )
     tables = {"means": means, "logit_opacity": logit}
-    if turn := _turn(gaussians):
+    if rotation := _rotation_argument(gaussians):
         tables["quats"] = workspace.array("moved quats", (4, stride))
         gaussians.device.program("motion.cl").turn_forward(
-            **_arguments(gaussians, camera), quats=gaussians["quats"], moved_quats=tables["quats"], **turn
+            **_arguments(gaussians, camera), quats=gaussians["quats"], moved_quats=tables["quats"], **rotation
         )
     return replace(model, gaussians=_with_tables(gaussians, tables))
 
@@ -58,11 +58,11 @@ def backpropagate_motion(model: DeviceModel, camera: DeviceCamera, gradients: Ga
         grad_means=gradients["means"],
         grad_logit_opacity=gradients["logit_opacity"],
         grad_motion=gradients[MOTION],
-        degree=_shape(gaussians)[0],
+        degree=_degree_and_rotation(gaussians)[0],
     )
-    if turn := _turn(gaussians):
+    if rotation := _rotation_argument(gaussians):
         program.turn_backward(
-            **_arguments(gaussians, camera), grad_quats=gradients["quats"], grad_motion=gradients[MOTION], **turn
+            **_arguments(gaussians, camera), grad_quats=gradients["quats"], grad_motion=gradients[MOTION], **rotation
         )
 
 
@@ -76,18 +76,18 @@ def _arguments(gaussians: Gaussians, camera: DeviceCamera) -> dict[str, Any]:
     }
 
 
-def _shape(gaussians: Gaussians) -> tuple[int, bool]:
+def _degree_and_rotation(gaussians: Gaussians) -> tuple[int, bool]:
     """Return the degree of the polynomials, and whether Gaussians rotate."""
     return WIDTHS[gaussians.tables[MOTION].components]
 
 
-def _turn(gaussians: Gaussians) -> dict[str, int]:
-    """Return the first plane of the rotation, if there is one."""
-    return {"first": gaussians.tables[MOTION].components - TURN} if _shape(gaussians)[1] else {}
+def _rotation_argument(gaussians: Gaussians) -> dict[str, int]:
+    """Return the kernel argument for rotation, the index of its first plane; empty if Gaussians do not rotate."""
+    return {"first": gaussians.tables[MOTION].components - TURN} if _degree_and_rotation(gaussians)[1] else {}
 
 
 def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
-    """Return a copy of Gaussians with some tables replaced."""
+    """Return a shallow copy of Gaussians with some tables replaced."""
     result = copy.copy(gaussians)
     tables = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
     result.tables = {**gaussians.tables, **tables}

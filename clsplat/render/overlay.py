@@ -12,7 +12,7 @@ from clsplat.render.workspace import Workspace
 
 @dataclass(frozen=True)
 class OverlayLayer:
-    """A layer composited over an image; valid until the next layer."""
+    """A layer composited over an image; valid until the next call of `lay_over`."""
 
     frame: Frame  # of the layer only, over black
     image: Array  # composite, [3 or 4, rows, stride]

@@ -32,7 +32,7 @@ class Layers:
 def render_layers(
     rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array, depth: bool = False
 ) -> Layers:
-    """Render a view.  background: [3]; depth: render it too, in a second pass."""
+    """Render a view to the host.  background: [3]; depth: whether to render the depth too, in a second pass."""
     frame = rasterizer.forward(model, camera, background)
     image = crop(frame, frame.image.get())
     alpha = crop(frame, 1 - np.abs(frame.transmittance.get()[None]))[:, :, 0]
@@ -53,7 +53,7 @@ def _depth(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> 
 
 
 class Painter(Protocol):
-    """A renderer of the views of cameras of any size."""
+    """A renderer for cameras of any image size."""
 
     @property
     def workspace(self) -> Workspace:

@@ -21,7 +21,7 @@ from clsplat.render.workspace import Workspace
 
 # Sums of gradient records over the pairs of each Gaussian, including those of the blended inverse depth.
 
-INVERSE_DEPTHS = "inverse_depth_sums"  # in the workspace
+INVERSE_DEPTHS = "inverse_depth_sums"  # name in the workspace
 
 
 def sum_records(
@@ -67,7 +67,7 @@ def sum_inverse_depths(
 
 
 def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splats: Array, grad_means: Array) -> None:
-    """Add the gradient of the inverse depth, from the last sums, to that of the means.  splats: [N, RECORD]."""
+    """Add the gradient through the inverse depth, from the last sums, to `grad_means`.  splats: [N, RECORD]."""
     count, capacity = splats.shape[0], grad_means.shape[1]
     workspace.device.program("inverse_depth.cl").inverse_depth_backward(
         items=count,
@@ -81,7 +81,7 @@ def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splat
 
 
 def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
-    """Return the arguments of every kernel that projects Gaussians, by name.
+    """Return the arguments shared by all kernels that project Gaussians, by name.
 
     Harmonics of Gaussians outside the view may have deferred updates; these kernels do not read them.
     """
@@ -136,8 +136,8 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
     if on_host or (deferred and deferred.updates):
         splats = workspace.array("splats", (model.gaussians.count, RECORD))
         radius = workspace.array("radius", model.gaussians.capacity)
-        no_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
-        depth_key = project(workspace, replace(model, degree=0), camera, no_band, splats, radius).depth_key
+        empty_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
+        depth_key = project(workspace, replace(model, degree=0), camera, empty_band, splats, radius).depth_key
         if on_host:
             on_host.upload_visible(depth_key)
         if deferred:
@@ -148,8 +148,8 @@ PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
 Content = Literal["color", "depth", "inverse_depth"]
-# The planes are the color; or (depth of the mean in scene units, 1, 0); or the color and a fourth plane, the blended
-# inverse depth of the means.
+# color: three planes of color.  depth: the depth of the mean in scene units, 1, and 0.  inverse_depth: the color, and a
+# fourth plane with the blended inverse depth of the means.
 
 
 @dataclass(frozen=True)
@@ -172,10 +172,10 @@ class Frame:
 def pose_gradient(
     workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array
 ) -> Callable[[], NDArray[np.float64]]:
-    """Return a function that waits for the pose gradient of the losses, [7].
+    """Return a function that waits for the pose gradient of the loss and returns it, [7].
 
-    The gradients are those of a translation of all Gaussians, of their rotation about the camera, in world axes, and of
-    the logarithm of a factor on the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
+    It contains the gradients with respect to a translation of all Gaussians, their rotation about the camera in world
+    axes, and the logarithm of a factor on the focal lengths.  pixel_sums: of the frame, [PIXEL_SUMS, S].
     """
     device = workspace.device
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
@@ -183,8 +183,8 @@ def pose_gradient(
     device.program("poses.cl", **model.defines).pose_gradient(
         items=items, **shape_arguments(frame.model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
     )
-    group_sums = sums.get_later()
-    return lambda: np.cumsum(group_sums(), axis=1, dtype=np.float64)[:, -1]
+    read_group_sums = sums.get_later()
+    return lambda: np.cumsum(read_group_sums(), axis=1, dtype=np.float64)[:, -1]
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class Rasterizer:
         self.tiler = Tiler(device, self.workspace, sort)
         self.skies = Skies(device, self.workspace)
         self._black = device.zeros(3)
-        device.program("project.cl")  # built now, like the other programs
+        device.program("project.cl")  # compiled now, like the other programs
         self._blend("color")
         self._lanes = int(device.tuning["LANES"])
         self._gradients: GaussianGradients | None = None  # allocated at first use
@@ -228,17 +228,17 @@ class Rasterizer:
                     self.skies.paint(sky, camera, frame.image, frame.transmittance)
                 return frame
             except TooManyPairs as error:
-                if not self._narrow(camera):
+                if not self._halve_bands(camera):
                     raise MemoryLimitError(
                         f"an image of {camera.width}x{camera.height} px has a row of tiles with more than "
                         f"{MAX_PAIRS:,} (tile, Gaussian) pairs; use smaller images, or fewer Gaussians"
                     ) from error
             except MemoryLimitError:
-                if not self._narrow(camera):
+                if not self._halve_bands(camera):
                     raise
 
-    def _narrow(self, camera: DeviceCamera) -> bool:
-        """Halve the height of the bands; return whether they had more than one row of tiles."""
+    def _halve_bands(self, camera: DeviceCamera) -> bool:
+        """Halve the height of the bands; return whether any had more than one row of tiles."""
         bands = self._bands.get(camera.tiles_y, 1)
         self._bands[camera.tiles_y] = 2 * bands
         return bands < camera.tiles_y
@@ -277,7 +277,7 @@ class Rasterizer:
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
         rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)
-        return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
+        return [Band(camera.tiles_x, camera.tiles_y, int(begin), int(end)) for begin, end in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
         """Return the first tile and the number of tiles of each launch; watchdogs may limit the time of a launch."""
@@ -295,8 +295,8 @@ class Rasterizer:
             self.device.program("depth.cl").paint_depth(
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
             )
-        single = band.row_end - band.row_begin == 1  # cannot be split further
-        limit = MAX_PAIRS if single else self._limit
+        is_single_row = band.row_end - band.row_begin == 1  # cannot be split further
+        limit = MAX_PAIRS if is_single_row else self._limit
         return self.tiler.build(splats, footprints, band, count, limit, model.defines)
 
     def pixel_sums(
@@ -308,18 +308,18 @@ class Rasterizer:
         texture: Array | None = None,
         behind: Array | None = None,
     ) -> Array:
-        """Return the sums over each Gaussian's pixels from which gradients follow, [count, S] (cl_kernels/splat.h).
+        """Return the sums over each Gaussian's pixels that determine its gradients, [count, S] (cl_kernels/splat.h).
 
         grad_image: in the layout of the frame's image, zero outside it.  A `count` above PIXEL_SUMS is slower; texture
         sums need `texture`, [rows, stride], negative if unknown.  behind: [rows, stride] T dL/dT of a loss on the
-        transmittance T.  The memory is limited as in `forward`.
+        transmittance T.  Memory is limited as in `forward`.
         """
         bands = frame.bands
         while True:
             try:
                 return self._pixel_sums(model, frame, bands, grad_image, count, texture, behind)
             except MemoryLimitError:
-                if not self._narrow(frame.camera):
+                if not self._halve_bands(frame.camera):
                     raise
                 bands = self._split(frame.camera)
 
@@ -336,7 +336,7 @@ class Rasterizer:
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
         blend_defines = {**defines, "GRAD_BEHIND": 1} if behind else defines
         pixel_sums = self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
-        for number, band in enumerate(bands):
+        for i, band in enumerate(bands):
             lists = frame.lists
             if len(bands) > 1:
                 lists = self._project_band(frame.model, frame.camera, band, frame.splats, frame.radius, frame.content)
@@ -357,9 +357,9 @@ class Rasterizer:
                     pair_sums=pair_sums,
                     first_tile=first_tile,
                 )
-            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate=int(number > 0))
+            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate=int(i > 0))
             if frame.content == "inverse_depth":
-                sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate=int(number > 0))
+                sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate=int(i > 0))
         return pixel_sums
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> GaussianGradients:

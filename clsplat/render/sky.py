@@ -37,7 +37,7 @@ class Runs:
 
 
 def ray_directions(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
-    """Return unnormalized ray directions through pixel centers, [height, width, 3], scene axes; values: camera_t."""
+    """Return unnormalized ray directions through pixel centers, [height, width, 3], scene axes.  values: camera_t."""
     rotation = values["world_to_camera"].reshape(3, 4)[:, :3].astype(np.float64)
     x = (np.arange(width) + 0.5 - np.float64(values["cx"])) / np.float64(values["fx"])
     y = (np.arange(height) + 0.5 - np.float64(values["cy"])) / np.float64(values["fy"])
@@ -50,15 +50,15 @@ def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> I
     values: camera_t.
     """
     rays = ray_directions(values, width, height)
-    first = np.floor(texel_positions(rays, side)).astype(np.int64)
-    bits = (signs(rays) < 0) @ np.array([1, 2, 4])
-    key = first[..., 0] + 1 | (first[..., 1] + 1) << PLACE_BITS | bits << 2 * PLACE_BITS
-    starts = np.ones(key.shape, bool)
-    starts[:, 1:] = key[:, 1:] != key[:, :-1]
-    row, column = np.nonzero(starts)
+    first_texel = np.floor(texel_positions(rays, side)).astype(np.int64)
+    octant = (signs(rays) < 0) @ np.array([1, 2, 4])
+    key = first_texel[..., 0] + 1 | (first_texel[..., 1] + 1) << PLACE_BITS | octant << 2 * PLACE_BITS
+    is_start = np.ones(key.shape, bool)
+    is_start[:, 1:] = key[:, 1:] != key[:, :-1]
+    row, column = np.nonzero(is_start)
     end = np.append(column[1:], width)
     end[np.append(row[1:] != row[:-1], True)] = width
-    corner = first[row, column]
+    corner = first_texel[row, column]
     words = np.column_stack([row, column, end, key[row, column]])
     return np.column_stack([words, bilinear_texels(corner[:, 0], corner[:, 1], side)])
 
@@ -90,10 +90,10 @@ class Skies:
         words = run_words(values, camera.width, camera.height, side)
         texel = words[:, -CORNERS:].ravel()
         entries = np.argsort(texel, kind="stable")
-        shown, first_entry = np.unique(texel[entries], return_index=True)
+        shown_texels, first_entry = np.unique(texel[entries], return_index=True)
         rows = np.arange(camera.height + 1)
         strips = np.searchsorted(words[:, 0], rows) if self._lanes > 1 else np.arange(len(words) + 1)
-        arrays = words, strips, shown, np.append(first_entry, len(entries)), entries
+        arrays = words, strips, shown_texels, np.append(first_entry, len(entries)), entries
         return Runs(camera.array, *(self.device.upload(array.astype(np.uint32)) for array in arrays))
 
     def paint(self, sky: DeviceSky, camera: DeviceCamera, image: Array, transmittance: Array) -> None:
@@ -125,7 +125,7 @@ class Skies:
         """Return T dL/dT of the loss on splats in front of the sky, [1, rows, stride], and row sums of 1 - T, [rows].
 
         free: [1, side * side], 1 for trained texels, otherwise 0; photograph: [3, rows, stride]; difference: largest
-        for a pixel that counts as sky; scale: factor on the loss.
+        color difference of a pixel that counts as sky; scale: factor on the loss.
         """
         runs, padded_stride = self.runs(camera, sky.side), camera.stride + 2 * BORDER
         matches = self.workspace.array("sky matches", (camera.rows + 2, padded_stride))
@@ -160,10 +160,13 @@ class Skies:
         return behind, sums
 
     def grad_texels(self, sky: DeviceSky, camera: DeviceCamera, transmittance: Array, gradient: Array) -> Array:
-        """Return the gradient of the texels in the view, [3, shown], from that of the image."""
+        """Return the gradient of the texels in the view, [3, texels], from the gradient of the image."""
         runs = self.runs(camera, sky.side)
-        count, shown = runs.runs.shape[0], runs.shown.shape[0]
-        sums, result = self.workspace.array("run sums", (count, RUN_SUMS)), self.workspace.array("texels", (3, shown))
+        count, texel_count = runs.runs.shape[0], runs.shown.shape[0]
+        sums, result = (
+            self.workspace.array("run sums", (count, RUN_SUMS)),
+            self.workspace.array("texels", (3, texel_count)),
+        )
         self._program.sky_backward(
             items=count,
             runs=runs.runs,
@@ -175,12 +178,12 @@ class Skies:
             **_sizes(sky, camera),
         )
         self._program.sky_gather(
-            items=(shown, 3),
+            items=(texel_count, 3),
             run_sums=sums,
             first_entry=runs.first_entry,
             entries=runs.entries,
             grad_texels=result,
-            shown=shown,
+            shown=texel_count,
         )
         return result
 
@@ -189,7 +192,7 @@ class Skies:
     ) -> None:
         """Update the texels in the view with Adam.
 
-        grad_texels: [3, shown] gradient; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
+        grad_texels: [3, texels]; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
         and `free`, [1, side * side], 1 for trained texels, otherwise 0.
         """
         runs = self.runs(camera, sky.side)

@@ -1,6 +1,6 @@
 """List the splats of each tile, front to back.
 
-Two algorithms give the same result.  Radix sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in that
+Two algorithms produce the same result.  Radix sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in that
 order, and then sorts them stably by tile.  Bitonic emits the pairs in the order of indices, and sorts each tile by
 (depth, index).  Both break ties by index.
 """
@@ -33,7 +33,7 @@ class Footprints:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs in emission order, with those of a Gaussian contiguous, and the depth order of each tile."""
+    """Pairs in emission order, contiguous for each Gaussian, and the depth order of each tile."""
 
     pairs: int
     pair_splat: Array  # [P] Gaussian of each pair
@@ -54,7 +54,7 @@ class Band:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles in the whole grid."""
+        """Number of tiles in the full grid."""
         return self.tiles_x * self.tiles_y
 
     @property
@@ -76,7 +76,7 @@ def resolve_sort(device: Device, sort: Sort) -> Sort:
 
 
 class Tiler:
-    """Builds tile lists.  sort: auto is radix on CPUs, and the faster sort in the first frame on GPUs."""
+    """Builds tile lists.  sort: `auto` is radix on CPUs, and on GPUs the sort that is faster in the first frame."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace
@@ -134,10 +134,10 @@ class Tiler:
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
         """Return the arguments of both kernels for large splats; on GPUs, each work-item checks one splat."""
-        run = self._team if self._team > 1 else self._runs(count, shortest=1 << 8)[0]
-        size = {"groups": -(-count // run), "run": run, "count": count}
-        size |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
-        return {**size, "splats": splats, "tile_box": footprints.tile_box, "tile_count": footprints.tile_count}
+        run = self._team if self._team > 1 else self._runs(count, min_run=1 << 8)[0]
+        arguments = {"groups": -(-count // run), "run": run, "count": count}
+        arguments |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
+        return {**arguments, "splats": splats, "tile_box": footprints.tile_box, "tile_count": footprints.tile_count}
 
     def scan(self, values: Array, count: int, name: str) -> Array:
         """Return the exclusive prefix sum, [count + 1] with the total at the end."""
@@ -145,7 +145,7 @@ class Tiler:
         if count == 0:
             offset.fill(0)
             return offset
-        run, _ = self._runs(count, shortest=1 << 14)
+        run, _ = self._runs(count, min_run=1 << 14)
         if count <= MAX_SINGLE_GROUP_RUN * self._team:  # on GPUs, one launch with long runs is faster than two
             run = max(run, -(-count // self._team))
         run = max(run, -(-count // (MAX_SCAN_BLOCKS * self._team)))
@@ -158,17 +158,17 @@ class Tiler:
         return offset
 
     def sort_pairs(self, keys: Array, bits: int, count: int, name: str) -> tuple[Array, Array]:
-        """Sort keys below 2^bits stably; return the sorted keys and their old indices, both [count]."""
+        """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [count]."""
         passes = -(-bits // self._digit_bits)
         width = -(-bits // passes)
-        run, blocks = self._runs(count, shortest=1 << 10)
+        run, blocks = self._runs(count, min_run=1 << 10)
         values = keys  # the first pass does not read them
         for number in range(passes):
-            size = {"shift": number * width, "digits": 1 << min(width, bits - number * width)}
-            size |= {"run": run, "blocks": blocks, "count": count}
-            digit_count = self.workspace.array("digit_count", size["digits"] * blocks, np.uint32)
-            self._radix.radix_count(groups=blocks, keys=keys, digit_count=digit_count, **size)
-            digit_offset = self.scan(digit_count, size["digits"] * blocks, "digit_offset")
+            arguments = {"shift": number * width, "digits": 1 << min(width, bits - number * width)}
+            arguments |= {"run": run, "blocks": blocks, "count": count}
+            digit_count = self.workspace.array("digit_count", arguments["digits"] * blocks, np.uint32)
+            self._radix.radix_count(groups=blocks, keys=keys, digit_count=digit_count, **arguments)
+            digit_offset = self.scan(digit_count, arguments["digits"] * blocks, "digit_offset")
             sorted_keys = self.workspace.array(f"{name}_keys{number % 2}", count, np.uint32)
             sorted_values = self.workspace.array(f"{name}_values{number % 2}", count, np.uint32)
             self._radix.radix_scatter(
@@ -179,15 +179,15 @@ class Tiler:
                 sorted_keys=sorted_keys,
                 sorted_values=sorted_values,
                 first_pass=int(number == 0),
-                **size,
+                **arguments,
             )
             keys, values = sorted_keys, sorted_values
         return keys, values
 
-    def _runs(self, count: int, shortest: int) -> tuple[int, int]:
+    def _runs(self, count: int, min_run: int) -> tuple[int, int]:
         """Return the number of values per item, and the number of groups."""
-        even = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
-        run = 8 if self._team > 1 else max(shortest, even)
+        balanced = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
+        run = 8 if self._team > 1 else max(min_run, balanced)
         return run, -(-count // (run * self._team))
 
     def _depth_order(self, depth_key: Array, count: int) -> Array:

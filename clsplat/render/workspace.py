@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike
 from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
 
-GROWTH = 1.25
+GROWTH = 1.25  # factor on the requested length when an array grows
 
 
 class Workspace:
@@ -20,29 +20,29 @@ class Workspace:
         self._arrays: dict[str, Array] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Return an array of that shape; its values are undefined.
+        """Return an array of this shape; its values are undefined.
 
         Raises MemoryLimitError if it does not fit, even without slack.
         """
         shape = (shape,) if isinstance(shape, int) else shape
-        kind = np.dtype(dtype)
+        value_type = np.dtype(dtype)
         length = math.prod(shape)
         array = self._arrays.get(name)
-        if array is None or array.nbytes < length * kind.itemsize:
-            grows, array = array is not None, None
+        if array is None or array.nbytes < length * value_type.itemsize:
+            is_growing, array = array is not None, None
             self._arrays.pop(name, None)  # frees the old buffer before the new one is allocated
             array = self._arrays[name] = (
-                self._allocate_with_slack(length, kind) if grows else self.device.zeros(length, kind)
+                self._allocate_with_slack(length, value_type) if is_growing else self.device.zeros(length, value_type)
             )
-        return Array(self.device, array.buffer, shape, kind)
+        return Array(self.device, array.buffer, shape, value_type)
 
-    def _allocate_with_slack(self, length: int, kind: np.dtype[Any]) -> Array:
+    def _allocate_with_slack(self, length: int, dtype: np.dtype[Any]) -> Array:
         """Allocate an array with slack for growth, if the device has enough memory."""
-        largest = self.device.info.allocation // kind.itemsize
+        max_length = self.device.info.allocation // dtype.itemsize
         try:
-            return self.device.zeros(max(length, min(int(length * GROWTH), largest)), kind)
+            return self.device.zeros(max(length, min(int(length * GROWTH), max_length)), dtype)
         except MemoryLimitError:
-            return self.device.zeros(length, kind)
+            return self.device.zeros(length, dtype)
 
     def length(self, name: str) -> int:
         """Return the number of values in the buffer of `name`; 0 before its first use."""

@@ -22,8 +22,8 @@ from clsplat.workflows.partition import Block
 
 def require_divisible(pipeline: Pipeline) -> None:
     """Raise ConfigError if a pipeline has settings that would differ between blocks, or does not start from a model."""
-    settings, first = pipeline.settings, pipeline.stages[0]
-    trainings = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
+    settings, first_stage = pipeline.settings, pipeline.stages[0]
+    optimize_stages = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
     faults = {
         "prepare": (settings.prepare, "run it first and give its run folder as --scene"),
         "adapt": (settings.adapt, "each block would decide by its own photos; write the settings explicitly"),
@@ -34,7 +34,7 @@ def require_divisible(pipeline: Pipeline) -> None:
         "scene.validation": (settings.scene.validation != 0, "a block has no validation views; set it to 0"),
         "scene.extent": (settings.scene.extent, "blocks use the extent of the whole scene; leave it out"),
         "optimize.modules": (
-            any("blocks" in module.conflicts for stage in trainings for module in stage.modules),
+            any("blocks" in module.conflicts for stage in optimize_stages for module in stage.modules),
             "some modules would differ between blocks; leave them out",
         ),
         "densify.budget": (
@@ -53,7 +53,7 @@ def require_divisible(pipeline: Pipeline) -> None:
     for key, (is_set, remedy) in faults.items():
         if is_set:
             raise ConfigError(f"{pipeline.path}: {key} cannot be used with blocks: {remedy}")
-    if not (isinstance(first, Init) and first.source == "model" and trainings):
+    if not (isinstance(first_stage, Init) and first_stage.source == "model" and optimize_stages):
         raise ConfigError(f"{pipeline.path}: start with `init: {{source: model}}`, and add a stage 'optimize'")
 
 
@@ -62,24 +62,22 @@ def block_pipeline(
 ) -> Pipeline:
     """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: extent of the whole scene; fraction: part of the steps to train, with the rates of `_with_fewer_steps`.
+    extent: of the full scene, scene units; fraction: of the steps to train, with rates as in `_with_fewer_steps`.
     """
-    data, last, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
-    stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:last], start)]
+    data, stage_count, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
+    stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:stage_count], start)]
     names = [view["name"] for view in block.views]
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
-    changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
-    changed["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
-    block_file = check_document(pipeline.path, Document(changed))
-    return (
-        block_file if fraction == 1 else replace(block_file, settings=_with_fewer_steps(block_file.settings, fraction))
-    )
+    document = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
+    document["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
+    result = check_document(pipeline.path, Document(document))
+    return result if fraction == 1 else replace(result, settings=_with_fewer_steps(result.settings, fraction))
 
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
     """Return a pipeline that starts from the merged model and runs the stages after training, or only exports it."""
-    data, last = pipeline.resolved(), _count_until_last_edit(pipeline)
-    stages = [*_with_start(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
+    data, stage_count = pipeline.resolved(), _count_until_last_edit(pipeline)
+    stages = [*_with_start(data["stages"][:1], file), *(data["stages"][stage_count:] or [{"export": {"file": MODEL}}])]
     return check_document(pipeline.path, Document({**data, "stages": stages}))
 
 
@@ -100,12 +98,13 @@ def without_start(pipeline: Pipeline) -> Pipeline:
 def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFile:
     """Return settings with a fraction of the steps, and learning rates divided by its square root.
 
-    Adam divides gradients by their RMS over steps.  A Gaussian seen in a fraction p of the views has gradients in that
-    fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is larger by 1 / fraction.
+    Adam divides gradients by their RMS over steps.  A Gaussian visible in a fraction p of the views has gradients in
+    that fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is 1 / fraction times as
+    large.
     """
 
     def with_rates(training: Optimize) -> Optimize:
-        if training.update != "all":  # rows outside the view keep their moments
+        if training.update != "all":  # Gaussians outside the view keep their moments
             return training
         return training.model_copy(update={"rates": training.rates.times(float(fraction) ** -0.5)})
 
@@ -123,27 +122,27 @@ def _densify_stages(stages: Iterable[Stage]) -> Iterator[Densify]:
 
 
 def _with_start(stages: list[Any], file: Path) -> list[Any]:
-    """Return stages of a resolved file with this model as the input of `init`."""
+    """Return the stages of a resolved pipeline with a model file as the input of `init`."""
     first, *others = stages
     return [{"init": {**first["init"], "file": str(file.resolve())}}, *others]
 
 
 def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
-    """Return a stage of a resolved file with densification limited to a block and its share of Gaussians."""
+    """Return a stage of a resolved pipeline with densification limited as in `_limit_densify`."""
     ((name, fields),) = stage.items()
     if name == "densify":
-        limited = _limit_densify(Densify.model_validate(fields), block).model_dump(mode="json")
-        return {name: {key: limited[key] for key in fields}}
+        densify = _limit_densify(Densify.model_validate(fields), block).model_dump(mode="json")
+        return {name: {key: densify[key] for key in fields}}
     if "during" in fields:
         return {name: {**fields, "during": [_limit_growth(inner, block) for inner in fields["during"]]}}
     return stage
 
 
 def _limit_densify(densify: Densify, block: Block) -> Densify:
-    """Limit a densify stage to the cell of a block and its share, by pairs, of the number of Gaussians."""
-    changed: dict[str, Any] = {"inside": block.growth_box}
+    """Limit a densify stage to the growth box of a block, and its Gaussians in proportion to the block's pairs."""
+    updates: dict[str, Any] = {"inside": block.growth_box}
     if densify.max_gaussians is not None:
-        changed["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
-        if min(schedule_values(changed["max_gaussians"])) < 1:
+        updates["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
+        if min(schedule_values(updates["max_gaussians"])) < 1:
             raise ConfigError(f"densify.max_gaussians: {block.name} gets no Gaussians; raise it, or use fewer --blocks")
-    return densify.model_copy(update=changed)
+    return densify.model_copy(update=updates)

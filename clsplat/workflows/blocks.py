@@ -65,28 +65,28 @@ from clsplat.workflows.partition import MIN_COVERAGE, Block, Partition, Partitio
 def block_seconds(
     blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], units: int
 ) -> dict[str, list[float]]:
-    """Return the minimum and maximum training time of each block, s, for its initial and its maximum Gaussians.
+    """Return the training time of each block, s, with its initial and with its maximum number of Gaussians.
 
     pipelines: by block name; size: of a photo, px; units: compute units of the device.
     """
     times = {}
     for block in blocks:
         estimates = (step_seconds(units, size, count) for count in _gaussian_range(block, pipelines[block.name], size))
-        steps = sum(training.steps for training in _trainings(pipelines[block.name]))
+        steps = sum(training.steps for training in _optimize_stages(pipelines[block.name]))
         times[block.name] = [steps * estimate[end] for end, estimate in enumerate(estimates)]
     return times
 
 
 def _gaussian_range(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
     """Return the initial and the maximum number of Gaussians of a block; without a limit, the latter is a guess."""
-    first, pixels = int(block.start.sum()), size[0] * size[1]
+    initial_count, pixels = int(block.start.sum()), size[0] * size[1]
     limits = [
-        max_gaussians(training, pixels) or block.pairs * MAX_PER_PIXEL * pixels for training in _trainings(pipeline)
+        max_gaussians(stage, pixels) or block.pairs * MAX_PER_PIXEL * pixels for stage in _optimize_stages(pipeline)
     ]
-    return first, max(first, int(max(limits)) + first - block.gaussians)
+    return initial_count, max(initial_count, int(max(limits)) + initial_count - block.gaussians)
 
 
-def _trainings(pipeline: Pipeline) -> list[Optimize]:
+def _optimize_stages(pipeline: Pipeline) -> list[Optimize]:
     return [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
 
 
@@ -97,7 +97,7 @@ Steps = Literal["each", "shared"]
 
 @dataclass(frozen=True)
 class BlocksPlan:
-    """The options of a training in blocks."""
+    """The options for training in blocks."""
 
     pipeline: str = "blocks"
     coarse: str = "blocks_coarse"  # a pipeline, or a model
@@ -147,7 +147,7 @@ class Blocks:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
     def identity(self) -> dict[str, Any]:
-        """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and model."""
+        """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and coarse model."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
         texts = {
             name: json.dumps(with_content_hashes(pipeline), sort_keys=True) for name, pipeline in pipelines.items()
@@ -207,9 +207,9 @@ class Blocks:
         if failures:
             remedy = "fix that and run the same command again; finished blocks are kept"
             coarse = shell_quote(self.out / COARSE)
-            other = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
+            other_settings = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
             summary = failures.summary(len(pipelines))
-            error = ClsplatError(f"{summary}; {remedy if self.coarse_file else f'{remedy}; {other}'}")
+            error = ClsplatError(f"{summary}; {remedy if self.coarse_file else f'{remedy}; {other_settings}'}")
             error.exit_code = summary.exit_code
             raise error
         if not files:
@@ -227,17 +227,17 @@ class Blocks:
             name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.store_folder(self.out))
             Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._device_name)
 
-    def merge(self, parts: list[tuple[Block, Path]]) -> Path:
+    def merge(self, block_models: list[tuple[Block, Path]]) -> Path:
         """Merge the models of all blocks in order; return the file."""
         file = self.out / f"{MERGED}.ply"
 
         def check(number: int, means: NDArray[np.float32]) -> None:
-            block, path = parts[number]
+            block, path = block_models[number]
             if not block.box.shifted(block.origin).contains(means).all():  # as the stage crop does
                 raise DataError(f"{path}: has Gaussians outside its cell; remove its folder and train it again")
 
-        count = join_plys(file, [path for _, path in parts], check)
-        LOG.info("%s of %s merged", pluralize(count, "Gaussian"), pluralize(len(parts), "block"))
+        count = join_plys(file, [path for _, path in block_models], check)
+        LOG.info("%s of %s merged", pluralize(count, "Gaussian"), pluralize(len(block_models), "block"))
         return file
 
     def finish(self, file: Path) -> Path:
@@ -303,7 +303,7 @@ def table(manifest: dict[str, Any]) -> str:
     if not times:
         return text_table([HEADINGS, *map(_cells, manifest["blocks"]), scene_row])
     rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(manifest["blocks"], times, strict=True)]
-    low, high = (sum(ends) for ends in zip(*times, strict=True))
+    low, high = (sum(seconds) for seconds in zip(*times, strict=True))
     total_row = [*scene_row, f"{minutes_text((low, high))}, one after another"]
     return f"{text_table([[*HEADINGS, TIME_HEADING], *rows, total_row])}\n{NOTE}"
 
@@ -313,8 +313,8 @@ def status_table(status: dict[str, Any]) -> str:
     done_count = sum(part["state"] == "done" for part in status["parts"])
     lines = [f"{status['in_blocks']}: {status['state']}, {done_count} of {len(status['parts'])} runs are done"]
     for part in status["parts"]:
-        first = status_text(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
-        lines.append(f"{first}; {part['message']}" if part.get("message") else first)
+        first_line = status_text(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
+        lines.append(f"{first_line}; {part['message']}" if part.get("message") else first_line)
     return "\n  ".join(map(one_line, lines))
 
 

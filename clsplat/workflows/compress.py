@@ -28,7 +28,7 @@ from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_s
 
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; each rung writes a PLY
 PALETTE = "palette_sh"
-# stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded ones
+# stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded tables
 VECTORS = ("reduce_sh", PALETTE, "optimize", "share_palette", PALETTE)
 SOG_STAGES = ("init", *VECTORS, "round_tables", "optimize", "round_tables")
 SOG_FOLDER, SOG = "fitted", "model.sog"
@@ -150,8 +150,8 @@ class CompressionTarget:
 
     def is_decided(self, rung: Sequence[Point], psnr: float) -> bool:
         """Return whether fewer Gaussians cannot help: every file of a rung fits, or none is good enough."""
-        met = [self.is_met(point, psnr) for point in rung]
-        return all(met) if self.max_bytes is not None else not any(met)
+        results = [self.is_met(point, psnr) for point in rung]
+        return all(results) if self.max_bytes is not None else not any(results)
 
 
 # The rate–distortion curve and table of a search, as text and as an offline page.
@@ -193,7 +193,7 @@ def page(
     model: str,
     result: str = "",
 ) -> str:
-    """Return the HTML page of a search; result: the name of the file that it wrote."""
+    """Return the HTML page of a search; result: the name of the written model file."""
     return render(
         "compress.html.j2",
         title=f"{scene} · {source.file}, compressed to {target.text}",
@@ -270,8 +270,8 @@ class Search:
     def write(self, result: str = "") -> None:
         """Write the measurements as JSON and as a page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
-        measured = self.target, self.source, self.points, self.chosen, self.split
-        write_text(self.out / PAGE, page(*measured, self.scene, self.identity["model"], result))
+        page_arguments = self.target, self.source, self.points, self.chosen, self.split
+        write_text(self.out / PAGE, page(*page_arguments, self.scene, self.identity["model"], result))
 
 
 def compress(
@@ -298,26 +298,28 @@ def compress(
         require_steps(steps)
     if form not in get_args(Format):
         raise ConfigError(f"--format {quote(form)}: expected one of {', '.join(get_args(Format))}")
-    opened = ModelFile(model, scene, device)
-    source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
-    require_static(source.file, first.to_splat_file(), form)
+    input_model = ModelFile(model, scene, device)
+    source, gaussians, measurer = input_model.source, input_model.gaussians, Measurer(input_model)
+    require_static(source.file, gaussians.to_splat_file(), form)
     identity: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
     identity |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": fractions, "steps": steps}
     size = model_bytes(source.file)  # fails for a damaged model, before the folder is created
     with claim_folder(out, identity, RECORD, "a search", "another --out"):
-        warn_about_losses(_result_path(out, form), first.to_splat_file())
-        original = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+        warn_about_losses(_result_path(out, form), gaussians.to_splat_file())
+        original = Point(
+            source.file.name, 1, gaussians.sh_degree, "", len(gaussians), size, *measurer.figures(gaussians)
+        )
         search = Search(out, goal, identity, original, measurer.split, source.scene_name)
-        ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
+        ladder = Ladder(out, Tuning("compress", source, gaussians, steps, input_model.device))
         previous = 1.0
         for keep in fractions:
-            rung = _measure_rung(ladder, ladder.train_rung(keep, previous), keep, form, measurer)
-            search.points += rung
+            trials = _measure_rung(ladder, ladder.train_rung(keep, previous), keep, form, measurer)
+            search.points += trials
             search.write()
             previous = keep
-            if keep < 1 and goal.is_decided(rung, original.psnr):  # a fine-tuned rung can be better than the original
+            if keep < 1 and goal.is_decided(trials, original.psnr):  # a fine-tuned rung can be better than the original
                 break
-        return _write_result_path(search, form)
+        return _write_result(search, form)
 
 
 def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
@@ -329,8 +331,8 @@ def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measu
         if form == "sog":
             _copy(ladder.train_sog(source, name, degree, quality), file)
         else:
-            lower = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
-            lower.save(file, Writing(quality=quality, quiet=True))
+            reduced_model = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
+            reduced_model.save(file, Writing(quality=quality, quiet=True))
         size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
         point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *figures)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
@@ -339,13 +341,13 @@ def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measu
 
 
 def _sh_settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
-    """Return the distinct SH degrees and qualities for a model of this degree; a single one for degree 0."""
-    lower = ((min(limit, degree), quality) for limit, quality in SETTINGS[form])
-    return dict.fromkeys((limit, quality if limit else "balanced") for limit, quality in lower)
+    """Return the distinct pairs of SH degree and quality for a model of this degree; a single pair for degree 0."""
+    settings = ((min(limit, degree), quality) for limit, quality in SETTINGS[form])
+    return dict.fromkeys((limit, quality if limit else "balanced") for limit, quality in settings)
 
 
-def _write_result_path(search: Search, form: Format) -> dict[str, Any]:
-    """Copy the chosen file to the result.  Raises ConfigError if there is none."""
+def _write_result(search: Search, form: Format) -> dict[str, Any]:
+    """Copy the chosen file to the result path; return the record.  Raises ConfigError if no file meets the target."""
     chosen, psnr = search.chosen, search.source.psnr
     file = _result_path(search.out, form)
     if chosen is None:

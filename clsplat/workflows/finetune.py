@@ -1,4 +1,4 @@
-"""Fine-tune a model file on the photos of its scene, by stages of the recipe `compress`."""
+"""Fine-tune a model file on the photos of its scene, with stages of the recipe `compress`."""
 
 import json
 import logging
@@ -57,33 +57,33 @@ class Tuning:
         """Return a pipeline of these stages of the recipe and an export.  values: settings by key path."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        chosen = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
-        document = Document({**data, "name": self.name, "stages": chosen})
+        selected = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
+        document = Document({**data, "name": self.name, "stages": selected})
         settings = {**self._scene(), **self._rendering(), **values}
         pipeline = check_document(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
             return pipeline
-        first = next(stage for stage in data["stages"] if _has_name(stage, TRAINING))[TRAINING]["steps"]
-        return replace(pipeline, settings=stretch(pipeline.settings, Fraction(self.steps, first)))
+        recipe_steps = next(stage for stage in data["stages"] if _has_name(stage, TRAINING))[TRAINING]["steps"]
+        return replace(pipeline, settings=stretch(pipeline.settings, Fraction(self.steps, recipe_steps)))
 
     def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
         """Run a pipeline in a folder as `train_in_folder` does; return the file that it writes."""
         return train_in_folder(pipeline, folder, self.device, file)
 
     def _scene(self) -> dict[str, Any]:
-        settings, numbers = self.source.settings, self.model.rendering
+        settings, rendering = self.source.settings, self.model.rendering
         return {
             "scene.path": str(self.source.folder.resolve()),
             "scene.downscale": settings.downscale,
             "scene.holdout": settings.holdout,
-            "scene.alpha": self.source.alpha or numbers.alpha,
-            "scene.background": numbers.background or settings.background,
+            "scene.alpha": self.source.alpha or rendering.alpha,
+            "scene.background": rendering.background or settings.background,
         }
 
     def _rendering(self) -> dict[str, Any]:
-        numbers = self.model.rendering
-        screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
-        if numbers.pixel_box:
+        rendering = self.model.rendering
+        screen = {"type": "dilation", "variance": rendering.screen_variance, "compensate": int(rendering.compensate)}
+        if rendering.pixel_box:
             screen = {"type": "box"}
         sky = self.model.sky and {"type": "envmap", "side": self.model.sky.side}
         return {
@@ -135,7 +135,7 @@ def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
 
 
 def _shift_start(training: Any, steps: int) -> Any:
-    """Shift the start steps of a training's inner stages, which count from the start of the run, by `steps`."""
+    """Subtract `steps` from the start steps of a training's inner stages, which count from the start of the run."""
     keys = training[TRAINING]
     during = [
         {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
@@ -146,7 +146,7 @@ def _shift_start(training: Any, steps: int) -> Any:
 
 
 def _has_name(stage: Any, name: str) -> bool:
-    """Return whether a stage of a file, a name or a mapping, has this name."""
+    """Return whether a stage of a pipeline file, a string or a mapping, has this name."""
     return bool(stage == name or (isinstance(stage, dict) and name in stage))
 
 
@@ -167,9 +167,8 @@ def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str,
     with raising_output_error(out):
         make_folder(out)
     with lock.lock_folder(out):
-        _require_same_identity(
-            out, identity, record, content, remedy
-        )  # again, because another process may have started
+        # again, because another process may have started
+        _require_same_identity(out, identity, record, content, remedy)
         remove_partial_files(out, border=PIPELINE)
         if not (out / record).exists():
             write_text(out / record, json.dumps(identity, indent=1) + "\n")
@@ -188,9 +187,9 @@ def _require_same_identity(out: Path, identity: dict[str, Any], record: str, con
         previous = None
     if not isinstance(previous, dict):
         raise ConfigError(f"{out / record}: is not the record of {content}; remove {out} or give {remedy}")
-    differing = [LABELS.get(key, key) for key, value in identity.items() if previous.get(key) != value]
-    if differing:
-        raise ConfigError(f"{out}: has {content} that differs in {', '.join(differing)}; remove it or give {remedy}")
+    changed_keys = [LABELS.get(key, key) for key, value in identity.items() if previous.get(key) != value]
+    if changed_keys:
+        raise ConfigError(f"{out}: has {content} that differs in {', '.join(changed_keys)}; remove it or give {remedy}")
 
 
 def _is_leftover(name: str) -> bool:
@@ -205,7 +204,7 @@ class Measurer:
     """Measures models at the test views of a scene, or at its training views if there are no test views."""
 
     def __init__(self, model: ModelFile) -> None:
-        self.opened = model
+        self.model_file = model
         self.split = "test" if model.scene.split("test") else "train"
         if self.split == "train":
             LOG.warning(
@@ -217,15 +216,15 @@ class Measurer:
 
     def identity(self) -> str:
         """Return a hash of the photos, cameras, and points.  Raises DataError if a photo is damaged."""
-        scene = self.opened.scene
+        scene = self.model_file.scene
         files = decode_all(scene.views)
         require_decodable(scene.path, files)
         return Identity.from_scene(scene, files).digest
 
     def figures(self, model: Model) -> tuple[float, float]:
         """Return the mean PSNR in dB and the mean SSIM of a model."""
-        views, shifted = self.opened.scene.split(self.split), model.in_scene(self.opened.scene)
-        painter = SplatPainter(self.rasterizer, shifted.upload(self.opened.device), self.photographs.background)
+        views, scene_model = self.model_file.scene.split(self.split), model.in_scene(self.model_file.scene)
+        painter = SplatPainter(self.rasterizer, scene_model.upload(self.model_file.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

@@ -27,7 +27,7 @@ def is_in_blocks(folder: Path) -> bool:
 
 
 def parse_status(folder: Path) -> dict[str, Any]:
-    """Return the state of a folder: a scene in blocks, a sweep store, or a run.  Raises DataError."""
+    """Return the status of a folder with a scene in blocks, a sweep store, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
     return store_status(folder) if is_store(folder) else run_status(RunState.read(folder))
@@ -76,7 +76,7 @@ def verify_blocks(out: Path) -> dict[str, Any]:
 
 
 def _parts(out: Path) -> list[str]:
-    """Return the run folders in the order of training."""
+    """Return the names of the run folders, in the order of training."""
     record = read_json(out / RECORD)
     if not (isinstance(record, dict) and type(record.get("blocks")) is int):
         raise DataError(f"{out / RECORD}: the number of blocks is missing; restore the file, or remove {out}")

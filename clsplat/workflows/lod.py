@@ -34,7 +34,7 @@ RECORD = "lod.json"
 
 @dataclass(frozen=True)
 class LodPlan:
-    """The options of levels of detail."""
+    """The options for building levels of detail."""
 
     levels: int = 4
     keep: float = 0.5  # fraction of the Gaussians of the previous level
@@ -58,7 +58,7 @@ class LodPlan:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """One level, with its PSNR in dB before quantization if there are photos."""
+    """A level of detail, with its PSNR in dB before quantization if there are photos."""
 
     model: Model
     merged_psnr: float | None = None  # before training
@@ -90,15 +90,15 @@ class LevelTrainer:
 
     def train(self, number: int, model: Model) -> DetailLevel:
         """Fine-tune a level, unless `steps` is 0, and measure its PSNR before and after."""
-        merged = self.measure(model)
+        merged_level = self.measure(model)
         if not self.steps:
-            return merged
+            return merged_level
         file = self.folder / f"level_{number}.ply"
         model.save(file)
         size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
         pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
-        trained = load(self.tuning.train(pipeline, self.folder / f"level_{number}"))
-        return DetailLevel(trained, merged.psnr, self.measure(trained).psnr)
+        trained_model = load(self.tuning.train(pipeline, self.folder / f"level_{number}"))
+        return DetailLevel(trained_model, merged_level.psnr, self.measure(trained_model).psnr)
 
 
 NEIGHBORS = 8  # candidates for merging with a Gaussian
@@ -114,18 +114,18 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
     """
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
-    plain = model.baked()
-    if invalid := int(not_finite(plain.tables()).sum()):
+    baked_model = model.baked()
+    if invalid := int(not_finite(baked_model.tables()).sum()):
         raise DataError(f"{invalid} Gaussians have values that are not finite; drop them with `clsplat convert`")
-    target = min(len(plain), max(1, int(keep * len(plain) + 0.5)))
-    if target == len(plain):
-        return plain
-    tables = _clipped_tables(plain)
+    target = min(len(baked_model), max(1, int(keep * len(baked_model) + 0.5)))
+    if target == len(baked_model):
+        return baked_model
+    tables = _clipped_tables(baked_model)
     while (count := len(tables["means"])) > target:
         first, second = match_pairs(tables)
         tables = _merge_pairs(tables, first[: count - target], second[: count - target])
-    fewer: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
-    return replace(plain, **fewer)
+    arrays: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
+    return replace(baked_model, **arrays)
 
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
@@ -134,14 +134,14 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
     cost = pair_cost(tables, first, second)
     order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
     is_free = bytearray(b"\1") * len(tables["means"])
-    chosen = []
+    selected = []
     for start in range(0, len(order), BLOCK):
         batch = order[start : start + BLOCK]
         for pair, i, j in zip(batch.tolist(), first[batch].tolist(), second[batch].tolist(), strict=True):
             if is_free[i] and is_free[j]:
                 is_free[i] = is_free[j] = 0
-                chosen.append(pair)
-    return first[chosen], second[chosen]
+                selected.append(pair)
+    return first[selected], second[selected]
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
@@ -168,16 +168,16 @@ def _neighbors(means: Floats) -> tuple[Rows, Rows]:
 
     Rows at the same position form a chain, and only its first row has neighbors at other positions.
     """
-    positions, first, position = np.unique(means, axis=0, return_index=True, return_inverse=True)
+    positions, first_row, position_index = np.unique(means, axis=0, return_index=True, return_inverse=True)
     count = len(positions)
     nearest = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
-    row, other = first[np.repeat(np.arange(count), nearest.shape[1])], first[nearest.ravel()]
-    order = np.argsort(position.ravel(), kind="stable")
-    is_same = np.diff(position.ravel()[order]) == 0
+    row, neighbor = first_row[np.repeat(np.arange(count), nearest.shape[1])], first_row[nearest.ravel()]
+    order = np.argsort(position_index.ravel(), kind="stable")
+    is_same = np.diff(position_index.ravel()[order]) == 0
     row = np.concatenate([row, order[:-1][is_same]])
-    other = np.concatenate([other, order[1:][is_same]])
-    count, differ = len(means), row != other
-    pairs = np.unique(np.minimum(row, other)[differ].astype(np.int64) * count + np.maximum(row, other)[differ])
+    neighbor = np.concatenate([neighbor, order[1:][is_same]])
+    count, is_pair = len(means), row != neighbor
+    pairs = np.unique(np.minimum(row, neighbor)[is_pair].astype(np.int64) * count + np.maximum(row, neighbor)[is_pair])
     return pairs // count, pairs % count
 
 
@@ -192,12 +192,12 @@ def _clipped_tables(model: Model) -> Tables:
 
 def _merge_pairs(tables: Tables, first: Rows, second: Rows) -> Tables:
     """Return the tables with each pair merged into its row of `first`, and the rows `second` removed."""
-    remains = np.ones(len(tables["means"]), bool)
-    remains[second] = False
+    is_remaining = np.ones(len(tables["means"]), bool)
+    is_remaining[second] = False
     mixtures = merge(tables, first, second, surface)
     for name, values in mixtures.items():
         tables[name][first] = values
-    return {name: table[remains] for name, table in tables.items()}
+    return {name: table[is_remaining] for name, table in tables.items()}
 
 
 LOG = logging.getLogger("clsplat")
@@ -214,40 +214,40 @@ def levels_of_detail(
     """
     plan = plan or LodPlan()
     require_free(folder)
-    opened, first = _open_model(model, scene, plan, device)
-    if not len(first):
+    photo_model, gaussians = _open_model(model, scene, plan, device)
+    if not len(gaussians):
         raise DataError(f"{model}: the model has no Gaussians to merge")
-    require_static(model, first.to_splat_file(), "SOG")
-    require_in_range(model, first.to_splat_file(), "SOG")
-    if len(first) < MIN_GAUSSIANS:
-        count = pluralize(len(first), "Gaussian")
+    require_static(model, gaussians.to_splat_file(), "SOG")
+    require_in_range(model, gaussians.to_splat_file(), "SOG")
+    if len(gaussians) < MIN_GAUSSIANS:
+        count = pluralize(len(gaussians), "Gaussian")
         LOG.warning("%s: has only %s; below a million a single SOG is better: `clsplat convert`", model, count)
-    training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
-    with new_folder(folder) as new:
-        with training.lock() if training else nullcontext():
-            levels = _levels(first, plan, training)
-        digest = write_lod(new, [level.model.to_splat_file() for level in levels])
-        write_sky_file(first.sky, new / LOD_META, digest)
-    if first.sky:
+    trainer = LevelTrainer(photo_model, folder.with_name(f"{folder.name}.training"), plan) if photo_model else None
+    with new_folder(folder) as temporary_folder:
+        with trainer.lock() if trainer else nullcontext():
+            levels = _levels(gaussians, plan, trainer)
+        digest = write_lod(temporary_folder, [level.model.to_splat_file() for level in levels])
+        write_sky_file(gaussians.sky, temporary_folder / LOD_META, digest)
+    if gaussians.sky:
         name = sky_path(folder / LOD_META).name
         LOG.info("%s: the sky of the finest level is in %s, which only clsplat renders", folder, name)
     return {
         "folder": str(folder),
         "bytes": model_bytes(folder),
-        "split": training.measurer.split if training else None,
-        "levels": [_figures(folder, number, level) for number, level in enumerate(levels)],
+        "split": trainer.measurer.split if trainer else None,
+        "levels": [_level_record(folder, number, level) for number, level in enumerate(levels)],
     }
 
 
 def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
-    """Return the model with its photos, or None if it has none, and its Gaussians with the world filter baked in."""
+    """Return the model file, None if it has no photos, and its Gaussians with the world filter baked in."""
     run = find_run(model) if scene is None else None
     if scene is None and run is None:
         gaussians = _without_photos(model, plan, device, "has no known photos")
         LOG.info("%s: no photos: levels are merged without training", model)
         return None, gaussians
     try:
-        opened = ModelFile(model, scene, device)
+        photo_model = ModelFile(model, scene, device)
     except DataError as error:
         if run is None or (photo_error := _photo_error(run)) is None:
             raise
@@ -256,7 +256,7 @@ def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> 
         gaussians = _without_photos(model, plan, device, "its photos cannot be read")
         LOG.warning("%s; levels are merged without training and not measured", photo_error)
         return None, gaussians
-    return opened, opened.gaussians.baked()
+    return photo_model, photo_model.gaussians.baked()
 
 
 def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Model:
@@ -277,17 +277,17 @@ def _photo_error(run: Path) -> DataError | None:
     return None
 
 
-def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[DetailLevel]:
-    levels = [training.measure(first) if training else DetailLevel(first)]
+def _levels(gaussians: Model, plan: LodPlan, trainer: LevelTrainer | None) -> list[DetailLevel]:
+    levels = [trainer.measure(gaussians) if trainer else DetailLevel(gaussians)]
     for number in range(1, plan.levels):
-        fewer = decimate(levels[-1].model, plan.keep)
-        LOG.info("level %d: %s", number, pluralize(len(fewer), "Gaussian"))
-        levels.append(training.train(number, fewer) if training else DetailLevel(fewer))
+        model = decimate(levels[-1].model, plan.keep)
+        LOG.info("level %d: %s", number, pluralize(len(model), "Gaussian"))
+        levels.append(trainer.train(number, model) if trainer else DetailLevel(model))
     return levels
 
 
-def _figures(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
-    """Return counts, size, and PSNR of a written level."""
+def _level_record(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
+    """Return the record of a written level: its number, Gaussians, bytes, and PSNR."""
     size = sum(file.stat().st_size for file in folder.glob(f"{number}_*/*"))
     figures = {"level": number, "gaussians": len(level.model), "bytes": size}
     return {**figures, "merged_psnr": level.merged_psnr, "psnr": level.psnr}

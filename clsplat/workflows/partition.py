@@ -23,7 +23,7 @@ from clsplat.scene.view import View
 from clsplat.training.memory import plan, table_widths
 from clsplat.workflows.folder import MANIFEST, block_name
 
-# Cells: the leaves of a kd-tree over the Gaussians of a coarse model, with equal shares of a weight.
+# Cells: the leaves of a kd-tree over the Gaussians of a coarse model, with equal sums of a weight.
 
 Floats = NDArray[np.float64]
 SIZE_QUANTILES = (0.01, 0.99)  # by weight; the extremes would follow the few Gaussians that are far away
@@ -46,7 +46,7 @@ class PartitionCell:
 
 
 def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
-    """Return `count` cells, each with about the same share of the weights, [N], of Gaussians at `means`, [N, 3].
+    """Return `count` cells, each with about the same sum of the weights, [N], of Gaussians at `means`, [N, 3].
 
     Cells are split across their longest side.  Raises DataError if the model cannot be split into `count` cells.
     """
@@ -73,8 +73,8 @@ def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) ->
 def quantile(values: Floats, weights: Floats, fraction: float) -> float:
     """Return the weighted quantile of values, [N]: the smallest value that reaches this fraction of the weights."""
     order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order[min(int(np.searchsorted(total, fraction * total[-1])), len(order) - 1)]])
+    sums = np.cumsum(weights[order])
+    return float(values[order[min(int(np.searchsorted(sums, fraction * sums[-1])), len(order) - 1)]])
 
 
 def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
@@ -93,8 +93,8 @@ def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[Par
     halves = ((below, "high", count_below), (~below, "low", count - count_below))
     return [
         cell
-        for rows, side, cells_in_half in halves
-        for cell in _split_box(means[rows], weights[rows], _with_bound(box, side, axis, position), cells_in_half)
+        for half, side, cells_in_half in halves
+        for cell in _split_box(means[half], weights[half], _with_bound(box, side, axis, position), cells_in_half)
     ]
 
 
@@ -116,7 +116,7 @@ Reason = Literal["inside", "coverage", "best"]
 
 @dataclass(frozen=True)
 class Membership:
-    """Which of V views belong to which of B blocks."""
+    """The assignment of V views to B blocks."""
 
     coverage: Floats  # [V, B] fraction of a view's pixels covered by a cell's Gaussians, by blending weight
     inside: NDArray[np.bool_]  # [V, B] whether the camera is in the cell
@@ -124,20 +124,20 @@ class Membership:
 
     @property
     def view_blocks(self) -> NDArray[np.bool_]:
-        """Whether each view belongs to each block, [V, B]; each view belongs at least to the block it shows most of."""
+        """Whether each view belongs to each block, [V, B]; always true for the block that covers most of the view."""
         best = np.arange(self.coverage.shape[1]) == self.coverage.argmax(axis=1)[:, None]
         return np.asarray(best | self.inside | (self.coverage > self.min_coverage))
 
     @property
     def assignment(self) -> NDArray[np.bool_]:
-        """Which view trains which block, [V, B]: `view_blocks`; a block without views gets the one with most of it."""
+        """Whether each view trains each block, [V, B]: `view_blocks`, and at least one view for each block."""
         blocks = self.view_blocks
         for block in np.flatnonzero(~blocks.any(axis=0)):
             blocks[self.coverage[:, block].argmax(), block] = True
         return blocks
 
     def reason(self, view: int, block: int) -> Reason:
-        """Return why a view belongs to a block: by its camera, its coverage, or because it shows most of it."""
+        """Return the reason why a view belongs to a block: `inside`, `coverage`, or otherwise `best`."""
         if self.inside[view, block]:
             return "inside"
         return "coverage" if self.coverage[view, block] > self.min_coverage else "best"
@@ -151,13 +151,13 @@ def count_pairs(renders: Iterable[RenderedView], count: int, tile: int) -> Float
     total = np.zeros(count)
     for render in renders:
         camera, radius = render.photograph.camera, render.radius().astype(np.float64)
-        sides = [np.minimum(2 * radius / tile + 1, -(-side // tile)) for side in (camera.width, camera.height)]
-        total += np.where(radius > 0, sides[0] * sides[1], 0)
+        tile_counts = [np.minimum(2 * radius / tile + 1, -(-side // tile)) for side in (camera.width, camera.height)]
+        total += np.where(radius > 0, tile_counts[0] * tile_counts[1], 0)
     return total
 
 
 def view_coverage(render: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the fraction of a view's pixels covered by each block, [B], and which Gaussians are visible, [N].
+    """Return the fraction of a view's pixels covered by each block, [B], and whether each Gaussian is visible, [N].
 
     owner: the block of each Gaussian, [N].  Masked pixels do not count.
     """
@@ -174,7 +174,7 @@ MIN_COVERAGE = 0.05  # fraction of a view's pixels
 
 @dataclass(frozen=True)
 class Block:
-    """One block of the scene."""
+    """A block of a scene: its cell, views, and initial Gaussians."""
 
     number: int
     cell: PartitionCell
@@ -187,7 +187,7 @@ class Block:
 
     @property
     def name(self) -> str:
-        """The name of its folder."""
+        """The name of the block's folder."""
         return block_name(self.number)
 
     @property
@@ -216,10 +216,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Partition:
-    """The blocks of a scene, the coarse model, and figures of the whole scene."""
+    """The blocks of a scene, the coarse model, and totals of the full scene."""
 
     blocks: list[Block]
-    model: Model  # the coarse one
+    model: Model  # the coarse model
     coarse: str  # SHA-256 of its file
     extent: float  # scene units
     memory: int  # device memory of the coarse model with all views, bytes
@@ -251,31 +251,31 @@ class Partitioner:
 
         Each view is rendered twice.  Raises DataError if the model cannot be split into that many blocks.
         """
-        means, total = self.model.means, len(self.model)
-        pairs = count_pairs(self._render(self.views), total, int(self.device.tuning["TILE"]))
+        means, gaussian_count = self.model.means, len(self.model)
+        pairs = count_pairs(self._render(self.views), gaussian_count, int(self.device.tuning["TILE"]))
         partition_cells = cells(means, pairs, count)
         owner = assign_cells(means, partition_cells)
-        members, needed = self._members(owner, partition_cells, min_coverage)
+        members, is_needed = self._members(owner, partition_cells, min_coverage)
         blocks = [
             Block(
                 number,
                 cell,
                 int((owner == number).sum()),
                 float(pairs[owner == number].sum() / (pairs.sum() or 1)),
-                start := needed[number] | (owner == number),
+                start := is_needed[number] | (owner == number),
                 self._view_entries(members, number),
                 self._memory(int(start.sum()), np.flatnonzero(members.assignment[:, number]).tolist()),
                 self.model.origin,
             )
             for number, cell in enumerate(partition_cells)
         ]
-        memory = self._memory(total, range(len(self.views)))
+        memory = self._memory(gaussian_count, range(len(self.views)))
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
     def _members(
         self, owner: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
     ) -> tuple[Membership, Bits]:
-        """Return the views of each block, and the Gaussians visible in its views or in no view, [B, N]."""
+        """Return the views of each block, and whether each Gaussian is visible in them or in no view, [B, N]."""
         positions = np.stack([view.position for view in self.views])
         inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
         coverage, visible_in_block = np.zeros(inside.shape), np.zeros((len(partition), len(owner)), bool)
@@ -286,9 +286,8 @@ class Partitioner:
         for view, block in np.argwhere(members.assignment & ~members.view_blocks):
             (render,) = self._render([self.views[view]])
             visible_in_block[block] |= view_coverage(render, owner, len(partition))[1]
-        return members, visible_in_block | ~visible_in_block.any(
-            axis=0
-        )  # Gaussians hidden from all views may become visible in any
+        # Gaussians hidden from all views may become visible in any
+        return members, visible_in_block | ~visible_in_block.any(axis=0)
 
     def _render(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
@@ -306,10 +305,10 @@ class Partitioner:
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:
-        """Return the device memory, bytes, of a training that starts with these Gaussians and views."""
+        """Return the device memory for training, bytes.  gaussians: initial number; views: indices."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
-        cached = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
+        cached_bytes = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
         motion = self.model.motion
         tables = table_widths(self.model.sh_degree, 0 if motion is None else motion.shape[1])
-        return plan(self.device.info, tables, cached, max(sizes) // 4).required_bytes(gaussians)
+        return plan(self.device.info, tables, cached_bytes, max(sizes) // 4).required_bytes(gaussians)
