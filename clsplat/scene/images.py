@@ -18,7 +18,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.files import open_atomic, write_text
 from clsplat.core.reading import open_file, read_file, read_json, require_content
 
-# Size, orientation and completeness of an image file, without decoding it.
+# Read the size, orientation and completeness of an image file without decoding it.
 
 HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes to read at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -29,7 +29,7 @@ ORIENTATION = 0x0112  # Exif tag
 
 @dataclass(frozen=True)
 class Header:
-    """Size in pixels as stored, the Exif orientation (1: upright), and whether the file is complete."""
+    """The stored size of an image in pixels, its Exif orientation (1: upright), and whether the file is complete."""
 
     width: int
     height: int
@@ -40,14 +40,15 @@ class Header:
 def parse_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
     """Return the header of a PNG or JPEG file from its first and last bytes; None for other formats.
 
-    `read_all` returns all bytes; it is called when neither part contains the end marker.
+    head, tail: up to HEAD_SIZE and TAIL_SIZE bytes.  read_all: returns all bytes of the file; it is called only when
+    `tail` does not contain the end marker.
     """
     header = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
         header = Header(width, height, complete=PNG_END in tail or PNG_END in read_all())
     elif head.startswith(JPEG):
-        header = _jpeg(head, tail, read_all)
+        header = _parse_jpeg_header(head, tail, read_all)
     return header if header and header.width and header.height else None
 
 
@@ -57,8 +58,8 @@ def is_truncated(data: bytes) -> bool:
     return header is not None and not header.complete
 
 
-def _jpeg(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
-    """Walk the segments up to the frame header; None when the walk fails."""
+def _parse_jpeg_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
+    """Return the header of a JPEG file, read from its segments; None if they contain no frame header."""
     orientation = 1
     for marker, offset, length in jpeg_segments(head):
         if marker in FRAME_MARKERS:
@@ -67,14 +68,14 @@ def _jpeg(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | N
             complete = JPEG_END in tail or read_all().find(JPEG_END, offset) >= 0
             return Header(width, height, orientation, complete)
         if _is_exif(head, marker, offset):
-            orientation = _orientation(head[offset + 10 : offset + 2 + length])
+            orientation = _read_orientation(head[offset + 10 : offset + 2 + length])
     return None
 
 
 def find_exif_segment(head: bytes) -> tuple[int, int] | None:
-    """Return the offset and length of the Exif segment in the first bytes of a JPEG file; None without one.
+    """Return the offset and length of the Exif segment in the first bytes of a JPEG file.
 
-    Its TIFF block starts 10 bytes after the offset.
+    The TIFF block of the segment starts 10 bytes after the offset.  None if there is no such segment.
     """
     matches = ((offset, length) for marker, offset, length in jpeg_segments(head) if _is_exif(head, marker, offset))
     return next(matches, None) if head.startswith(JPEG) else None
@@ -85,7 +86,7 @@ def _is_exif(head: bytes, marker: int, offset: int) -> bool:
 
 
 def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield the marker, offset and length of each segment of a JPEG file, up to a damaged one."""
+    """Yield the marker, offset and length of each segment of a JPEG file, up to the first damaged segment."""
     offset = 2
     while offset + 9 <= len(head) and head[offset] == 0xFF:
         marker = head[offset + 1]
@@ -97,15 +98,15 @@ def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
         offset += 2 + length
 
 
-def _orientation(exif: bytes) -> int:
-    """Return the orientation in a TIFF block, 1 to 8; 1 if missing."""
+def _read_orientation(exif: bytes) -> int:
+    """Return the orientation in a TIFF block, 1 to 8; 1 if the block has none."""
     offset = find_orientation(exif)
     value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, offset)[0] if offset else 1
     return int(value) if 1 <= value <= 8 else 1
 
 
 def find_orientation(exif: bytes) -> int | None:
-    """Return the offset of the orientation, 2 bytes, in a TIFF block; None if missing."""
+    """Return the offset of the orientation value (2 bytes) in a TIFF block; None if the block has none."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
         return None
@@ -119,35 +120,36 @@ def find_orientation(exif: bytes) -> int | None:
 
 # PNG files are checked and stripped before OpenCV reads them.
 
-RELEVANT_CHUNKS = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # in addition to critical chunks, in capitals
+# Chunks to keep in addition to the critical ones, whose names start with a capital letter.
+RELEVANT_CHUNKS = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}
 
 
 def strip_png_metadata(data: bytes) -> bytes:
-    """Return a PNG without metadata, and other files unchanged.
+    """Return the bytes of a PNG file without its metadata; other files are returned unchanged.
 
-    Raises ValueError, with the offset, when the file is truncated or the checksum of a relevant chunk is wrong.
+    Raises ValueError with the byte offset when the file is truncated or the checksum of a relevant chunk is wrong.
     """
     if not data.startswith(PNG):
         return data
     view, offset, chunks = memoryview(data), len(PNG), [memoryview(PNG)]
     while offset + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, offset)
-        kind, end = data[offset + 4 : offset + 8], offset + 12 + length
+        name, end = data[offset + 4 : offset + 8], offset + 12 + length
         if end > len(data):
             break
-        if kind in RELEVANT_CHUNKS or not kind[0] & 0x20:
+        if name in RELEVANT_CHUNKS or not name[0] & 0x20:
             if zlib.crc32(view[offset + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-                raise ValueError(f"byte {offset}: the checksum of the chunk {quote(kind.decode('latin-1'))} is wrong")
+                raise ValueError(f"byte {offset}: the checksum of the chunk {quote(name.decode('latin-1'))} is wrong")
             chunks.append(view[offset:end])
-        if kind == b"IEND":
+        if name == b"IEND":
             return b"".join(chunks)
         offset = end
     raise ValueError(f"byte {offset}: expected another chunk, but only {len(data) - offset} bytes are left")
 
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its messages do not name the file; ours do
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our messages name the file; those of OpenCV do not
 MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
-GRAY_FLAGS = {  # OpenCV's flag for gray, by the divisor of the size
+GRAY_FLAGS = {  # OpenCV's flag for decoding to gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
     4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
@@ -162,7 +164,7 @@ def is_image(path: PurePath) -> bool:
 
 
 def write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write RGB or RGBA, [H, W, 3 or 4], as PNG, creating the folders above it.  Raises OutputError when that fails."""
+    """Write an RGB or RGBA image, [H, W, 3 or 4], as PNG, and create its folder.  Raises OutputError on failure."""
     assert pixels.dtype == np.uint8, pixels.dtype
     assert pixels.shape[2:] in ((3,), (4,)), pixels.shape
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]))
@@ -177,7 +179,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_header(path: Path) -> Header:
-    """Return the header of an image file, decoding formats other than PNG and JPEG.  Raises DataError."""
+    """Return the header of an image file; formats other than PNG and JPEG are decoded.  Raises DataError."""
     with open_file(path, "an image", limit=MAX_BYTES) as file:
         head = file.read(HEAD_SIZE)
         file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
@@ -192,15 +194,15 @@ def stored_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
-    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` rotates it by its EXIF tag."""
+    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` applies the EXIF rotation."""
     return decode_image(read_file(path, "an image", limit=MAX_BYTES), path, upright)
 
 
 def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Return a photograph in gray as stored, [H, W], with no side longer than `long_side` px, and its scale factors.
+    """Return a photograph in gray, [H, W], with no side longer than `long_side` px, and its scale factors in x and y.
 
-    The factors, in x and y, are stored pixels per returned pixel.  JPEG files are decoded at 1/2, 1/4 or 1/8 of their
-    size, which is faster.  Raises DataError as decode_image does.
+    The EXIF rotation is not applied.  The factors are stored pixels per returned pixel.  Large JPEG files are decoded
+    at 1/2, 1/4 or 1/8 of their size, which is faster.  Raises DataError like decode_image.
     """
     data = read_file(path, "an image", limit=MAX_BYTES)
     header = parse_header(data[:HEAD_SIZE], data[-TAIL_SIZE:], lambda: data) if data.startswith(JPEG) else None
@@ -216,7 +218,7 @@ def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[floa
 
 
 def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]:
-    """Decode the bytes of the image file `path`, as read_image does.  Raises DataError when they are damaged."""
+    """Decode the bytes of the image file `path` like read_image.  Raises DataError when they are damaged."""
     pixels = _decode(data, path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
@@ -229,7 +231,7 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
 
 
 def _transparent_gray(data: bytes) -> int | None:
-    """Return the gray level that a PNG declares transparent, which OpenCV drops; None for other files."""
+    """Return the gray level that a PNG declares transparent, which OpenCV ignores; None for other files."""
     if data[:8] != PNG or len(data) < 26 or data[25] != 0:
         return None
     offset = data.find(b"\0\0\0\2tRNS", 33, data.find(b"IDAT"))
@@ -238,8 +240,11 @@ def _transparent_gray(data: bytes) -> int | None:
     return None if level is None else level * max(1, 255 // largest)
 
 
-def _without_rotation(data: bytes) -> bytes:
-    """Return a TIFF without its orientation tag, which OpenCV always applies; other files unchanged."""
+def _reset_orientation(data: bytes) -> bytes:
+    """Return the bytes of a TIFF file with upright orientation, since OpenCV always applies the tag.
+
+    Other files are returned unchanged.
+    """
     offset = find_orientation(data) if data[:4] in (b"II*\0", b"MM\0*") else None
     return data if offset is None else data[:offset] + (b"\1\0" if data[:1] == b"I" else b"\0\1") + data[offset + 2 :]
 
@@ -249,7 +254,7 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:
-        data = _without_rotation(data)
+        data = _reset_orientation(data)
     try:  # not cv2.imread: that needs ASCII paths on Windows
         pixels = cv2.imdecode(np.frombuffer(strip_png_metadata(data), np.uint8), flags)
     except ValueError as error:
@@ -262,7 +267,7 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-# Camera settings of a photograph: Exif 2.3 in JPEG files, or a file next to images without it.
+# Read the camera settings of a photograph: from Exif 2.3 in JPEG files, or from a file next to images without it.
 
 EXPOSURES_FILE = "exposures.json"  # in a folder of images
 EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
@@ -289,15 +294,15 @@ class CameraExposure:
 
 
 def read_exif_exposure(path: Path) -> CameraExposure | None:
-    """Return the exposure in the EXIF data of a JPEG file, or None.  Raises DataError when it cannot be read."""
+    """Return the exposure in the EXIF data of a JPEG file, or None.  Raises DataError when the file cannot be read."""
     tags = _read_tags(path)
     return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 
 
 def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
-    """Return make, model and focal lengths of the camera of a JPEG file; None without focal lengths.
+    """Return the make, model, focal length and 35 mm focal length in the EXIF data of a JPEG file.
 
-    Raises DataError when it cannot be read.
+    A missing value is "".  Returns None without focal lengths.  Raises DataError when the file cannot be read.
     """
     tags = _read_tags(path)
     values = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
@@ -305,9 +310,9 @@ def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
 
 
 def read_exif_camera(path: Path) -> tuple[str, bool]:
-    """Return make, model and focal length by the EXIF data of a JPEG file, and whether it has a GPS position.
+    """Return the make, model and focal length in the EXIF data of a JPEG file, and whether it has a GPS position.
 
-    Raises DataError when it cannot be read.
+    The first value is a text such as "Canon EOS R5 35 mm".  Raises DataError when the file cannot be read.
     """
     tags = _read_tags(path)
     make, model, focal = (tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL))
@@ -317,7 +322,10 @@ def read_exif_camera(path: Path) -> tuple[str, bool]:
 
 
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:
-    """Return the upright `jpeg` with the EXIF data in the first bytes of another file, without its rotation."""
+    """Return the upright JPEG file `jpeg` with the EXIF data of another file, except for the rotation.
+
+    head: the first bytes of the other file.
+    """
     segment = find_exif_segment(head)
     if segment is None:
         return jpeg
@@ -341,49 +349,52 @@ def _read_tags(path: Path) -> dict[int, Value]:
     with suppress(struct.error, KeyError, ValueError):  # truncated, or without EXIF tags
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
-        tags.update(_values(block, order, int(start)))
+        tags.update(_read_ifd(block, order, int(start)))
         for pointer in (EXIF_IFD, GPS_IFD):
             if pointer in tags:
-                tags.update(_values(block, order, int(tags[pointer])))
+                tags.update(_read_ifd(block, order, int(tags[pointer])))
     return tags
 
 
-def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """Return the values of an IFD by tag; for several numbers, the first."""
+def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
+    """Return the values of an image file directory (IFD) by tag; of an array, the first element."""
     values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for entry in range(start + 2, start + 2 + 12 * entries, 12):
-        tag, kind, count, value = struct.unpack_from(order + "HHII", block, entry)
-        if kind == RATIONAL:
+        tag, value_type, count, value = struct.unpack_from(order + "HHII", block, entry)
+        if value_type == RATIONAL:
             numerator, denominator = struct.unpack_from(order + "II", block, value)
             if denominator:
                 values[tag] = numerator / denominator
-        elif kind in (SHORT, LONG):
-            (values[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, entry + 8)
-        elif kind == TEXT:
+        elif value_type in (SHORT, LONG):
+            (values[tag],) = struct.unpack_from(order + ("H" if value_type == SHORT else "I"), block, entry + 8)
+        elif value_type == TEXT:
             offset = value if count > 4 else entry + 8
             values[tag] = block[offset : offset + count].split(b"\0")[0].decode("ascii", "replace").strip()
     return values
 
 
 def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
-    """Return an exposure, or None when a value is missing or implausible for a camera."""
-    numbers = [float(value) for value in (seconds, aperture, iso) if isinstance(value, int | float)]
-    is_valid = len(numbers) == 3 and all(low < n < high for n, (low, high) in zip(numbers, PLAUSIBLE, strict=True))
-    return CameraExposure(*numbers) if is_valid else None
+    """Return the exposure with these settings, or None when a value is missing or implausible for a camera."""
+    values = [float(value) for value in (seconds, aperture, iso) if isinstance(value, int | float)]
+    is_valid = len(values) == 3 and all(low < x < high for x, (low, high) in zip(values, PLAUSIBLE, strict=True))
+    return CameraExposure(*values) if is_valid else None
 
 
 def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
-    """Write the known exposures of the images in a folder, by name, if there are any.  Raises OutputError."""
+    """Write the known exposures of the images in a folder, by name; write no file if there are none.
+
+    Raises OutputError.
+    """
     table = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
     if table:
         write_text(folder / EXPOSURES_FILE, json.dumps(table, indent=1) + "\n")
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:
-    """Return the exposures in the file of a folder of images, by name; empty without the file.
+    """Return the exposures of the images in a folder by name, from its exposures file; empty without that file.
 
-    Raises DataError when it is damaged.
+    Raises DataError when the file is damaged.
     """
     path = folder / EXPOSURES_FILE
     if not path.is_file():

@@ -24,7 +24,7 @@ logger = logging.getLogger("clsplat")
 
 
 class LlffReader(Reader):
-    """An LLFF scene: the i-th row of `poses_bounds.npy` belongs to the i-th image by name.
+    """Read an LLFF scene: the i-th row of `poses_bounds.npy` belongs to the i-th image in order of name.
 
     The file contains focal lengths, but no distortion and no points.  Every `holdout`-th view is a test view.
     """
@@ -50,9 +50,9 @@ class LlffReader(Reader):
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:
-    """Return the rows of a `poses_bounds.npy`, [N, 17]: a matrix [3, 5] and the nearest and farthest depths.
+    """Return the rows of a `poses_bounds.npy` file, [N, 17]: a flattened [3, 5] matrix, and the depth range.
 
-    Raises DataError for a damaged file and for numbers that are not finite.
+    Raises DataError for a damaged file and for values that are not finite.
     """
     data = read_file(path, "a NumPy file", limit=MAX_BYTES)
     try:
@@ -61,13 +61,16 @@ def read_poses(path: Path) -> NDArray[np.float64]:
             raise ValueError(f"it has shape {rows.shape}, {rows.dtype}")
         if not (np.abs(rows) < MAX_VALUE).all():
             raise ValueError(f"it has numbers that are not finite, or beyond {MAX_VALUE:g}")
-    except Exception as error:  # of many kinds, as NumPy parses the header as Python
+    except Exception as error:  # NumPy evaluates the header as Python, which may raise any exception
         raise DataError(f"{path}: {one_line(error)}; expected finite numbers [N, 17]: export it again") from error
     return np.asarray(rows, np.float64)
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the images by name: of `images`, `input`, the largest `images_N`, or otherwise the folder itself."""
+    """Return the image files in `images`, `input`, the largest `images_N` or `path` itself, sorted by name.
+
+    The first of these folders that contains images is used; the list is empty if there is none.
+    """
     smaller = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
     for folder in (path / "images", path / "input", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
         files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
@@ -77,7 +80,10 @@ def image_files(path: Path) -> list[Path]:
 
 
 def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
-    """Return the view of a row, with the focal length scaled to the image file.  Raises DataError."""
+    """Return the view of a row of the file `path`, with its focal length scaled to the size of the image.
+
+    Raises DataError for an invalid camera or pose, or for an image with another aspect ratio.
+    """
     matrix, header = row[:15].reshape(3, 5), read_header(image)
     height, width, focal = matrix[:, 4]
     scale = header.width / max(width, 1.0)

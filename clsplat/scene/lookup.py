@@ -20,28 +20,28 @@ from clsplat.core.reading import open_regular
 from clsplat.scene.images import is_image
 
 Missing = Literal["refuse", "skip"]  # what to do about missing photographs
-Parts = tuple[str, ...]  # of a path
-MAX_DEPTH = 6  # folders below that of the scene
-MAX_COMPARED = 5000  # file names, to find the nearest one
+Parts = tuple[str, ...]  # the parts of a path
+MAX_DEPTH = 6  # levels of folders to search below the folder of the scene
+MAX_COMPARED = 5000  # file names to search for the most similar one
 RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs (ours and 3DGS's) and of `prepare`
 CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)")
 OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the name in the dataset contains the folder
     r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
-SPLITS = {"train", "test", "val", "validation", "eval"}  # folders; a photograph in one does not match another
+SPLITS = {"train", "test", "val", "validation", "eval"}  # folder names; a photograph in one never matches a name in another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
-OTHER_PROGRAMS = {  # whose files hold cameras that no reader reads: part of the start of such a file
+OTHER_PROGRAMS = {  # programs whose camera files are not supported, and a pattern in the start of such a file
     "Polycam": rb'"t_00"',
     "Record3D": rb'"initPose"|"poses": *\[\[',
     "Metashape": rb"<document[^>]*>\s*<chunk",
     "RealityScan": rb"^#name,x,y",
 }
-ELSEWHERE = "…"  # instead of folders outside of the scene, in paths of missing files
+ELSEWHERE = "…"  # replaces the folders outside of the scene in the paths of missing files
 logger = logging.getLogger("clsplat")
 
 
 def safe_join(folder: Path, name: str, source: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `source`, when the path is outside the folder."""
+    """Return `folder / name`.  Raises DataError, prefixed with `source`, when the path is outside of the folder."""
     if not _is_safe(name):
         raise DataError(f"{source}: the file name {quote(name)} is not a path below {folder}; rename it")
     return folder / name
@@ -53,7 +53,7 @@ def _is_safe(name: str) -> bool:
 
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
-    """Raise DataError that names the first few `files` of the dataset at `path` that do not exist, if any."""
+    """Raise DataError when some `files` of the dataset at `path` do not exist; the error names the first three."""
     paths = list(files)
     if missing := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
         raise DataError(f"{path}: {_missing_text(missing, len(paths))}; put them back")
@@ -80,7 +80,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 
 
 def unread_cameras(path: Path) -> str:
-    """Return a sentence about a file with the cameras of another program, in a folder or at a path; "" without one."""
+    """Return a sentence about an unsupported camera file of another program at or below `path`; "" without one."""
     folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
     for folder, names in folders:
         for file in [folder / name for name in names if name.endswith((".json", ".xml", ".csv"))][:8]:
@@ -98,12 +98,13 @@ def unread_cameras(path: Path) -> str:
 class FileLookup:
     """The image files of a dataset that another machine or program may have written.
 
-    An image `name` that exists below `folder` is used.  Otherwise, a name and a file below `root` match if each is the
-    only best match of the other: the one with the longest common end of their paths.  Upper and lower case, slashes,
-    Unicode forms, URL escapes and the suffix of the image do not matter.  Links out of `root` are ignored.
+    The file `folder / name` is used if it exists.  Otherwise, a name and a file below `root` match if each is the only
+    best match of the other; the best match has the longest common end of the path.  Case, the kind of slash, Unicode
+    normalization, URL escapes and the suffix of the image are ignored, and so are links that point out of `root`.
 
-    spellings: returns the file names to try first for a name, by default the name itself.  strict: for masks and depth
-    maps, whose whole path must match, below their folder or below that of the name.  excluded: files not to match.
+    spellings: returns the file names to try first for a name, by default the name itself.  strict: require that the
+    entire path matches, below the folder of the files or that of the name, as for masks and depth maps.  excluded:
+    files that must not match.
     """
 
     def __init__(
@@ -118,9 +119,9 @@ class FileLookup:
         self.root, self.folder, self.strict = root, folder, strict
         self.listing, self.names = list(names), list(names)  # the names in the dataset, and those of the views
         self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
-        self.matches: dict[int, int] = {}  # the length of the common end of each inexact match
+        self.matches: dict[int, int] = {}  # length of the common end of the path, by index, of each inexact match
         self.downscaled_files: set[Path] = set()  # photographs from a folder such as images_4
-        self.choices: dict[int, list[Path]] = {}  # several files that fit a name equally well
+        self.choices: dict[int, list[Path]] = {}  # files that match a name equally well, by its index
         unmatched = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
         self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
         self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matches)
@@ -128,7 +129,7 @@ class FileLookup:
             logger.info("%s: %s", root, self.note)
 
     def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
-        """Use the file that exactly matches a name, and return whether it exists."""
+        """Use the file that exactly matches the i-th name; return whether it exists."""
         for name in filter(_is_safe, dict.fromkeys((self.listing[i], PureWindowsPath(self.listing[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
                 self.paths[i] = path
@@ -140,7 +141,7 @@ class FileLookup:
         return False
 
     def _target(self, name: str) -> Parts:
-        """Return the comparable parts of a path that can be below `root`; empty for an impossible name."""
+        """Return the normalized parts of the path of a name, relative to `root` if possible; () for an invalid name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
         if not parts or parts[-1] == ".." or min(name) < " ":
@@ -153,7 +154,7 @@ class FileLookup:
 
     @cached_property
     def _files(self) -> dict[str, list[tuple[Parts, Path]]]:
-        """The image files below `root` and the comparable parts of their paths, by the comparable stem."""
+        """The image files below `root` with the normalized parts of their paths, by normalized stem."""
         files, real = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
         for folder, names in walk_folders(self.root, MAX_DEPTH):
             parts = tuple(map(_normalize, folder.relative_to(self.root).parts))
@@ -187,7 +188,7 @@ class FileLookup:
                     self.downscaled_files |= {path} if _divisor(parts[:-length]) > 1 else set()
 
     def _rank(self, dataset_name: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
-        """Return how well a file fits a name, or None if it does not."""
+        """Return the rank of a file as a match of a name (larger is better), or None if it does not match."""
         length, name = _common_end(target, parts), PureWindowsPath(dataset_name)
         parents = {*parts[:-length]}
         is_other = any(map(OTHER_CONTENT.search, parents)) or (SPLITS & parents and SPLITS.intersection(target))
@@ -198,7 +199,7 @@ class FileLookup:
 
     @property
     def note(self) -> str:
-        """The number of inexact matches and their criterion, in one sentence; "" if all names are exact."""
+        """One sentence with the number of inexact matches and how they match; "" if all matches are exact."""
         for i, length in self.matches.items():
             count = f"{len(self.matches)} of {pluralize(len(self.listing), 'image' if self.strict else 'photograph')}"
             criterion = "base name" if length == 1 else "the end of their paths"
@@ -208,10 +209,10 @@ class FileLookup:
         return ""
 
     def existing_indices(self, source: Path, missing: Missing) -> list[int]:
-        """Return the indices of the files that exist.
+        """Return the indices of the files that exist, and log a warning about the others.
 
-        Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are.
-        source: the dataset, for messages.
+        source: the dataset, for messages.  Raises DataError when all files are missing, or when some are and `missing`
+        is "refuse".
         """
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
         if absent := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
@@ -226,7 +227,7 @@ class FileLookup:
 
     @cached_property
     def hint(self) -> str:
-        """Similar files or searched folders, in parentheses after a space; "" if no file is missing."""
+        """A remark in parentheses about similar files or the searched folders; "" if no file is missing."""
         if not self.skipped:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
@@ -248,21 +249,21 @@ def _normalize(text: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """Return the comparable name of an image without its suffix."""
+    """Return the normalized name of an image without its suffix."""
     path = PureWindowsPath(_normalize(name))
     return path.stem if is_image(path) or CONVERTED.fullmatch(path.suffix) else path.name
 
 
 def _keys(parts: Parts) -> set[str]:
-    """Return the stems that files of a name may have: for a.jpg.png, `a.jpg.png`, `a.jpg`, and `a`."""
+    """Return the possible stems of the file of a name: `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 
 def _common_end(a: Parts, b: Parts) -> int:
-    """Return the length of the common end of two paths with matching file names, in parts."""
+    """Return the number of equal parts at the end of two paths whose file names match."""
     return 1 + len([*takewhile(lambda pair: pair[0] == pair[1], zip(a[-2::-1], b[-2::-1], strict=False))])
 
 
 def _divisor(folders: Sequence[str]) -> int:
-    """Return N for a path through a folder such as images_N, otherwise 1."""
+    """Return N if one of the folders is named like images_N, otherwise 1."""
     return max([int(match[1]) for folder in folders if (match := REDUCED.fullmatch(folder))], default=1) or 1

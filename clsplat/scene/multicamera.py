@@ -24,16 +24,16 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v"})  #
 class MulticameraReader(Reader):
     """Synchronized videos of fixed cameras: frames in `videos/NAME`, cameras in `sparse` or transforms.json.
 
-    The pose of camera NAME is that of the image `NAME.png` (with any suffix, in any folder), or of an image in a folder
-    NAME.  Frames are sorted by name, with 10 after 9; the i-th frames of all cameras have the same timestamp.  Every
-    `holdout`-th camera by name is a test camera.  A mask `static/NAME.png` is white in pixels that show no motion.
+    Camera NAME has the pose of the image `NAME.png` (with any suffix, in any folder), or of an image in a folder NAME.
+    Frames are sorted by name, with 10 after 9; the i-th frames of all cameras have the same timestamp.  Every
+    `holdout`-th camera in order of name is a test camera.  A mask `static/NAME.png` is white in pixels without motion.
     """
 
     name = "multi-camera video"
     expects = f"{VIDEOS}/ next to sparse/0 or {TRANSFORMS}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether an entry of `videos` is named like a camera; other videos may be the source of a scene."""
+        """Return whether an entry of `videos` has the name of a camera; otherwise, it may be the source of a scene."""
         named = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
         return bool(named) and not named.isdisjoint(_camera_names(path))
 
@@ -53,19 +53,19 @@ class MulticameraReader(Reader):
 
 
 def names_of(image: str) -> tuple[str, str]:
-    """Return the possible names of an image's camera: the name of the image, and that of its folder."""
+    """Return the possible camera names of an image: its name without the suffix, and the name of its folder."""
     name = PureWindowsPath(image)
     return name.stem, name.parent.name
 
 
 def _entries(path: Path) -> list[Path]:
-    """Return the entries of the folder `videos` by name; empty if the folder does not exist."""
+    """Return the entries of the folder `videos`, sorted by name; empty if the folder does not exist."""
     folder = path / VIDEOS
     return sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
 
 
 def _camera_names(path: Path) -> set[str]:
-    """Return the possible names of a dataset's cameras; empty if files are damaged, which another reader reports."""
+    """Return the possible camera names of a dataset; empty if a file is damaged, which another reader reports."""
     try:
         if (path / TRANSFORMS).is_file():
             paths = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
@@ -78,7 +78,7 @@ def _camera_names(path: Path) -> set[str]:
 
 
 def _frames(path: Path) -> dict[str, list[Path]]:
-    """Return the sorted frames of each camera.  Raises DataError for missing frames and differing counts."""
+    """Return the sorted frames of each camera.  Raises DataError unless all cameras have as many frames, at least 2."""
     folders = _entries(path)
     frames = {
         entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in folders if entry.is_dir()
@@ -112,7 +112,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
 
 
 def _natural_order(frame: Path) -> list[tuple[int, str]]:
-    """Return a sort key for frames by name, with 10 after 9."""
+    """Return a key that sorts frames by name, with 10 after 9."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", frame.name)]
 
 

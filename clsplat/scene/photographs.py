@@ -21,9 +21,10 @@ from clsplat.scene.view import View, load_image, load_mask, photograph_name
 def load_photograph(
     view: View, background: tuple[float, float, float], undistorted: Path | None = None
 ) -> NDArray[np.uint8]:
-    """Return RGB, [H, W, 3], or RGB and a mask of 0 and 1, [H, W, 4].
+    """Return the photograph of a view: RGB, [H, W, 3], or RGB and a mask of 0 and 1, [H, W, 4].
 
-    undistorted: a folder that caches undistorted photographs.  Raises DataError like load_image.
+    background: a color in [0, 1] behind transparent pixels.  undistorted: a folder that caches undistorted photographs.
+    Raises DataError like load_image.
     """
     if view.lens is None or undistorted is None or view.image is not None:
         return _load(view, background)
@@ -37,7 +38,7 @@ def load_photograph(
 
 
 def _key(view: View, background: tuple[float, float, float]) -> str:
-    """Return a hash of the file, the lens, the size, and the background of transparent pixels."""
+    """Return a hash of everything that the cached photograph depends on: file, lens, size, mask and background."""
     state = view.image_path.stat() if view.image_path.exists() else None
     file = state and (state.st_mtime_ns, state.st_size)
     parts = view.lens, view.camera, view.mask_path, view.alpha, background, file
@@ -53,7 +54,7 @@ LOG = logging.getLogger("clsplat")
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
-    """Return the mask of each image: its name with .png appended (COLMAP) or as the suffix; None without one."""
+    """Return the mask file of each image, called `NAME.jpg.png` (as by COLMAP) or `NAME.png`; None without a mask."""
     if not folder.is_dir():
         return [None] * len(names)
     files = FileLookup(folder, folder, names, _mask_names, strict=True)
@@ -61,10 +62,10 @@ def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
 
 
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
-    """Return the scene with the masks in a folder; without a folder, the scene.
+    """Return the scene with the masks in `folder`, or the scene itself if `folder` is None.
 
     All pixels of a photograph without a mask are used.  Faces of a wide photograph that its mask hides are left out.
-    Raises DataError if the folder does not exist or contains no mask of a photograph, and if the dataset already has
+    Raises DataError if the folder does not exist or contains no mask of any photograph, or if the dataset already has
     masks.
     """
     if folder is None:

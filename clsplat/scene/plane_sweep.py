@@ -1,7 +1,7 @@
 """Create points from the photographs of a scene by a plane sweep (Collins 1996).
 
-For every photograph and each of PLANES depths, the neighbors are projected onto the plane at that depth.  The surface
-is at the depth where they agree best.  A pixel becomes a point if its neighbors find the same depth.
+For every photograph and each of PLANES depths, adjacent photographs are projected onto the plane at that depth.  The
+surface is at the depth where they agree best.  A pixel becomes a point if adjacent photographs have the same depth.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,24 +21,24 @@ PLANES = 64  # evenly spaced in inverse depth
 MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to the point that the cameras look at
 NEIGHBORS = 4  # photographs with which each photograph is compared
 WINDOW = 5  # px
-MAX_COST_RATIO = 0.6  # cost of the best plane / mean cost of all planes
-MIN_VOTES = 2  # neighbors that must confirm the depth of a point
-MAX_DIFFERENCE = 1.5  # planes between agreeing depths
+MAX_COST_RATIO = 0.6  # largest ratio of the cost of the best plane to the mean cost of all planes
+MIN_VOTES = 2  # adjacent photographs that must confirm the depth of a point
+MAX_DIFFERENCE = 1.5  # planes between depths that agree
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface in a downscaled photograph, in pixels where the neighbors agree on the depth."""
+    """The surface in a downscaled photograph, known in pixels where adjacent photographs agree on the depth."""
 
     view: View
     image: Floats  # [H, W, 3] float32, in [0, 1]
-    inverse: Floats  # [H, W] 1 / depth, 1 / scene units; 0 where the neighbors do not agree
-    step: float  # inverse depth between planes, 1 / scene units
+    inverse: Floats  # [H, W] 1 / depth, 1 / scene units; 0 where unknown
+    step: float  # difference of inverse depth between planes, 1 / scene units
 
     def is_new(self, points: Floats) -> NDArray[np.bool_]:
-        """Return the pixels, [H, W], whose surface none of the points, [M, 3], covers or hides.
+        """Return which pixels, [H, W], show a surface that none of the points, [M, 3], covers or hides.
 
-        A point covers the pixel that it projects to, unless the surface there is more than a plane nearer.
+        A point covers the pixel that it projects to, unless the surface in that pixel is more than a plane nearer.
         """
         is_visible, row, column, depth = _project(self.view, points)
         nearest = np.zeros(self.inverse.shape)
@@ -55,11 +55,11 @@ def sweep_points(
     existing: Floats | None = None,
     allowed: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
-    """Return at most `count` colored points on the surfaces that neighboring views agree on, perhaps none.
+    """Return at most `count` colored points on the surfaces that adjacent views agree on; there may be none.
 
     center: the point that the cameras look at, [3].  load: returns the photograph of a view, [H, W, 3].  existing:
-    points, [M, 3]; pixels that show them give no new points.  allowed: returns the pixels of a view that may give
-    points, [H, W]; None: all.
+    points, [M, 3]; the pixels that show them are skipped.  allowed: returns which pixels of a view may become points,
+    [H, W], or None for all.
     """
     positions, colors = [], []
     for surface in surfaces(views, center, load):
@@ -77,7 +77,7 @@ def sweep_points(
 
 
 def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
-    """Return the surface that each view shows; arguments as for `sweep_points`."""
+    """Return the surface in each view; the arguments are those of `sweep_points`."""
     small = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
@@ -95,7 +95,7 @@ def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArr
 
 
 def _neighbors(i: int, views: Sequence[View]) -> list[int]:
-    """Return the nearest views among those whose directions differ by less than 60 degrees."""
+    """Return the indices of the views nearest to the i-th, of which the viewing directions differ by at most 60°."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
     alike = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
     return sorted(alike, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
@@ -104,9 +104,9 @@ def _neighbors(i: int, views: Sequence[View]) -> list[int]:
 def _best_planes(
     i: int, views: Sequence[View], images: Sequence[Floats], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
-    """Return the plane of each pixel, [H, W], with the smallest difference to the better half of the neighbors.
+    """Return the index of the best plane of each pixel, [H, W], by its difference to the better half of the adjacent views.
 
-    It is 0 where no plane is clearly the best: in uniform areas, and where no neighbor shows the surface.
+    The index is 0 where no plane is clearly the best: in uniform areas, and where no adjacent view shows the surface.
     """
     view, image = views[i], images[i]
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
@@ -139,7 +139,7 @@ def _calibration(view: View) -> Floats:
 
 
 def _unproject(view: View, rows: Places, columns: Places, depth: Floats) -> Floats:
-    """Return the world positions, [M, 3], of pixels at given depths."""
+    """Return the world positions, [M, 3], of M pixels at depths `depth`, [M]."""
     c = view.camera
     rays = np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(depth))], axis=1)
     points: Floats = (rays * depth[:, None] - view.world_to_camera[:, 3]) @ view.world_to_camera[:, :3]
@@ -147,7 +147,10 @@ def _unproject(view: View, rows: Places, columns: Places, depth: Floats) -> Floa
 
 
 def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Places, Floats]:
-    """Return which points, [M, 3], project into a view, their rows and columns, and their depths; 1 if behind it."""
+    """Return which points, [M, 3], project into the image of a view, and the rows, columns and depths of all, [M].
+
+    Points behind the camera have depth 1.
+    """
     camera, pose = view.camera, view.world_to_camera
     x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
     in_front = z > 0
@@ -161,7 +164,7 @@ def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Pla
 def _confirm(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
-    """Return the pixels, [H, W], whose depth enough neighbors confirm and is not on the first or last plane."""
+    """Return which pixels, [H, W], have a depth that enough adjacent views confirm, not on an outer plane."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
     points = _unproject(views[i], rows, columns, 1 / inverse[planes[i].ravel()])

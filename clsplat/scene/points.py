@@ -18,10 +18,10 @@ from clsplat.scene.view import Floats
 
 logger = logging.getLogger("clsplat")
 
-MAX_VALUE = 1e15  # of all numbers in a dataset; squares of much larger ones overflow float32
+MAX_VALUE = 1e15  # of any number in a dataset; the squares of much larger numbers overflow float32
 BELOW_MAX = f"a number between -{MAX_VALUE:g} and {MAX_VALUE:g}"
 RGB = ("red", "green", "blue")
-TIME = "time"  # of a point, in the unit of the frames' times
+TIME = "time"  # name of the property with the time of a point, in the unit of the frame times
 POINT = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in RGB])
 TIMED_POINT = np.dtype([*POINT.descr, (TIME, "<f4")])
 
@@ -34,7 +34,7 @@ class PointTable(NamedTuple):
     rgb: NDArray[Any]  # [M, 3], in 0..255
     error: Floats = np.empty(0)  # [M] mean reprojection error, px, or [0]; COLMAP writes -1 or 0 if unknown
     ids: NDArray[np.int64] = np.empty(0, np.int64)  # [M] ids that images refer to, or [0]
-    times: Floats = np.empty(0)  # [M] in the unit of the frames' times, or [0]
+    times: Floats = np.empty(0)  # [M] in the unit of the frame times, or [0]
 
     def is_finite(self) -> NDArray[np.bool_]:
         """Return which points are finite, [M]."""
@@ -42,9 +42,10 @@ class PointTable(NamedTuple):
         return np.asarray(finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else finite)
 
     def cloud(self, clock: Clock | None = None) -> PointCloud:
-        """Return the finite points; log the number of the others.
+        """Return the finite points, and log how many points are dropped.
 
-        clock: clock of the frames; without it, points have no times.  Raises DataError for times in another unit.
+        clock: the clock of the frames; without it, the points have no times.  Raises DataError for times in another
+        unit.
         """
         finite, times = self.is_finite(), None
         if not finite.all():
@@ -56,16 +57,16 @@ class PointTable(NamedTuple):
 
 
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
-    """Read positions, colors and, with a clock, times of the vertices of a PLY file.
+    """Read the positions, the colors and, with a clock, the times of the vertices of a PLY file.
 
-    The vertices need x y z and uchar red green blue; other properties are ignored.  Raises DataError if the file is
-    damaged, big-endian or lacks these properties, or if times are in another unit.
+    The vertices need the properties x y z and uchar red green blue; others are ignored.  Raises DataError if the file
+    is damaged, is big-endian or lacks these properties, or if the times are in another unit than those of the frames.
     """
     return read_ply_table(path).cloud(clock)
 
 
 def read_ply_table(path: Path) -> PointTable:
-    """Return all points of a PLY file.  Raises DataError like read_points_ply."""
+    """Return all points of a PLY file, including invalid ones.  Raises DataError like read_points_ply."""
     data = read_file(path)
     header = parse_ply_header(path, data)
     if header.format == "binary_big_endian":
@@ -84,9 +85,9 @@ def read_ply_table(path: Path) -> PointTable:
 
 
 def write_points_ply(path: Path, points: PointCloud) -> None:
-    """Write points, with times if they have any, as binary little-endian PLY.  Raises OutputError."""
+    """Write points, including their times if they have any, as binary little-endian PLY.  Raises OutputError."""
     kind = POINT if points.times is None else TIMED_POINT
-    if points.positions.dtype == np.float64:  # world coordinates, which float32 may not hold
+    if points.positions.dtype == np.float64:  # world coordinates, for which float32 may be too coarse
         kind = np.dtype([(name, "<f8" if name in "xyz" else kind[name]) for name in kind.names or ()])
     table = np.empty(len(points), kind)
     if points.times is not None:

@@ -1,4 +1,4 @@
-"""Measure photographs before training, to adapt settings to them."""
+"""Measure the photographs before training, so that settings can be adapted to them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import MIN_WHITE, View, load_mask, load_transparency, sample_views
 
-NEAREST = 0.01  # quantile of the depths of observed points: a few nearer ones are wrong
+NEAREST = 0.01  # quantile of the depths of observed points, since the nearest few points are usually wrong
 NEAR_FRACTION = 0.04  # of the extent
-MAX_POINTS = 10_000  # of a cloud, for depths
+MAX_POINTS = 10_000  # of a cloud, used to estimate depths
 
 
 @dataclass
@@ -27,29 +27,29 @@ class Measures:
     photographs: int
     """Number of training photographs, including those for validation."""
     reprojection_error: float | None = None
-    """Mean reprojection error of the points, px at the size of training; None: unknown."""
+    """Mean reprojection error of the points, px at the training resolution; None: unknown."""
     scene: Scene | None = None
-    """The scene at the size of training; None: not prepared yet."""
+    """The scene at the training resolution; None: not prepared yet."""
     measure_sky: Callable[[], float | None] = lambda: None
 
     @cached_property
     def sky(self) -> float | None:
-        """The fraction of the training photographs that show a sky, which reads all of them; None: unknown."""
+        """The fraction of the training photographs that show the sky; None: unknown.  The first use reads them all."""
         return self.measure_sky()
 
 
 def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
-    """Return the measurements of a scene at the size of training."""
+    """Return the measurements of a scene at the training resolution."""
     views = {view.name: view for view in reversed(scene.merge_validation().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
     return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure_sky)
 
 
 def near_depth(scene: Scene) -> float | None:
-    """Return the 1 % quantile of the depths of all points that training views observe, scene units; None without any.
+    """Return the 1 % quantile of the depths of all points that training views observe, scene units.
 
-    Validation views count as training views.  When the dataset does not contain observations, a view observes the
-    points inside its image.
+    Validation views count as training views.  When the dataset does not contain observations, a view observes all
+    points inside its image.  None if no view observes a point.
     """
     views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file
@@ -58,7 +58,7 @@ def near_depth(scene: Scene) -> float | None:
 
 
 def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
-    """Return the depths of the points that a view observes, scene units."""
+    """Return the depths of the points that a view observes, [K], scene units."""
     if scene.tracks is None:
         return points_in_image(view, scene.points)
     points = scene.tracks.positions[scene.tracks.rows.get(view.name, [])]
@@ -67,7 +67,7 @@ def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
 
 
 def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]:
-    """Return the depths of points that project into a view's image, scene units; for a large cloud, of a sample."""
+    """Return the depths of the points inside the image of a view, [K], scene units; only a sample of a large cloud."""
     points = np.zeros((0, 3)) if cloud is None else cloud.positions
     points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
     x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
@@ -78,10 +78,10 @@ def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]
 
 
 def near_plane(scene: Scene) -> float:
-    """Return the near plane of `model.near: auto`, scene units.
+    """Return the distance of the near plane for `model.near: auto`, scene units.
 
-    It is 4 % of the extent (0.2 for an extent of 5), or half of `near_depth` if that is less, rounded to three digits,
-    so that it is the same on every machine.
+    It is 4 % of the extent (0.2 for an extent of 5), or half of `near_depth` if that is less.  It is rounded to three
+    digits, so that it is the same on every machine.
     """
     nearest = near_depth(scene)
     return float(f"{min(NEAR_FRACTION * scene.extent, np.inf if nearest is None else nearest / 2):.3g}")
@@ -89,46 +89,49 @@ def near_plane(scene: Scene) -> float:
 
 # Sharpness of photographs.
 
-BLURRED = 0.25  # of the median of a set: six captures have at least 0.4, a blur of 1 px leaves 0.05 to 0.09
+BLURRED = 0.25  # of the median of a set: sharp photographs have at least 0.4, those with a blur of 1 px 0.05 to 0.09
 SIDE = 480  # px: sharpness is measured at this size, since noise looks like detail at full size
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian of an image [H, W], gray levels²."""
+    """Return the variance of the Laplacian of a gray image, [H, W], in squared gray levels."""
     return float(cv2.Laplacian(gray, cv2.CV_64F).var())
 
 
 def sharpness_values(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the sharpness of an image [H, W] and, invariant to brightness, divided by its squared mean, [2]."""
+    """Return two values, [2]: the sharpness of a gray image, [H, W], and the sharpness divided by its squared mean.
+
+    The second value does not depend on the brightness.
+    """
     value = sharpness(gray)
     return np.array([value, value / max(float(gray.mean()), 1.0) ** 2])
 
 
 def measure_sharpness(path: Path) -> NDArray[np.float64]:
-    """Return both sharpness values of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
+    """Return both sharpness values, [2], of a photograph reduced to SIDE px.  Raises DataError if it is unreadable."""
     return sharpness_values(read_gray(path, SIDE)[0])
 
 
 def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool:
     """Return whether both sharpness values of a photograph are far below the medians of a set, [2].
 
-    The first one is also small for a dark photograph, the second one for a bright photograph among dark ones.
+    The first value is also small for a dark photograph, the second for a bright photograph among dark ones.
     """
     return bool((values < BLURRED * median).all())
 
 
 # Blank photographs, and masks that exclude everything.
 
-DARK, PLAIN = 8, 2  # gray levels of 255: the brightest of a black image, and the range of an image of one color
+DARK, PLAIN = 8, 2  # gray levels of 255: upper bounds of the levels of a black image, and of the range of a plain one
 
 
 def is_blank(pixels: NDArray[Any]) -> bool:
     """Return whether an image, [H, W] or [H, W, C], is black, of one color, or transparent everywhere."""
     unit = 255 / np.iinfo(pixels.dtype).max
     channels = pixels.reshape(*pixels.shape[:2], -1)
-    if channels.shape[2] == 4 and not channels[:, :, 3].all():  # a silhouette shows its outline
+    if channels.shape[2] == 4 and not channels[:, :, 3].all():  # the outline of a silhouette is visible
         return not channels[:, :, 3].any()
-    for part in (channels[::16, ::16, :3], channels[:, :, :3]):  # the first one decides for nearly all photographs
+    for part in (channels[::16, ::16, :3], channels[:, :, :3]):  # the sparse sample usually suffices
         low, high = part.min(axis=(0, 1)) * unit, part.max(axis=(0, 1)) * unit
         if high.max() >= DARK and (high - low).max() > PLAIN:
             return False
@@ -142,7 +145,7 @@ def excludes_all(layer: NDArray[Any]) -> bool:
 
 # Transparency of photographs.
 
-SAMPLED_PHOTOGRAPHS = 3  # for training; more than one, since the object may fill it
+SAMPLED_PHOTOGRAPHS = 3  # several training photographs, since the object may fill one
 
 
 def is_transparent(scene: Scene) -> bool:
@@ -153,7 +156,7 @@ def is_transparent(scene: Scene) -> bool:
 def has_visible_background(scene: Scene) -> bool:
     """Return whether a sampled training photograph can be composited on another background.
 
-    Photographs with masks cannot.  Raises DataError.
+    Photographs with masks cannot.  Raises DataError when a file cannot be read.
     """
     return any(load_transparency(view) is not None for view in sample_views(scene.split("train"), SAMPLED_PHOTOGRAPHS))
 
@@ -161,7 +164,7 @@ def has_visible_background(scene: Scene) -> bool:
 def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of a photograph are opaque and not masked, [H, W], or None when all are.
 
-    Raises DataError.
+    Raises DataError when a file cannot be read.
     """
     transparency, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
     masks = [mask for mask in (None if transparency is None else transparency == 0, unmasked) if mask is not None]

@@ -1,4 +1,4 @@
-"""Define the base class of dataset readers, and datasets in pieces."""
+"""Define the base class of dataset readers, and the parts of a dataset that may be damaged."""
 
 import inspect
 from abc import ABC, abstractmethod
@@ -20,25 +20,25 @@ Result = TypeVar("Result")
 
 @dataclass
 class Parts:
-    """A dataset in pieces: a damaged piece becomes a fault, and the others stay readable.
+    """The readable parts of a dataset; each damaged part is recorded as a fault.
 
-    `scene` is None when the dataset cannot be read as a whole; `refusal` is the reason why training does not start.
+    `scene` is None when the dataset cannot be read without faults; `refusal` is the reason why training cannot start.
     """
 
     path: Path
     kind: str = "none"
     views: list[View] = field(default_factory=list)  # whether or not their files exist
     models: dict[str, str] = field(default_factory=dict)  # camera model of each view, if the dataset names it
-    observed: dict[str, int] = field(default_factory=dict)  # number of points seen by each view, if known
-    submodels: dict[str, int] = field(default_factory=dict)  # images of each COLMAP model, the one in use first
+    observed: dict[str, int] = field(default_factory=dict)  # number of points that each view observes, if known
+    submodels: dict[str, int] = field(default_factory=dict)  # image counts of COLMAP models, the one in use first
     points: PointTable | None = None
     image_folder: Path | None = None  # contains all images; None: those in `expected`
     on_disk: list[Path] = field(default_factory=list)  # image files in the folders of the views
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
-    hint: str = ""  # similar files that exist instead of missing ones
-    notes: list[str] = field(default_factory=list)  # about files that are not where the dataset says
+    hint: str = ""  # about existing files that are similar to missing ones
+    notes: list[str] = field(default_factory=list)  # about files that are not at the paths in the dataset
     scene: Scene | None = None
     refusal: str = ""
 
@@ -52,7 +52,7 @@ class Parts:
             return None
 
     def expect(self, files: FileLookup) -> None:
-        """Add files that the dataset names, with a note on how they were matched."""
+        """Add the files that the dataset names, with a note about inexact matches."""
         self.expected += files.paths
         self.notes += [files.note] if files.note else []
         self.hint = files.hint
@@ -61,18 +61,18 @@ class Parts:
 
 
 class Reader(ABC):
-    """The reader of a dataset format.
+    """The base class of the readers of dataset formats.
 
-    All commands use a subclass as soon as it is defined, unless it has subclasses itself.  A class that is redefined,
-    as in a notebook, replaces the earlier one.
+    All commands use a subclass as soon as it is defined, unless it has subclasses itself.  A class that is defined
+    again, as in a notebook, replaces the earlier one.
     """
 
     name: ClassVar[str]  # of the format
-    expects: ClassVar[str]  # the file that marks the format; with `matches`, in a few words
+    expects: ClassVar[str]  # the file that marks the format, or a short description for custom `matches`
     missing: Missing = "refuse"  # what to do about missing photographs
-    root: Path | None = None  # of the scene, where files are looked for; None: the folder of the dataset
-    folder: Path = Path()  # of the dataset, in `root`
-    choice: str = ""  # among several datasets
+    root: Path | None = None  # folder of the scene, in which files are searched; None: the folder of the dataset
+    folder: Path = Path()  # of the dataset, at or below `root`
+    choice: str = ""  # why this dataset is used, if there are several; for `note`
     subclasses: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -88,24 +88,24 @@ class Reader(ABC):
 
     @property
     def note(self) -> str:
-        """Which dataset is read, in one sentence; "" for the only one in the scene's folder."""
+        """One sentence that names the dataset that is read; "" for a dataset in the folder of the scene itself."""
         if self.root in (None, self.folder):
             return ""
         return f"the {self.name} dataset in {self.folder.relative_to(self.root).as_posix()} is used{self.choice}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether a folder holds a dataset of this format, without reading it; by default, a file `expects`."""
+        """Return whether a folder contains a dataset of this format, by default whether it has the file `expects`."""
         return (path / self.expects).is_file()
 
     @abstractmethod
     def read(self, path: Path, holdout: int) -> Scene:
-        """Read the dataset in a folder; every `holdout`-th view is a test view if the dataset has no split.
+        """Return the scene in a folder; every `holdout`-th view is a test view if the dataset has no split.
 
         Raises DataError when a file is missing, damaged or not supported.
         """
 
     def list_parts(self, parts: Parts) -> None:
-        """Add the readable pieces of a dataset, which may be damaged; by default, those of the scene."""
+        """Add the readable parts of a dataset that may be damaged to `parts`; by default, those of its scene."""
         scene = parts.scene
         if scene is not None:
             parts.views = list(scene.views)
@@ -116,6 +116,6 @@ class Reader(ABC):
 
 
 def reader_classes() -> list[type[Reader]]:
-    """Return the classes that have no subclasses and are not abstract, in the order of their definition."""
+    """Return the reader classes that are not abstract and have no subclasses, in the order of their definition."""
     bases = {base for kind in Reader.subclasses for base in kind.__mro__[1:]}
     return [kind for kind in Reader.subclasses if kind not in bases and not inspect.isabstract(kind)]

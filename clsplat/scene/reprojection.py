@@ -11,13 +11,16 @@ from clsplat.scene.scene import PointCloud, Scene, Tracks
 from clsplat.scene.view import View, photo_lens
 
 Floats = NDArray[np.float64]
-MAX_ERROR = 1.0  # px at the size of training (ours): beyond it, the pixel does not show the point
+MAX_ERROR = 1.0  # px at the training resolution (our choice): beyond it, the pixel does not show the point
 EXACT = 1e-3  # px: below it, observations were computed from the cameras and say nothing about them
 
 
 def reprojection_residuals(view: View, positions: NDArray[np.floating], observed: Floats) -> Floats:
-    """Return the vectors, [K, 2] px, from the projections of `positions`, [K, 3], to `observed`, [K, 2] px of the
-    original photograph; NaN behind the camera, and for observations far outside the photograph."""
+    """Return the vectors, [K, 2] px, from the projections of `positions`, [K, 3], to the pixels `observed`, [K, 2].
+
+    Pixels are those of the original photograph.  The result is NaN for points behind the camera and for observations
+    far outside of the photograph.
+    """
     original = view.lens or view.camera
     size = np.array([original.width, original.height])
     is_plausible = np.all(np.abs(observed - size / 2) <= size, axis=1, keepdims=True)  # others come from damaged files
@@ -25,8 +28,10 @@ def reprojection_residuals(view: View, positions: NDArray[np.floating], observed
 
 
 def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
-    """Return the projections of positions, [K, 3], into the original photograph of a view, [K, 2] px; NaN behind the
-    camera."""
+    """Return the projections of positions, [K, 3], into the original photograph of a view, [K, 2] px.
+
+    Positions behind the camera have projections of NaN.
+    """
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
     points[~(points[:, 2] > 0)] = np.nan
     with np.errstate(all="ignore"):
@@ -34,7 +39,7 @@ def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
 
 
 def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
-    """Return a scene at full size with other cameras; the observed pixels of its points do not change."""
+    """Return a scene at full size with the cameras of `views`; the observed pixels of its points do not change."""
     tracks, residuals = scene.tracks, dict[str, Floats]()
     if tracks is not None:
         for old, new in zip(scene.views, views, strict=True):
@@ -47,7 +52,10 @@ def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
 
 
 def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
-    """Return the mean reprojection error of each point that views observe, px at their sizes; None if unknown."""
+    """Return the mean reprojection error, px at the size of the view, of each point that `views` observe.
+
+    None if the errors are unknown, or if the observations were computed from the cameras.
+    """
     if tracks is None or not tracks.residuals:
         return None
     sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
@@ -62,15 +70,16 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
 
 
 def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = MAX_ERROR) -> Tracks:
-    """Return the tracks without observations whose reprojection error is `limit` px or more at the size of the view.
+    """Return the tracks without observations that have a reprojection error of `limit` px or more.
 
-    Views without known observations, and views not in `views`, keep all points.
+    Errors are measured at the size of the view.  Views without known observations, and views that are not in `views`,
+    keep all points.
     """
     rows, residuals = dict(tracks.rows), dict(tracks.residuals)
-    for view in sorted(views, key=lambda view: -view.downscale):  # the largest size of a photograph is last and counts
+    for view in sorted(views, key=lambda view: -view.downscale):  # the largest size of a photograph comes last
         if view.name in tracks.residuals:
             vectors = tracks.residuals[view.name]
-            is_accurate = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN, unknown
+            is_accurate = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN: an unknown error
             rows[view.name], residuals[view.name] = tracks.rows[view.name][is_accurate], vectors[is_accurate]
     return Tracks(tracks.positions, rows, residuals)
 

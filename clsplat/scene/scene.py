@@ -1,4 +1,4 @@
-"""Hold a dataset on the host: cameras, views, points, and the split into training and test views.
+"""Represent a dataset on the host: cameras, views, points, and the split into training and test views.
 
 Conventions of the whole project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
@@ -32,16 +32,16 @@ class Tracks:
     """Points from structure from motion, and the photographs that show them."""
 
     positions: NDArray[np.floating]  # [M, 3], scene units
-    rows: Mapping[str, NDArray[np.int64]]  # by name of the view: rows of `positions`, in order of the point ids
+    rows: Mapping[str, NDArray[np.int64]]  # rows of `positions` by view name, in order of the point ids
     residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    # by name of the view, [K, 2] px of the original photograph: from the projection of each point to its observation
+    # by view name, [K, 2] px of the original photograph: from the projection of each point to its observation
 
     def shifted(self, origin: Floats) -> "Tracks":
-        """Return the tracks in coordinates whose zero is at `origin`, [3] in the current coordinates."""
+        """Return the tracks in coordinates relative to `origin`, [3]."""
         return replace(self, positions=self.positions - origin) if origin.any() else self
 
     def split_by_face(self, views: Iterable["View"]) -> "Tracks":
-        """Return the tracks with the points of wide photographs divided among the views of their faces."""
+        """Return the tracks in which each face of a wide photograph observes the points that project into it."""
         by_view = dict(self.rows)
         for view in views:
             if view.lens is not None and view.lens.face and photograph_name(view.name) in self.rows:
@@ -74,15 +74,15 @@ SPLITS = ("train", "test", "validation")
 class PointCloud:
     """Sparse colored points."""
 
-    positions: Floats  # [M, 3] float32, scene units; as a file has them until make_scene subtracts the origin
+    positions: Floats  # [M, 3] float32, scene units; world coordinates until make_scene subtracts the origin
     colors: Floats  # [M, 3] float32, in [0, 1]
-    times: Floats | None = None  # [M] float32, timestamps in [0, 1], if a moving scene has them
+    times: Floats | None = None  # [M] float32, timestamps in [0, 1]; None for a static scene
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points followed by another cloud, with times if both have them."""
+        """Return these points followed by those of another cloud, with times if both clouds have them."""
         pairs = [(self.positions, other.positions), (self.colors, other.colors)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
         return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
@@ -98,10 +98,10 @@ class Scene:
     test: tuple[int, ...]
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
-    background: Background = "black"  # as in papers on this dataset
+    background: Background = "black"  # color behind transparent pixels, as in papers on this dataset
     validation: tuple[int, ...] = ()  # held out to choose the best model
-    tracks: Tracks | None = None  # which photographs show which points, if the dataset has this
-    origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of this scene's zero
+    tracks: Tracks | None = None  # which photographs show which points, if the dataset contains that
+    origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of zero in the scene
     skipped: tuple[str, ...] = ()  # names of views whose photographs are missing
 
     @classmethod
@@ -112,7 +112,10 @@ class Scene:
         test: Collection[str] = (),
         background: Background = "black",
     ) -> "Scene":
-        """Return a scene of views in memory, with the names of its test views.  Raises DataError as for a dataset."""
+        """Return a scene of views in memory.
+
+        test: the names of the test views.  Raises DataError like make_scene, and for an unknown name.
+        """
         if unknown := set(test) - {view.name for view in views}:
             raise DataError(f"test: no view is called {quote(min(unknown))}; expected names of views")
         held_out = {i for i, view in enumerate(views) if view.name in test}
@@ -132,7 +135,7 @@ class Scene:
         return {"train": self.train, "test": self.test, "validation": self.validation}
 
     def in_world(self) -> "Scene":
-        """Return the scene in world coordinates, as camera files have them: float64 points, origin 0."""
+        """Return the scene in the world coordinates of camera files, with float64 points and origin 0."""
         if not self.origin.any():
             return self
         views = tuple(view.shifted(-self.origin) for view in self.views)
@@ -145,13 +148,13 @@ class Scene:
         return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
     def renamed(self, names: Sequence[str]) -> "Scene":
-        """Return the scene with other names of its views."""
+        """Return the scene with `names` as the names of its views, in their order."""
         views = tuple(replace(view, name=name) for view, name in zip(self.views, names, strict=True))
         new_names = {view.name: name for view, name in zip(self.views, names, strict=True)}
         return replace(self, views=views, tracks=self.tracks and self.tracks.renamed(new_names))
 
     def with_alpha(self, alpha: Alpha) -> "Scene":
-        """Return the scene with the fourth channel of its photographs used as transparency or as mask."""
+        """Return the scene with the fourth channel of its photographs interpreted as transparency or as a mask."""
         return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))
 
     @property
@@ -162,7 +165,7 @@ class Scene:
     def downscaled(self, *downscales: float) -> "Scene":
         """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        It uses views of that size if the dataset has them, and otherwise resamples the largest ones.
+        Views of that size in the dataset are used as they are; for other sizes, the largest views are resampled.
         Raises DataError for a size larger than the largest in the dataset.
         """
         if downscales == self.downscales:
@@ -186,14 +189,14 @@ class Scene:
 
     @property
     def image_sizes(self) -> str:
-        """The width x height of the images in pixels, the three most frequent first: `800x600 and 600x800`."""
+        """The three most frequent sizes of the images in pixels, as in `800x600 and 600x800`."""
         sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in self.views)
         *others, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
         return f"{', '.join(others)} and {last}" if others else last
 
     @property
     def cameras(self) -> dict[str, str]:
-        """The camera of each view, by name: the name of the first view with an equal lens, or pinhole camera."""
+        """The name of the camera of each view, by view name: the first view with an equal lens or camera."""
         first: dict[object, str] = {}
         return {view.name: first.setdefault(view.lens or view.camera, view.name) for view in self.views}
 
@@ -215,7 +218,7 @@ class Scene:
         return summary(rows, list(self._thumbnails()))
 
     def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        """Yield some evenly spaced photographs with their names, without unreadable ones."""
+        """Yield the names and pixels of a few evenly spaced photographs, except for unreadable ones."""
         for i in np.unique(np.linspace(0, len(self.views) - 1, MAX_THUMBNAILS).astype(int)):
             with suppress(DataError):
                 yield self.views[i].name, load_image(self.views[i])
@@ -224,10 +227,11 @@ class Scene:
 def make_scene(
     path: Path, views: list[View], test: set[int], points: PointCloud | None, background: Background = "black"
 ) -> Scene:
-    """Return a scene of `views`, with its split, its extent and its origin, which is subtracted from all positions.
+    """Return a scene of `views`, with its extent and its origin, which is subtracted from all positions.
 
-    Wide photographs become views of their faces, in the split of the photograph.
-    Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
+    test: the indices of the test views; the others are training views.  Each wide photograph becomes several views,
+    one for each face, in the same split.  Raises DataError when there are no views, when two views have the same name,
+    or when a camera is invalid.
     """
     if not views:
         raise DataError(f"{path}: the dataset has no images; expected at least one image with a pose")
@@ -258,7 +262,7 @@ def make_scene(
 
 
 def remaining_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
-    """Return the indices below `count` that are not in `test`.  Raises DataError when there are none."""
+    """Return the indices below `count` that are not in `test`.  Raises DataError when no index is left."""
     if train := tuple(i for i in range(count) if i not in test):
         return train
     remedy = "raise scene.holdout or add images" if count > 1 else "set scene.holdout=0 to train on it"
@@ -266,10 +270,10 @@ def remaining_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
 
 
 def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
-    """Return the world coordinates, [3] float64, of a scene's origin: 0 unless the scene is far from there.
+    """Return the origin of a scene in world coordinates, [3] float64: 0 unless the scene is far from 0.
 
     Positions on the device are float32, in which map coordinates have a precision of only half a meter.  The origin is
-    a multiple of a power of ten, so that differences are exact where the file's digits allow that.
+    a multiple of a power of ten, so that subtracting it from the decimal numbers of a file stays exact if possible.
     """
     centers = np.stack([view.position for view in views])
     positions = centers if points is None else np.asarray(points.positions, np.float64)
@@ -277,7 +281,7 @@ def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
 
 
 def far_origin(center: Floats, positions: Floats) -> Floats:
-    """Return an origin near `center`, [3]; 0 unless `center` is far from 0 compared with the spread of positions."""
+    """Return an origin near `center`, [3]; 0 unless `center` is far from 0 relative to the spread of the positions."""
     spread = float(np.median(np.linalg.norm(positions - center, axis=1)))
     if np.abs(center).max() <= MAX_OFFSET * (spread or 1.0):
         return np.zeros(3)
@@ -286,15 +290,16 @@ def far_origin(center: Floats, positions: Floats) -> Floats:
 
 
 def position_text(position: Floats) -> str:
-    """Return a position, [3], with all its digits."""
+    """Format a position, [3], with all its digits."""
     return f"({', '.join(f'{value:.15g}' for value in position)})"
 
 
 def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = None) -> float:
-    """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
+    """Return the radius of the cameras: 1.1 x the largest distance of a camera from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
-    have the same center, it is the median distance of the points, or without points the distance to zero.
+    have the same center, the result is the median distance of the points from it, or without points its distance from
+    zero.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     center = centers.mean(axis=0)
@@ -312,9 +317,9 @@ def share_center(centers: Floats) -> bool:
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which cameras, [N], are more than MAX_DISTANCE times the median distance from the median center.
+    """Return which cameras, [N], are outliers: more than MAX_DISTANCE times the median distance from the median center.
 
-    If more than MAX_OUTLIERS of the cameras are, the scene has several groups of cameras, and all are False.
+    If more than a fraction of MAX_OUTLIERS is so far away, the scene has several groups of cameras and no outliers.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
@@ -323,7 +328,7 @@ def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
 
 
 def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
-    """Return the indices of the held-out names: every `holdout`-th in order of name, starting at `offset`.
+    """Return the indices of every `holdout`-th name in sorted order, starting at `offset`; none if `holdout` is 0.
 
     The faces of a wide photograph count as one name.
     """
@@ -335,5 +340,5 @@ def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
 
 
 def scene_name(folder: str | Path) -> str:
-    """Return the name of a scene on pages: the user's folder, since the name of a prepared folder is a hash."""
+    """Return the name of a scene for pages, which is the name of its folder."""
     return Path(folder).resolve().name

@@ -1,4 +1,4 @@
-"""Map the timestamps of a moving scene to [0, 1], and group its views by camera."""
+"""Map the timestamps of a dynamic scene to [0, 1], and group its views by camera."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -19,9 +19,9 @@ class Clock:
     last: float
 
     def normalize_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the timestamps of points in a file as times in [0, 1], of the same shape.
+        """Return the timestamps of the points of the file `path` as times in [0, 1], in the same shape.
 
-        Raises DataError if some are outside the range of the scene by more than a rounding error in single precision.
+        Raises DataError if some are outside of the range of the scene by more than a single-precision rounding error.
         """
         span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
         slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)
@@ -34,14 +34,14 @@ class Clock:
         return self(values)
 
     def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return timestamps as times in [0, 1], of the same shape; values outside are clamped."""
+        """Return timestamps as times in [0, 1], in the same shape; timestamps outside of the range are clamped."""
         return np.clip((np.asarray(values, np.float64) - self.first) / (self.last - self.first), 0, 1)
 
 
 def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clock | None:
     """Return the clock of a dataset from the names and timestamps of its frames, or None without timestamps.
 
-    Raises DataError when only some frames have a timestamp, or all have the same.
+    Raises DataError when only some frames have a timestamp, or when all timestamps are equal.
     """
     values = [value for _, value in moments if value is not None]
     if not values:
@@ -66,12 +66,12 @@ def distinct_times(views: Iterable[View]) -> list[float]:
 
 
 def camera_key(view: View) -> bytes:
-    """Return the pose, camera and size of a view as a key that is equal for all views of one fixed camera."""
+    """Return a key of the pose, the camera and the size of a view, equal for all views of a fixed camera."""
     return view.world_to_camera.tobytes() + repr((view.camera, view.downscale)).encode()
 
 
 def group_by_camera(views: Sequence[View]) -> list[list[View]]:
-    """Return the views of each fixed camera, in order of time."""
+    """Return a list for each fixed camera with its views in order of time."""
     groups: dict[bytes, list[View]] = {}
     for view in views:
         groups.setdefault(camera_key(view), []).append(view)

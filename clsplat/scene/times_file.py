@@ -1,4 +1,4 @@
-"""Read and write times.json, the timestamp of each photograph in a folder, in any unit."""
+"""Read and write times.json, which contains the timestamp of each photograph in a folder, in any unit."""
 
 import json
 import os
@@ -18,12 +18,12 @@ LARGEST = 1 << 26  # bytes
 
 
 def write_times(folder: Path, times: Mapping[str, float]) -> None:
-    """Write the timestamps of photographs by their names below `folder`.  Raises OutputError."""
+    """Write the timestamps of photographs, by their paths relative to `folder`.  Raises OutputError."""
     write_text(folder / FILE, json.dumps(dict(times), indent=1) + "\n")
 
 
 def read_times(folder: Path) -> dict[str, float] | None:
-    """Return the timestamps of the photographs below `folder` by name; None without a file.  Raises DataError."""
+    """Return the timestamps in the times.json of `folder` by photograph, or None without it.  Raises DataError."""
     path = folder / FILE
     if not os.path.lexists(path):  # reading reports a path that is not a file
         return None
@@ -40,9 +40,9 @@ def read_times(folder: Path) -> dict[str, float] | None:
 
 
 def add_times(views: list[View], folder: Path) -> list[View]:
-    """Return views with the times of the file in their folder of photographs; without a file, the same views.
+    """Return the views with the times in the times.json of `folder`, or the same views without that file.
 
-    Raises DataError as read_times and make_clock do.
+    Raises DataError like read_times and make_clock, and when the file contains none of the views.
     """
     times = read_times(folder)
     if times is None:
