@@ -28,7 +28,7 @@ CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|r
 OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the name in the dataset contains the folder
     r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
-SPLITS = {"train", "test", "val", "validation", "eval"}  # folder names; a photograph in one never matches a name in another
+SPLITS = {"train", "test", "val", "validation", "eval"}  # folder names; a photograph in one never matches another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
 OTHER_PROGRAMS = {  # programs whose camera files are not supported, and a pattern in the start of such a file
     "Polycam": rb'"t_00"',

@@ -38,25 +38,28 @@ MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
 class JsonFrame:
-    """One image of a file: its values, with those of the whole file as defaults; `source` is for messages."""
+    """The values of one image in a file; those at the top level of the file are defaults.
+
+    source: the file and the index of the frame, for messages.
+    """
 
     def __init__(self, folder: Path, source: str, values: dict[str, Any], common: dict[str, Any] | None = None) -> None:
         self.folder, self.source = folder, source
         self._values, self._common = values, common or {}
 
     def value(self, key: str) -> Any:
-        """Return a value as the file holds it, or None."""
+        """Return the unchecked value of a key, or None."""
         return self._values[key] if key in self._values else self._common.get(key)
 
     def array(self, key: str) -> Floats:
-        """Return a list of numbers as an unchecked array; an empty array for any other value."""
+        """Return a list of numbers as an array of unchecked shape; any other value becomes an empty array."""
         try:
             return np.array(self.value(key), np.float64)
         except (ValueError, TypeError, OverflowError):
             return np.empty(0)
 
     def number(self, key: str) -> float | None:
-        """Return a number below MAX_VALUE in size, or None without a value.  Raises DataError for anything else."""
+        """Return a number of magnitude below MAX_VALUE, or None without a value.  Raises DataError otherwise."""
         value = self.value(key)
         if value is None:
             return None
@@ -75,7 +78,7 @@ class JsonFrame:
         return None if value is None else view_name(value)
 
     def image_name(self) -> str:
-        """Return the path of the image.  Raises DataError when the frame has none."""
+        """Return the path of the image, as a view name.  Raises DataError when the frame has no path."""
         name = self.file_name("file_path")
         if name is None:
             raise DataError(
@@ -85,7 +88,7 @@ class JsonFrame:
 
 
 class Transforms:
-    """A `transforms*.json`.  Raises DataError when it is not JSON, or not a table with a list `frames`."""
+    """The content of a `transforms*.json`.  Raises DataError unless it is a JSON object with a list called `frames`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -98,16 +101,16 @@ class Transforms:
         self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
 
     def moments(self) -> list[tuple[str, float | None]]:
-        """Return the position in the file and the `time` of every frame.  Raises DataError if one is not a number."""
+        """Return the source of every frame and its `time`, or None without one.  Raises DataError for invalid times."""
         return [(frame.source, frame.number("time")) for frame in self.frames]
 
     def points(self, clock: Clock | None = None) -> PointCloud | None:
-        """Read the points; None without a file of points."""
+        """Return the points, or None without a file of points.  Raises DataError like read_points_ply."""
         path = self.points_path()
         return read_points_ply(path, clock) if path else None
 
     def points_path(self) -> Path | None:
-        """Return `ply_file_path`, otherwise `points3d.ply` if it exists."""
+        """Return the path of the points: `ply_file_path`, or else `points3d.ply` if it exists; None without both."""
         name = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
         if name is not None:
             return safe_join(self.path.parent, name, str(self.path))
@@ -116,15 +119,15 @@ class Transforms:
 
 
 class FrameFiles(FileLookup):
-    """The photographs of frames of one folder, searched below `root`, and their masks."""
+    """The photographs and masks of the frames of a dataset in `folder`; the files are searched below `root`."""
 
     def __init__(self, root: Path, folder: Path, frames: Sequence[JsonFrame]) -> None:
         super().__init__(root, folder, [frame.image_name() for frame in frames], _with_png)
         self.frames = frames
-        self.masks: dict[str, dict[int, Path]] = {"mask_path": {}, "static_path": {}}  # by key and frame
+        self.masks: dict[str, dict[int, Path]] = {"mask_path": {}, "static_path": {}}  # by key and index of the frame
 
     def find_masks(self, source: Path, rows: Sequence[int]) -> None:
-        """Find the masks of some of the frames.  Raises DataError when one is missing."""
+        """Find the masks of the frames with indices `rows`.  Raises DataError when a mask is missing."""
         for key in self.masks:
             names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
             files = FileLookup(self.root, self.folder, [*names.values()], strict=True, excluded=self.paths)
@@ -132,18 +135,18 @@ class FrameFiles(FileLookup):
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
     def views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
-        """Return the views of the frames.  missing: what to do about missing images.
+        """Return the views of the frames with photographs.
 
-        Raises DataError for damaged numbers and missing files.
+        missing: what to do about missing photographs.  Raises DataError for invalid values and missing files.
         """
         rows = self.existing_indices(source, missing)
         self.find_masks(source, rows)
         return [self.view(i, clock) for i in rows]
 
     def view(self, i: int, clock: Clock | None = None) -> View:
-        """Return the view of a frame.  An image without a size in the file has that of its photograph.
+        """Return the view of the i-th frame; without a size in the frame, it has the size of its photograph.
 
-        Photographs of lenses with distortion are undistorted when they are read.  Raises DataError.
+        Photographs of lenses with distortion are undistorted when they are read.  Raises DataError for invalid values.
         """
         frame, path, masks = self.frames[i], self.paths[i], [files.get(i) for files in self.masks.values()]
         size = None
@@ -159,13 +162,13 @@ class FrameFiles(FileLookup):
     def scene(
         self, path: Path, views: list[View], test: Set[str], points: PointCloud | None, background: Background = "black"
     ) -> Scene:
-        """Return the scene at `path` of some views of the frames; test: the names of the test views."""
+        """Return the scene at `path` with some views of the frames; test: the names of the test views."""
         held_out = {i for i, view in enumerate(views) if view.name in test}
         return replace(make_scene(path, views, held_out, points, background), skipped=self.skipped)
 
     @cached_property
     def _first_size(self) -> tuple[int, int]:
-        """The size of the first photograph that can be read.  Raises DataError when there is none."""
+        """The size of the first readable photograph.  Raises DataError when all are unreadable."""
         for path in self.paths:
             with suppress(DataError):
                 return stored_size(path)
@@ -173,12 +176,12 @@ class FrameFiles(FileLookup):
 
 
 def _with_png(name: str) -> list[str]:
-    """Return the spelling of a file name with a suffix, which Blender's exporter omits."""
+    """Return a file name with the suffix .png added if it has none, since Blender's exporter omits it."""
     return [name if PurePosixPath(name).suffix else f"{name}.png"]
 
 
 def list_frames(parts: Parts, root: Path, *names: str) -> None:
-    """Add the frames of the files `names`, if they exist, to `parts`, and the points of the first file."""
+    """Add the frames of the existing files among `names` and the points of the first file to `parts`."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
     moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
     clock = parts.attempt(make_clock, parts.path, moments)
@@ -204,9 +207,10 @@ def view_name(file_path: str) -> str:
 
 
 def make_view(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
-    """Return the view of a frame, without its photograph; `size` is that of the image, for a frame without a size.
+    """Return the view of a frame without its photograph.
 
-    clock: of a moving scene.  Raises DataError.
+    size: (width, height) of the image, for a frame without a size.  clock: the clock of a dynamic scene.  Raises
+    DataError for invalid values.
     """
     lens = intern_lens(make_lens(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
@@ -220,7 +224,7 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
     width, height = (int(frame.number(key) or side) for key, side in zip("wh", size or (0, 0), strict=True))
     if frame.value("camera_model") == "EQUIRECTANGULAR" and 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
-        return panorama_lens(width, height).camera  # other programs write a focal length without meaning
+        return panorama_lens(width, height).camera  # other programs write a meaningless focal length
     fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
@@ -233,9 +237,9 @@ def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
 
 
 def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
-    """Return a focal length in pixels, from the file or from the field of view (rad) of `pixels`; None without both."""
+    """Return a focal length in pixels, from its value or from the field of view of `pixels`; None without both."""
     length, angle = frame.number(length_key), frame.number(angle_key)
-    degrees = frame.number(f"{angle_key[-1]}_fov")  # of instant-ngp
+    degrees = frame.number(f"{angle_key[-1]}_fov")  # written by instant-ngp, in degrees
     if angle is None and degrees is not None:
         angle_key, angle = f"{angle_key[-1]}_fov", math.radians(degrees)
     if length is not None or angle is None:
@@ -246,7 +250,10 @@ def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> fl
 
 
 def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
-    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye model, or a panorama.  Raises DataError."""
+    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye model, or a panorama.
+
+    Raises DataError for an unknown model, or for parameters that the model does not have.
+    """
     model = frame.value("camera_model")
     model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if model is None else model
     keys = LENSES.get(model) if isinstance(model, str) else None
@@ -264,7 +271,10 @@ def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
 
 
 def read_pose(frame: JsonFrame) -> Floats:
-    """Return [4, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
+    """Return the camera-to-world matrix of a frame, [4, 4], converted from OpenGL axes (y up, z back) to OpenCV axes.
+
+    Raises DataError without a valid rotation.
+    """
     matrix = frame.array("transform_matrix")
     is_finite = matrix.shape in ((4, 4), (3, 4)) and (np.abs(matrix) < MAX_VALUE).all()
     if is_finite and not _is_rotation(matrix[:3, :3]):
@@ -281,14 +291,14 @@ def read_pose(frame: JsonFrame) -> Floats:
 
 
 def opengl_matrix(pose: Floats) -> Floats:
-    """Return the camera-to-world matrix with OpenGL axes, [4, 4], from [3, 4] OpenCV world to camera."""
+    """Return the camera-to-world matrix with OpenGL axes, [4, 4], of an OpenCV world-to-camera pose, [3, 4]."""
     matrix: Floats = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]])) @ np.diag([1.0, -1.0, -1.0, 1.0])
     matrix[3] = 0, 0, 0, 1
     return matrix
 
 
 def _is_rotation(matrix: Floats) -> bool:
-    """Return whether [3, 3] is a rotation, to 1e-3: some exporters write few digits."""
+    """Return whether a [3, 3] matrix is a rotation up to 1e-3, since some exporters write few digits."""
     return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0
 
 
@@ -298,7 +308,7 @@ TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 
 
 class BlenderReader(Reader):
-    """A Blender scene; the test views are those of transforms_test.json, and none without that file.
+    """Read a Blender scene; the test views are those of transforms_test.json, or none without that file.
 
     With a `time` in every frame of both files, the scene is dynamic (D-NeRF): the first timestamp is 0, the last is 1.
     """
@@ -332,11 +342,11 @@ logger = logging.getLogger("clsplat")
 
 
 class NerfstudioReader(Reader):
-    """A nerfstudio scene; views are in order of name.
+    """Read a nerfstudio scene, with its views in order of name.
 
-    The lists `train_filenames` and `test_filenames` are the split if the file has one of them; images on neither
-    list are left out.  Otherwise, every `holdout`-th view is for testing.  With a `time` in every frame, the scene
-    is dynamic.
+    The lists `train_filenames` and `test_filenames` define the split if the file has one of them; images on neither
+    list are left out.  Otherwise, every `holdout`-th view is a test view.  With a `time` in every frame, the scene is
+    dynamic.
     """
 
     name = "nerfstudio"
@@ -364,7 +374,10 @@ class NerfstudioReader(Reader):
 
 
 def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
-    """Return the view names of a list of file paths, or None if the file has no such list.  Raises DataError."""
+    """Return the view names in the list `key` of a file, or None without that list.  Raises DataError.
+
+    renamed: maps names in the file to the names of the views.
+    """
     entries = transforms.table.get(key)
     if entries is None:
         return None
@@ -379,14 +392,14 @@ def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> 
     return {renamed[name] for name in names}
 
 
-# Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes.
+# Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, and every photograph at several sizes.
 
 METADATA_FILE = "metadata.json"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
 
 
 class MultiscaleReader(Reader):
-    """A multi-scale Blender scene; an image of label j shows 1/2^j of the full size."""
+    """Read a multi-scale Blender scene; an image with label j has 1 / 2^j of the full width and height."""
 
     name = "multi-scale Blender"
     expects = METADATA_FILE

@@ -21,7 +21,7 @@ ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting
 
 
 def validate_pose(name: str, pose: ArrayLike) -> Floats:
-    """Return a world-to-camera pose, [3, 4] float64, of the view `name`.  Raises PoseError without a rotation."""
+    """Return the world-to-camera pose of the view `name`, [3, 4] float64.  Raises PoseError for an invalid pose."""
     matrix = np.asarray(pose, np.float64)
     if matrix.shape != (3, 4):
         raise PoseError(f"the pose of {quote(name)} has shape {matrix.shape}; expected (3, 4)")
@@ -52,14 +52,14 @@ def validate_time(name: str, time: float | None) -> float | None:
 Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-NO_FILE = Path()  # of a view without a photograph
+NO_FILE = Path()  # path of a view without a photograph
 MAX_ROUNDING = 1.5  # px; a reduced image has whole pixels
 MIN_WHITE = 0.99  # fraction of the largest value: JPEG does not store white exactly
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera with its photograph.  `name` is unique in the scene: the path below the image folder.
+    """A camera and its photograph.  `name` is unique in the scene, usually the path below the image folder.
 
     Views compare by identity; compare names, downscales or poses instead.  A view that only renders a model needs no
     photograph.  Raises PoseError for a pose without a rotation, and for a time outside [0, 1].
@@ -74,11 +74,11 @@ class View:
     lens: Lens | None = None  # of the photograph on disk, if it has distortion
     downscale: float = 1  # divisor of the original photograph's size
     time: float | None = None  # timestamp in [0, 1]; None: the scene is static
-    static_path: Path | None = None  # an image of the photograph's size, white in pixels that show only static things
-    camera_to_world: Floats | None = None  # [4, 4] float64, as a file has it, until make_scene
-    response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes with the camera's response
+    static_path: Path | None = None  # an image of the photograph's size, white in pixels without motion
+    camera_to_world: Floats | None = None  # [4, 4] float64, as in the file; None after make_scene
+    response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes with the camera response
     image: NDArray[Any] | None = None  # [height, width, 3 or 4], integers or [0, 1]: the photograph instead of a file
-    background: tuple[float, float, float] = BLACK  # of the scene, behind transparent pixels
+    background: tuple[float, float, float] = BLACK  # color of the scene behind transparent pixels
 
     def __post_init__(self) -> None:
         if self.image is not None:
@@ -90,9 +90,9 @@ class View:
     def looking_at(
         cls, position: ArrayLike, target: ArrayLike, up: ArrayLike, camera: Camera, name: str = "view"
     ) -> "View":
-        """Return a view from a position toward a target, with `up` pointing up in the image; each [3], in scene units.
+        """Return a view from `position` toward `target`, with `up` pointing up in the image; each [3], in scene units.
 
-        Raises ValueError when the target is at the position or in the direction of `up`.
+        Raises ValueError when the target equals the position or is in the direction of `up` from it.
         """
         center, point, up_vector = (np.asarray(vector, np.float64) for vector in (position, target, up))
         if not center.shape == point.shape == up_vector.shape == (3,):
@@ -106,7 +106,7 @@ class View:
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
     def shifted(self, origin: Floats) -> "View":
-        """Return the view in coordinates whose zero is at `origin`, [3] float64 in the current coordinates."""
+        """Return the view in coordinates relative to `origin`, [3] float64."""
         if not origin.any():
             return self
         if (matrix := self.camera_to_world) is not None:
@@ -117,9 +117,9 @@ class View:
         return replace(self, world_to_camera=np.column_stack([rotation, translation + rotation @ origin]))
 
     def faces(self) -> list["View"]:
-        """Return the views of the non-empty faces of a wide photograph; for other photographs, only this view.
+        """Return the views of the faces of a wide photograph; for other photographs, only this view.
 
-        Raises DataError when the mask excludes every pixel.
+        Faces that the mask hides are left out.  Raises DataError when the mask excludes every pixel.
         """
         if self.lens is None or not self.lens.is_wide or self.lens.face:
             return [self]
@@ -140,7 +140,7 @@ class View:
         return views
 
     def whole_photograph(self) -> "View":
-        """Return the view of the wide photograph that this face is cut from; other views unchanged."""
+        """Return the view of the entire photograph to which this face belongs; other views are returned unchanged."""
         if self.lens is None or not self.lens.face:
             return self
         lens, pose = intern_lens(replace(self.lens, face="", whole=False)), FACES[self.lens.face].T
@@ -149,7 +149,7 @@ class View:
 
     @property
     def position(self) -> Floats:
-        """Camera center in world coordinates, [3]."""
+        """The camera center in world coordinates, [3]."""
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return -rotation.T @ translation
 
@@ -168,15 +168,15 @@ class View:
 
     @property
     def has_photograph(self) -> bool:
-        """Whether the view has an image, or a file for it."""
+        """Whether the view has a photograph, in memory or as a file (which may be missing)."""
         return self.image is not None or self.image_path != NO_FILE
 
     def photograph(self, background: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
-        background: behind transparent pixels, one number or three in [0, 1]; default: the scene's.  That of a render is
-        `picture.background`.  Raises DataError when the file cannot be read or does not fit the camera, ValueError for
-        an invalid background.
+        background: the color behind transparent pixels, one number or three in [0, 1]; default: that of the scene.  The
+        background of a render is `picture.background`.  Raises DataError when the file cannot be read or does not fit
+        the camera, and ValueError for an invalid background.
         """
         red, green, blue = to_color(self.background if background is None else background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
@@ -197,7 +197,7 @@ def _checked_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
     return np.asarray(np.rint(pixels.astype(np.float64) * 65535), np.uint16)  # uint8 / 255 is exact
 
 
-CUBE = "cube_"  # before the name of a face
+CUBE = "cube_"  # prefix of the name of a face
 
 
 def photograph_name(name: str) -> str:
@@ -209,7 +209,7 @@ def photograph_name(name: str) -> str:
 
 
 def to_color(background: ArrayLike) -> Floats:
-    """Return a background as three numbers.  Raises ValueError unless it is one number or three in [0, 1]."""
+    """Return a background color as an array, [3].  Raises ValueError unless it is one number or three in [0, 1]."""
     try:
         color = np.asarray(background, np.float64)
     except (ValueError, TypeError):
@@ -220,7 +220,7 @@ def to_color(background: ArrayLike) -> Floats:
 
 
 def load_image(view: View, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.uint8]:
-    """Return the photograph of `view` at its camera's size, RGB, [H, W, 3]; alpha is composited on `background`.
+    """Return the photograph of `view` at the size of its camera, RGB, [H, W, 3], composited on `background`.
 
     `background` is a color in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
     16-bit image, or when its size does not fit the camera.
@@ -245,10 +245,9 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
 
 
 def load_rgba(view: View) -> NDArray[np.uint8] | None:
-    """Return the photograph of `view` at its camera's size with straight alpha, [H, W, 4]; None when it has no
-    alpha, or has a mask.
+    """Return the photograph of `view` at the size of its camera with straight alpha, [H, W, 4].
 
-    Raises DataError as load_image does.
+    None when it has no alpha, or when the view has a mask.  Raises DataError like load_image.
     """
     pixels = _read_original(view, view.image_path)
     if pixels.shape[2] == 3 or load_mask(view) is not None:
@@ -259,9 +258,9 @@ def load_rgba(view: View) -> NDArray[np.uint8] | None:
 
 
 def load_transparency(view: View) -> NDArray[np.uint8] | None:
-    """Return the transparency of the photograph of `view`, [H, W] from 0 to 255; None when it is opaque.
+    """Return the transparency of the photograph of `view`, [H, W], from 0 (opaque) to 255.
 
-    Raises DataError as load_image does.
+    None when it is opaque or has a mask.  Raises DataError like load_image.
     """
     rgba = load_rgba(view)
     return None if rgba is None or (rgba[:, :, 3] == 255).all() else np.asarray(255 - rgba[:, :, 3])
@@ -270,9 +269,8 @@ def load_transparency(view: View) -> NDArray[np.uint8] | None:
 def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of `load_image` are valid, [H, W], or None when all are.
 
-    A pixel is valid when its whole area is white in the mask file, opaque in the photograph (with alpha as mask) and
-    covered by the photograph (with a `whole` lens).
-    Raises DataError as load_image does.
+    The entire area of a valid pixel is white in the mask file, opaque in the photograph (if alpha is a mask) and
+    covered by the photograph (with a `whole` lens).  Raises DataError like load_image.
     """
     layers = []
     if view.mask_path is not None:
@@ -291,9 +289,9 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 
 
 def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
-    """Return some channels of a file at the size of the camera before downscaling: upright and undistorted.
+    """Return some channels of a file, rotated to fit the camera, undistorted, and not downscaled.
 
-    Raises DataError as needs_rotation does.
+    Raises DataError when the file cannot be read or does not fit the camera.
     """
     is_file = path != NO_FILE
     if not is_file and view.image is None:
@@ -312,8 +310,8 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
 def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
     """Return whether a photograph or mask fits the camera of its view only after its EXIF rotation.
 
-    COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or upright with True.
-    Raises DataError when neither fits.
+    COLMAP ignores that rotation.  size: returns (width, height) of the file, as stored for False and upright for True.
+    Raises DataError when neither size fits.
     """
     width, height = size(False)
     if fits_camera(view, (width, height)):
@@ -331,7 +329,7 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
 
 
 def fit_to_photograph(view: View) -> View:
-    """Return the view with its camera scaled to a photograph that is smaller but has the same aspect ratio."""
+    """Return the view with its camera scaled to its photograph if that is smaller and has the same aspect ratio."""
     (width, height), camera = stored_size(view.image_path), view.lens or view.camera
     x_scale, y_scale = width / camera.width, height / camera.height
     if x_scale >= 1 or abs(height - x_scale * camera.height) > MAX_ROUNDING:
@@ -361,10 +359,10 @@ def fits_camera(view: View, size: Size) -> bool:
     return smallest <= min(side / (c - 0.5) if c > 1 else np.inf for side, c in sides)
 
 
-# Lenses with a changed focal length: the undistorted photograph stays the same.
+# Change the focal length of lenses without changing the undistorted photograph.
 
 ROUNDING = 1e-12
-DEGREES: dict[str, tuple[int, ...]] = {  # power of the focal length in each coefficient, in COLMAP's order
+DEGREES: dict[str, tuple[int, ...]] = {  # power of the focal length in each distortion parameter, in COLMAP's order
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": (2,),
@@ -375,14 +373,14 @@ DEGREES: dict[str, tuple[int, ...]] = {  # power of the focal length in each coe
 
 
 def can_zoom(lens: Lens) -> bool:
-    """Return whether `zoom_lens` supports the model of a lens; it does not support fisheye lenses."""
+    """Return whether `zoom_lens` supports the model of a lens; fisheye lenses are not supported."""
     return lens.model in DEGREES
 
 
 def zoom_lens(lens: Lens, factor: float) -> Lens:
     """Return a lens whose focal length is multiplied by a factor, with the same undistorted photograph.
 
-    Raises DataError when its model does not support that.
+    Raises DataError when the model of the lens does not support that.
     """
     if factor == 1:
         return lens
@@ -397,9 +395,9 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
 
 
 def photo_lens(view: View) -> Lens:
-    """Return the lens of a view's photograph on disk, a pinhole lens if it has no distortion.
+    """Return the lens of the photograph of a view as stored, or a pinhole lens if it has no distortion.
 
-    The lens of a face of a wide photograph is that of the undistorted face.
+    For a face of a wide photograph, it is the pinhole lens of the face.
     Raises DataError when the focal length was optimized and the model of the lens does not support that.
     """
     c, lens = view.camera, view.lens
@@ -410,7 +408,7 @@ def photo_lens(view: View) -> Lens:
 
 
 def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
-    """Return the exposure of each view, from the exposures file of its folder or from EXIF; None: unknown.
+    """Return the exposure of each view, from the exposures file of its folder or from EXIF; None if unknown.
 
     Raises DataError when a file cannot be read.
     """
@@ -426,7 +424,7 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
 
 
 def _parent_folders(view: View) -> Iterator[tuple[Path, str]]:
-    """Yield the folders that contain the image, up to the one that its view's name starts from, and its path below."""
+    """Yield the folders above the image of a view up to the image folder, and the path of the image in each of them."""
     parts = PurePosixPath(view.name if view.lens is None else photograph_name(view.name)).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:

@@ -1,4 +1,4 @@
-"""Select views of a scene by name (every n-th, a list, or the lines of a file), and split a scene by them."""
+"""Select the views of a scene by name (every n-th, a list, or the lines of a file), and split the scene."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ def _require_text(value: Any) -> Any:
 
 
 class MissingViewError(DataError):
-    """A selection that does not match the photographs; it may match once they are prepared."""
+    """The error for a selection that does not match the photographs; it may match prepared photographs."""
 
 
 class ViewSelection(Settings):
@@ -84,8 +84,8 @@ class ViewSelection(Settings):
     def select(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> set[int]:
         """Return the indices of the selected `names`.
 
-        folders: where to look for a relative file, in order.  excluded: names that must not be selected, and names with
-        missing photographs, which are skipped.  Raises DataError for names that match no view or several.
+        folders: the folders in which a relative file is searched, in order.  excluded: names that must not be selected;
+        those with missing photographs are skipped.  Raises DataError for a listed name that matches no view or several.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
@@ -102,9 +102,10 @@ class ViewSelection(Settings):
         return {i for name, matches in matches_of.items() for i in _require_one_match(name, matches, names, source)}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> list[str]:
-        """Return the listed names, some of which may be left out later; empty for every n-th view.
+        """Return the names that the list matches; empty for a selection of every n-th view.
 
-        excluded: names that must not be selected.  Raises DataError for a name that matches none, or only such names.
+        excluded: names that must not be selected.  Raises DataError for a listed name that matches only excluded names
+        or no name.
         """
         if self.every is not None:
             return []
@@ -119,7 +120,7 @@ class ViewSelection(Settings):
         return [names[i] for indices in matches.values() for i in indices]
 
     def _read_names(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
-        """Return the source of the names, for messages, and the names.  Raises DataError for a bad or empty file."""
+        """Return the source of the list, for messages, and its names.  Raises DataError for a bad or empty file."""
         if self.file is None:
             return "the list of names", self.names or []
         files = [folder / self.file for folder in folders]
@@ -136,7 +137,7 @@ ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_senten
 
 
 def _excluded_error(source: str, name: str, key: ExcludedBy) -> DataError:
-    """Return the error for a name that another setting of the scene excludes."""
+    """Return the error for a listed name that another setting of the scene excludes."""
     reason, remedy = {
         "holdout": ("is a test view", "from scene.holdout"),
         "train": ("is left out by scene.train", "add it to scene.train"),
@@ -146,7 +147,7 @@ def _excluded_error(source: str, name: str, key: ExcludedBy) -> DataError:
 
 
 class _NameIndex:
-    """Find views by the last parts of their photographs' names: `a/b.png`, `b.png` and `b` name the same view."""
+    """Find views by the end of the name of their photograph: `a/b.png`, `b.png` and `b` match the same view."""
 
     def __init__(self, names: Sequence[str]):
         self._views: dict[str, list[int]] = {}
@@ -160,9 +161,9 @@ class _NameIndex:
         self._full_stems = _group((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, name: str) -> list[int]:
-        """Return the indices of the names that end with a listed name, with or without its suffix.
+        """Return the indices of the views whose names end with a listed name, with or without its suffix.
 
-        If there are none, the suffix may differ, since prepared images are PNG.
+        If there are none, names with another suffix match too, since prepared images are PNG files.
         """
         return [i for match in self._matches_of(name) for i in self._views[self._names[match]]]
 
@@ -175,7 +176,7 @@ class _NameIndex:
 
 
 def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Yield the last 1, 2, … parts of each path with the index of the path."""
+    """Yield every end of each path, as parts, with the index of the path."""
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
@@ -188,7 +189,7 @@ def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ..
 
 
 def _require_one_match(name: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
-    """Return the views of the only photograph that matches.  Raises DataError for none or several."""
+    """Return `matches` if they are views of one photograph.  Raises DataError for no or several photographs."""
     if len({photograph_name(names[i]) for i in matches}) == 1:
         return matches
     if matches:
@@ -206,29 +207,29 @@ def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataErr
 
 # Split a scene into training, validation and test views.
 
-FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name; not the first one, which is often at the end of a path
-MIN_TRAIN = 4  # training views: with fewer, none can be held out for validation
+FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name, but not the first, often at the end of a camera path
+MIN_TRAIN = 4  # smallest number of training views from which some can be held out for validation
 
 
 @dataclass(frozen=True)
 class Split:
-    """The training, validation and test views of a run; fields are those of `scene` in a pipeline."""
+    """The choice of training, validation and test views of a run; the fields are settings of `scene` in a pipeline."""
 
     holdout: int | ViewSelection = HOLDOUT
     train: ViewSelection | None = None
     validation: int | ViewSelection | Literal["auto"] = 0
     missing: Missing = "refuse"
-    folder: Path | None = None  # where to look for lists of names that the folder of the dataset does not have
+    folder: Path | None = None  # searched for lists of names that are not in the folder of the dataset
 
     @property
     def reader_holdout(self) -> int:
-        """The holdout for a reader, which it applies if the dataset has no split."""
+        """The `holdout` to pass to a reader, which uses it if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def apply(self, scene: Scene) -> Scene:
-        """Return the scene, read with `reader_holdout`, with this split.
+        """Return a scene that was read with `reader_holdout` with this split.
 
-        Raises DataError for wrong names, or when one split takes all views.
+        Raises DataError for unknown names, or when one of the splits contains all views.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         holdout = self.holdout
@@ -261,9 +262,9 @@ class Split:
         return self.with_validation(scene, left_out)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError for lists that do not fit the photos in a folder: unknown names, or a photo in two lists.
+        """Raise DataError for lists with unknown names, or with a photograph that is in two lists.
 
-        Photos need not have poses yet.
+        names: the photographs in `folder`, which need not have poses yet.
         """
         excluded: dict[ExcludedBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
@@ -279,16 +280,16 @@ class Split:
                     excluded["train"] = [name for name in names if name not in free]
 
     def _held_out(self, names: Sequence[str]) -> set[str]:
-        """Return the names that are held out for testing by number, if all photos get poses."""
+        """Return the names that every n-th as `holdout` selects for testing, if all photographs get poses."""
         every, offset = self.reader_holdout, 0
         if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset
         return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
 
     def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
-        """Return a scene with some of its training views moved to the validation views.
+        """Return the scene with some of its training views moved to the validation views.
 
-        left_out: names of views that the scene leaves out.  Raises DataError as `apply` does.
+        left_out: names of views that are not in the scene because of `train`.  Raises DataError like `apply`.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
@@ -307,7 +308,7 @@ class Split:
 
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
-    """Return the scene with other test views, and with the extent of its training views."""
+    """Return the scene with the views at the indices `test` as test views, and with the extent of the others."""
     train = remaining_views(scene.path, len(scene.views), test)
     points = None if scene.points is None else scene.points.positions
     extent = camera_extent([scene.views[i] for i in train], points)
@@ -317,7 +318,7 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
 def _select_training(
     scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
 ) -> set[int]:
-    """Return the indices of the selected training views; key: the setting that selects them."""
+    """Return the indices of the selected training views; key: the name of the setting, for messages."""
     names = [scene.views[i].name for i in scene.train]
     test_names = [scene.views[i].name for i in scene.test]
     excluded: ExcludedNames = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
@@ -332,7 +333,7 @@ def _select(
     folders: Sequence[Path],
     excluded: ExcludedNames = NONE,
 ) -> set[int]:
-    """Return the indices of the selected names; a number n selects every n-th, starting with the first, and 0 none.
+    """Return the indices of the selected names; a number n selects every n-th name from the first, and 0 selects none.
 
     key: the name of the setting, for messages.
     """
@@ -345,7 +346,7 @@ def _select(
 
 
 def _validation_fold(scene: Scene) -> set[int]:
-    """Return the views of every 8th training photograph by name, and of at least two."""
+    """Return the indices of the views of every 8th training photograph by name, and of at least two photographs."""
     names = [photograph_name(scene.views[i].name) for i in scene.train]
     order = sorted(set(names))
     count = len(order)

@@ -1,4 +1,4 @@
-"""Find which way is up in a scene, what its cameras look at, and where the viewer starts."""
+"""Find the up direction of a scene, the point that its cameras look at, and the start view of the viewer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from clsplat.scene.view import View
 
 MIN_TURN = 0.1  # smallest second eigenvalue of the right axes of cameras that turn enough: 18 degrees
 MAX_ROLL = 0.15  # largest ratio of the third to the second eigenvalue of level cameras
-MIN_UP = 0.2  # mean of the up axes along the axis from which its sign is clear
-AGREED, FURTHEST = 0.5, 75.0  # a mean of up axes at least this long is less than this many degrees from up
-PRIOR = 1e-3  # weight of the splats' center, which fixes the distance when all axes are parallel
-START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # without views
-QUANTILES = 0.05, 0.95  # of the splats along each axis: the sides of the box to look at
-DISTANCE = 2.2  # of the start from the center of the box, in halves of its diagonal
+MIN_UP = 0.2  # smallest component of the mean up axis along the axis that determines its sign
+AGREED, FURTHEST = 0.5, 75.0  # a mean up axis longer than this is less than this many degrees from the up direction
+PRIOR = 1e-3  # weight of the center of the splats, which determines the distance if all axes are parallel
+START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
+QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
+DISTANCE = 2.2  # of the start view from the center of the box, in halves of its diagonal
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The start of a viewer and the frame in which it moves, in scene units."""
+    """The start view of the viewer and the frame of its motion, in scene units."""
 
     pivot: NDArray[np.floating]  # [3]
     up: NDArray[np.floating]  # [3], unit
@@ -32,7 +32,10 @@ class Viewpoint:
 
     @classmethod
     def from_points(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Viewpoint":
-        """Start at `first`, or else outside of most points.  points: [N, 3], the centers of the splats."""
+        """Return a viewpoint that starts at `first`, or outside of most points without `first` or without views.
+
+        points: the centers of the splats, [N, 3].
+        """
         means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         low, high = np.quantile(means, QUANTILES, axis=0) if len(means) else np.zeros((2, 3))
         center, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -51,8 +54,9 @@ class Viewpoint:
 def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     """Return the up direction as a unit vector, [3].
 
-    When cameras turn and are level, it is perpendicular to their right axes.  Otherwise it is the mean of their up
-    axes, which leans when all look down from one side.  When these cancel out, it is opposite to where most look.
+    If the cameras turn and are level, it is perpendicular to their right axes.  Otherwise it is the mean of their up
+    axes, which is tilted if all cameras look down from one side.  If the up axes cancel out, it is opposite to the mean
+    viewing direction.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
     right, mean, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
@@ -68,7 +72,7 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def perpendicular(up: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return a unit vector perpendicular to a unit vector, both [3]."""
+    """Return a unit vector, [3], that is perpendicular to the unit vector `up`, [3]."""
     vector = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     return np.asarray(vector / np.linalg.norm(vector), np.float64)
 
@@ -76,9 +80,9 @@ def perpendicular(up: NDArray[np.floating]) -> NDArray[np.float64]:
 def nearest_to_axes(
     centers: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Return the point, [3], with the least squared distances to lines, weakly drawn to `prior`.
+    """Return the point, [3], with the smallest sum of squared distances to V lines, with a small weight for `prior`.
 
-    centers, axes: [V, 3], a point on each line and its unit direction.
+    centers, axes: a point on each line and the unit direction of the line, [V, 3].
     """
     planes = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = PRIOR * len(centers)
@@ -86,13 +90,13 @@ def nearest_to_axes(
     return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", planes, centers) + weight * prior))
 
 
-BLENDER_DISTANCE = 4.03  # of the cameras from the center, in the Blender scenes
-RANDOM_BOX = 1.3 / BLENDER_DISTANCE  # half side of the box by camera distance (3DGS, Kerbl et al. 2023)
-MIN_DISTANCE = 1e-3  # extents: cameras that are nearer to the center only turn
+BLENDER_DISTANCE = 4.03  # distance of the cameras from the center in the Blender scenes
+RANDOM_BOX = 1.3 / BLENDER_DISTANCE  # half the side of the box / camera distance (3DGS, Kerbl et al. 2023)
+MIN_DISTANCE = 1e-3  # in extents; cameras nearer to the center only rotate
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
-    """Return gray points, uniform in a box around the point that the training cameras look at."""
+    """Return `count` gray points, distributed uniformly in a box around the point that the training cameras look at."""
     center, half_side = scene_box(scene)
     rng = np.random.default_rng([seed, count])
     spread = rng.uniform(-half_side, half_side, (count, 3))
@@ -107,7 +111,7 @@ def scene_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
 def camera_distance(scene: Scene) -> float:
     """Return the median distance of the training cameras from the point that they look at, scene units.
 
-    For cameras that only turn, it is the extent.
+    For cameras that only rotate, it is the extent.
     """
     views = scene.split("train")
     positions, center = np.stack([view.position for view in views]), scene_center(views)

@@ -1,4 +1,4 @@
-"""Points for photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
+"""Create points from photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
 
 A box is split into cells, as an octree (Szeliski 1993).  A cell outside the silhouette of any view is empty, and a cell
 inside all silhouettes is full; the others are split.  Cells of the last level are full if their centers are.
@@ -19,13 +19,13 @@ from clsplat.scene.view import View
 Floats = NDArray[np.floating]
 Bools = NDArray[np.bool_]
 Cells = NDArray[np.integer]  # [M, 3], indices in a grid
-LONG_SIDE = 400  # px, of the photos as read
-MAX_VIEWS = 64  # used for the silhouettes
+LONG_SIDE = 400  # px, of the downscaled photographs
+MAX_VIEWS = 64  # largest number of views that are used as silhouettes
 COARSEST, FINEST = 16, 256  # cells along a side of the box
 HALF, OPAQUE = 127, 250  # alpha above which a pixel is in the silhouette, and from which its color is used
-MIN_VIEWS, MIN_FRACTION = 2, 0.25  # views that must see a cell: a number, and a fraction of all
+MIN_VIEWS, MIN_FRACTION = 2, 0.25  # smallest number and fraction of views that must see a cell
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
-MAX_BEHIND = 2.0  # cell sides by which a visible point may be behind the nearest point of its pixel
+MAX_BEHIND = 2.0  # largest distance of a visible point behind the nearest point of its pixel, in cell sides
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Silhouette:
 
     @property
     def alpha(self) -> NDArray[np.uint8]:
-        """[H, W]."""
+        """The alpha channel, [H, W]."""
         return np.ascontiguousarray(self.rgba[:, :, 3])
 
     def project(self, points: NDArray[np.float32]) -> "Projection":
@@ -54,7 +54,7 @@ class Silhouette:
         return Projection(inside, row[inside], column[inside], depth[inside])
 
     def radius(self, size: float, depth: Floats) -> int:
-        """Return an upper bound, px, of the projected radius of a ball of radius `size` at any of these depths."""
+        """Return an upper bound, px, of the projected radius of balls of radius `size` at the depths `depth`."""
         c = self.view.camera
         slant = math.hypot(1, max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy)
         return min(math.ceil(slant * size * max(c.fx, c.fy) / float(depth.min())), max(c.width, c.height))
@@ -80,8 +80,8 @@ def hull_points(
 ) -> PointCloud:
     """Return at most `count` colored points on the hull, in a box of side 2 `half_side` around `center`, [3].
 
-    `load` returns a photo with its alpha, [H, W, 4], or None without transparency.  Cells are split until about `count`
-    of them are on the surface, or until there are FINEST along a side of the box.
+    load: returns a photograph with its alpha, [H, W, 4], or None without transparency.  Cells are split until about
+    `count` of them are on the surface, or until FINEST of them are along each side of the box.
     """
     silhouettes = list(_silhouettes(views, load))
     full, number = np.zeros((COARSEST,) * 3, bool), COARSEST
@@ -120,14 +120,16 @@ def _split(cells: Cells) -> Cells:
 
 
 def _centers(cells: Cells, center: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
-    """Return the centers, [M, 3], and the side of cells in a box with `number` of them along a side."""
+    """Return the centers, [M, 3], and the side of cells in a box with `number` cells along each side."""
     side = 2 * half_side / number
     return (center - half_side + side * (cells + 0.5)).astype(np.float32), side
 
 
 def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
-    """Return which balls, [M], are inside the silhouettes of all views that see them, and which are on the edge of one
-    and outside none.  Balls that few views see are in neither group."""
+    """Return which balls, [M], are inside all silhouettes, and which are on the edge of some and outside of none.
+
+    Only the views that see a ball count.  Balls that too few views see are in neither group.
+    """
     full, remaining, view_counts = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:
         projection = silhouette.project(centers[remaining])
@@ -149,7 +151,7 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
 def _colors(
     silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], Bools]:
-    """Return the mean colors, [M, 3] in [0, 1], of points in the views that show them, and which are shown, [M]."""
+    """Return the mean colors of points in the views that show them, [M, 3] in [0, 1], and which are visible, [M]."""
     total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     for silhouette in silhouettes:
         projection, camera = silhouette.project(points), silhouette.view.camera
