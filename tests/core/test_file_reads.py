@@ -130,7 +130,7 @@ def test_records_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, ca
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()
         os.mkfifo(tmp_path / "decoded" / f"opencv-{identity.cv2.__version__}-contents.txt")
-        assert identity.DecodedSizes()._known == {}
+        assert identity.DecodedSizes()._entries == {}
 
 
 def test_binary_pipeline_is_not_copied(tmp_path):

@@ -1,4 +1,4 @@
-"""Modules that take part in a training step next to the Gaussians: one file each, with settings and state."""
+"""Modules of a training step in addition to the Gaussians, each with its settings and its state in one file."""
 
 from clsplat.core.settings import import_modules
 

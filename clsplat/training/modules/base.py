@@ -31,7 +31,7 @@ Scalars = dict[str, float]
 
 @dataclass
 class TrainingStep:
-    """The data of one training step; each hook sees what the hooks before it changed."""
+    """The data of one training step.  Each hook sees the changes that earlier hooks made."""
 
     number: int  # global, from 1
     rasterizer: Rasterizer
@@ -42,8 +42,8 @@ class TrainingStep:
     transforms: Sequence[PhotographTransform]
     frame: Frame = field(init=False)
     planes: Planes = field(init=False)  # the photograph and its mask
-    image: Array = field(init=False)  # compared with the photograph by the losses; a module may replace it
-    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by that of the module's input
+    image: Array = field(init=False)  # image that the losses compare with the photograph; a module may replace it
+    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by the gradient of its input
     comparison: Comparison = field(init=False)
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)
@@ -58,7 +58,7 @@ class TrainingStep:
 
     @property
     def view(self) -> int | None:
-        """The index of the training view; None for other images, which modules leave unchanged."""
+        """The index of the training view; None for other images, which modules do not change."""
         return self.photograph.camera.view
 
     @property
@@ -67,7 +67,7 @@ class TrainingStep:
 
     @property
     def loss(self) -> float:
-        """The sum of the losses; waits for the device."""
+        """The sum of the losses.  Reading it waits for the device."""
         return sum(loss.value() for loss in self.losses)
 
     def save(self, state: "ModuleState", value: Any) -> None:
@@ -87,30 +87,30 @@ class ModuleState:
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "dropped"
-    """What happens to the state after its training: dropped, kept for evaluation, or active in later trainings too."""
-    is_saved: ClassVar[bool] = True  # in checkpoints
+    """Whether the state is dropped after its training, kept for evaluation, or active in later training runs too."""
+    is_saved: ClassVar[bool] = True  # whether checkpoints contain the state
 
     def __init__(self) -> None:
         self.scalars: Scalars = {}  # on the host, by name, with their Adam moments
 
-    # saved in a checkpoint, next to `scalars`
+    # checkpoints contain the tables and `scalars`
     def tables(self, full: bool = True) -> Tables:
-        """Copy the tables to the host.  full: include tables that only training needs, such as Adam moments."""
+        """Copy the tables to the host.  full: include the tables that only training needs, such as Adam moments."""
         return {}
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        """Restore the state from a checkpoint, an earlier training, or the best model."""
+        """Restore the state of a checkpoint, of an earlier training run, or of the best model."""
         self.scalars = dict(scalars)
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
-        """Return whether `load` accepts this state; if not, the module starts from scratch."""
+        """Return whether `load` accepts this state.  If not, the module starts from scratch."""
         return True
 
     def start(self, run: Run) -> None:
-        """Set the initial values, in a run that has no earlier state."""
+        """Set the initial values in a run without an earlier state of this module."""
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        """Prepare for a training that ends at global step `last`.  trained: whether the module learns in it."""
+        """Prepare for training that ends at global step `last`.  trained: whether the module learns in this run."""
 
     # in a step: forward in list order, backward and update in reverse
     def before_render(self, step: TrainingStep) -> None: ...
@@ -122,14 +122,14 @@ class ModuleState:
 
     # outside steps
     def attach_to(self, model: DeviceModel) -> None:
-        """Attach objects to a model that are rendered with its Gaussians, such as a sky."""
+        """Attach objects to a model, such as a sky, that are rendered together with its Gaussians."""
 
     def finish(self, run: Run) -> None:
-        """Act after the last step, before the best model replaces the last one."""
+        """Run after the last step, before the best model replaces the last one."""
 
     @property
     def color_model(self) -> ColorFit | None:
-        """The color model that metrics fit to each photograph; None to measure renders as they are."""
+        """The color model that metrics fit to each photograph; None to evaluate renders without color correction."""
         return None
 
     def apply_to(self, scene: Scene) -> Scene:
@@ -137,35 +137,35 @@ class ModuleState:
         return scene
 
     def write(self, run: Run) -> None:
-        """Write the side files and log a line."""
+        """Write the side files, and log a summary."""
 
 
 class TrainingModule(Settings):
     """A component of training steps, in addition to the Gaussians."""
 
     order: ClassVar[int] = 0
-    """Modules are listed in ascending order of this number.  Below 20, they change the camera, model, background, or
-    photograph; below 30, layers in front of the scene; below 40, colors; below 99, the images that are compared.  It is
-    a number and not a list of other modules, so that plug-ins have a position too."""
+    """Modules must be listed in ascending order of this number.  Modules below 20 change the camera, model, background,
+    or photograph; below 30, layers in front of the scene; below 40, colors; and below 99, the images that are compared.
+    The order is a number, not a list of modules, so that plug-ins can be ordered too."""
     side_files: ClassVar[Mapping[str, str]] = {}
-    """Files in the run folder, each with its title; their names start with `view_`."""
+    """Titles of the files that the module writes to the run folder, by file name; the names start with `view_`."""
     masks_objects: ClassVar[bool] = False  # whether it masks objects that move between photographs
-    device_planes: ClassVar[int] = 0  # float planes on the device, each of the largest view's size
-    implicit_type: ClassVar[str] = ""  # the type of a module that is never listed, but implied by the model or a loss
+    device_planes: ClassVar[int] = 0  # number of float planes on the device, each with the size of the largest view
+    implicit_type: ClassVar[str] = ""  # the type of a module that is not listed but implied by the model or a loss
     keyed_by_type: ClassVar[bool] = True
-    optional_on_resume: ClassVar[bool] = False  # may be added or removed on resume; results then differ
+    optional_on_resume: ClassVar[bool] = False  # whether a resumed run may add or remove it; results then differ
 
     type: str
     """Name of the module."""
 
     @property
     def group(self) -> str:
-        """At most one module of each group may be in a list."""
+        """The name of the module's group.  A list may contain at most one module of each group."""
         return self.family or self.type
 
     @classmethod
     def implied_module(cls, run: Run, stage: Any) -> "TrainingModule | None":
-        """Return the module if the run's model or the stage's losses imply it."""
+        """Return the module if the run's model or the stage's losses imply it, or None."""
         return None
 
     def resolve_auto(self, run: Run) -> "TrainingModule":
@@ -173,7 +173,7 @@ class TrainingModule(Settings):
         return self
 
     def is_active(self, scene: Scene | None = None) -> bool:
-        """Return whether the module has an effect for a scene; without a scene, whether it has one for every scene."""
+        """Return whether the module has an effect for a scene, or for every scene if `scene` is None."""
         return True
 
     def active_conflicts(self) -> Mapping[str, str]:
@@ -183,14 +183,14 @@ class TrainingModule(Settings):
         """Raise ConfigError for losses that the module does not support."""
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        """Return an upper bound of the device memory that the module needs, bytes.  tile: side of a tile, px."""
+        """Return an upper bound on the device memory that the module needs, in bytes.  tile: side of a tile, px."""
         return 4 * self.device_planes * max_pixels(views, tile) if self.device_planes else 0
 
     def check_run(self, run: Run) -> None:
-        """Raise errors that can be detected before the first stage."""
+        """Raise an error for a problem that can be detected before the first stage."""
 
     def create_state(self, run: Run) -> ModuleState:
-        """Return an empty state with the sizes for a run; nothing is measured yet."""
+        """Return an empty state with the sizes that the run needs, without measuring initial values."""
         raise NotImplementedError
 
     @classmethod
@@ -202,7 +202,7 @@ class TrainingModule(Settings):
 
     @classmethod
     def read_color_model(cls, model: Path) -> ColorFit | None:
-        """Read the color model of a training from the side files next to its model.  Raises DataError."""
+        """Read the color model of a training run from the side files next to its model.  Raises DataError."""
         return None
 
     @classmethod
@@ -213,9 +213,9 @@ class TrainingModule(Settings):
 
 def check_list(modules: Sequence[TrainingModule]) -> None:
     """Raise ValueError if modules are out of order, or if two are in the same group."""
-    for before, after in itertools.pairwise(modules):
-        if after.order < before.order:
-            raise ValueError(f"'{after.type}' is listed after '{before.type}'; put it before '{before.type}'")
+    for first, second in itertools.pairwise(modules):
+        if second.order < first.order:
+            raise ValueError(f"'{second.type}' is listed after '{first.type}'; put it before '{first.type}'")
     types: dict[str, str] = {}
     for module in modules:
         if module.group in types:
@@ -224,24 +224,24 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
 
 
 def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
-    """Return the module states of a training that ends at global step `last`, in order.
+    """Create the module states for training that ends at global step `last`, and return them in order.
 
-    They are those of the listed modules, of modules implied by the model and the losses, and of modules that are still
-    active from an earlier training.
+    There is a state for each listed module, for each module that the model or the losses imply, and for each module of
+    an earlier training run that is still active.
     """
-    trained = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
-    groups = {module.group for module in trained}
+    trainable = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
+    groups = {module.group for module in trainable}
     earlier = [m for m in modules_so_far(run).values() if m.type in run.modules and m.group not in groups]
     active = [module for module in earlier if run.modules[module.type].after_training == "active"]
-    states, before = list[ModuleState](), run.modules
-    run.modules = {module.type: before[module.type] for module in earlier}
-    for module in sorted([*trained, *active], key=lambda module: module.order):
-        state, old = module.create_state(run), before.get(module.type)
+    states, old_states = list[ModuleState](), run.modules
+    run.modules = {module.type: old_states[module.type] for module in earlier}
+    for module in sorted([*trainable, *active], key=lambda module: module.order):
+        state, old = module.create_state(run), old_states.get(module.type)
         if old and old is not state and state.can_load(old.scalars, tables := old.tables()):
             state.load(old.scalars, tables)
         elif old is not state:
             state.start(run)
-        state.prepare(run, last, module in trained)
+        state.prepare(run, last, module in trainable)
         if state.is_saved:
             run.modules[module.type] = state
         states.append(state)
@@ -249,17 +249,17 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> li
 
 
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
-    """Return the modules of a run's trainings up to its current stage, the last of each type, by type."""
+    """Return the modules of a run's stages up to the current one: the last module of each type, by type."""
     stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
     listed = (module for stage in stages for module in getattr(stage, "modules", ()))
     return {module.type: module for module in (*listed, *implied_modules(run)) if module.is_active(run.scene)}
 
 
 def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
-    """Return the modules implied by the model and the losses of a stage.  stage: None for the current one."""
+    """Return the modules that the model and the losses of a stage imply.  stage: None for the current stage."""
     stages = getattr(run.settings, "stages", ())
     stage = stages[run.stage_index] if stage is None and run.stage_index < len(stages) else stage
-    return [module for kind in implicit_modules().values() if (module := kind.implied_module(run, stage))]
+    return [module for cls in implicit_modules().values() if (module := cls.implied_module(run, stage))]
 
 
 def implicit_modules() -> dict[str, type[TrainingModule]]:
@@ -291,24 +291,24 @@ def learned_scene(run: Run) -> Scene:
 
 def apply_side_files(model: Path, scene: Scene) -> Scene:
     """Return a scene with the cameras in the side files next to a model."""
-    for kind in variants(TrainingModule).values():
-        scene = kind.apply_side_files(model, scene)
+    for cls in variants(TrainingModule).values():
+        scene = cls.apply_side_files(model, scene)
     return scene
 
 
 def module_class(name: str) -> type[TrainingModule]:
     """Return the class of a module in a checkpoint.  Raises ConfigError for an unknown name."""
-    if (kind := {**variants(TrainingModule), **implicit_modules()}.get(name)) is None:
+    if (cls := {**variants(TrainingModule), **implicit_modules()}.get(name)) is None:
         raise ConfigError(f"the checkpoint has an unknown module '{name}'; load its plug-in with --plugin")
-    return kind
+    return cls
 
 
 def color_model(run: Run) -> ColorFit | None:
-    """Return the color model that metrics fit to each photograph; None to measure renders as they are."""
+    """Return the color model that metrics fit to each photograph; None to evaluate renders without color correction."""
     return next((model for state in run.modules.values() if (model := state.color_model)), None)
 
 
 def read_color_model(model: Path) -> ColorFit | None:
-    """Read the color model of a training from the side files next to its model.  Raises DataError."""
-    models = (kind.read_color_model(model) for kind in variants(TrainingModule).values())
+    """Read the color model of a training run from the side files next to its model.  Raises DataError."""
+    models = (cls.read_color_model(model) for cls in variants(TrainingModule).values())
     return next((model for model in models if model), None)

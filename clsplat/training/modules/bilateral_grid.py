@@ -30,7 +30,7 @@ from clsplat.training.run import Run
 VIEW_GRIDS = "view_colors.npy"
 ENTRIES = int(constants("color_grid.h")["ENTRIES"])
 TABLES = ("values", "moment1", "moment2")
-WARM_UP = 1000  # steps (gsplat), or a tenth of a shorter training
+WARM_UP = 1000  # steps (gsplat), or a tenth of the steps of a shorter run
 Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
     f"{MEANING}; [E | b] is interpolated trilinearly; file: matrices [photographs, luminance, height, width, 3, 4], "
@@ -42,10 +42,10 @@ GRID_MEANING = (
 class BilateralGrid(Appearance):
     """Learn a bilateral grid of affine color transforms per photograph (Wang et al. 2024).
 
-    It follows the local tone mapping of phones, which `exposure` cannot.  It also absorbs what the model should learn,
-    so test views are often worse with it: try `exposure` first.  At each luminance, the mean transform over photographs
-    and positions stays the identity.  A grid cannot be fitted to one half of a photograph and tested on the other, so
-    metrics use the color model `gain`.
+    It can represent the local tone mapping of phones, which `exposure` cannot.  It also absorbs colors that the model
+    should learn, so test views are often worse with it: try `exposure` first.  At each luminance, the mean transform
+    over photographs and positions remains the identity.  A grid cannot be fitted to one half of a photograph and tested
+    on the other half, so metrics use the color model `gain`.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
@@ -58,11 +58,11 @@ class BilateralGrid(Appearance):
     """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown,
     with a warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
-    """Weight of the total variation loss of the step's grid: the mean squared difference of neighbors, summed over the
-    axes."""
+    """Weight of the total variation loss of the step's grid: the mean squared difference of adjacent nodes, summed over
+    the axes."""
 
     side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
-    device_planes: ClassVar[int] = 9  # with the gradient where white clips
+    device_planes: ClassVar[int] = 9  # including the gradient before clipping at white
 
     def create_state(self, run: Run) -> "GridState":
         return GridState(self, [view.name for view in run.scene.split("train")], run.device)
@@ -89,8 +89,8 @@ class BilateralGrid(Appearance):
         exposure_rate = super().rate_schedule(steps, photographs, is_warm_start)
         rate = Decay(initial=2e-3, final=2e-5, over=steps) if is_warm_start else exposure_rate
         warm_up = max(1, min(WARM_UP, steps // 10))
-        later = [warm_up + round((steps - warm_up) * t) for t in np.linspace(0, 1, 11)]
-        points = {step: [float(step), at_step(rate, step)] for step in later}
+        knots = [warm_up + round((steps - warm_up) * t) for t in np.linspace(0, 1, 11)]
+        points = {step: [float(step), at_step(rate, step)] for step in knots}
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
 
     @property
@@ -99,7 +99,7 @@ class BilateralGrid(Appearance):
 
 
 class GridState(ColorState):
-    """The grids of all photographs on the device, with Adam moments, each [photographs, ENTRIES, nz, ny, nx]."""
+    """The grids of all photographs on the device, and their Adam moments, each [photographs, ENTRIES, nz, ny, nx]."""
 
     settings: BilateralGrid
 
@@ -115,7 +115,7 @@ class GridState(ColorState):
         return "values" in tables and tables["values"].shape == self.shape
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        """Restore the state; missing tables become 0."""
+        """Restore the state, with zeros for missing tables."""
         super().load(scalars, tables)
         for name, array in self.arrays.items():
             array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
@@ -170,6 +170,7 @@ class GridState(ColorState):
         return ColorReport(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
     def transform(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
+        """Apply a training view's grid to an image, [3 or 4, rows, stride].  view: the index of the view."""
         result = workspace.array("colored", image.shape)
         workspace.device.program("color_grid.cl").color_grid_forward(
             groups=(1, camera.rows), image=image, colored=result, **self._arguments(camera, image, view)
@@ -177,7 +178,7 @@ class GridState(ColorState):
         return result
 
     def smoothness(self, workspace: Workspace, view: int) -> Array:
-        """Write the gradient of the total variation loss into the workspace; return the terms of the loss, [row]."""
+        """Write the gradient of the total variation loss to the workspace, and return the terms of the loss, [row]."""
         nodes, row = dict(zip("xyz", self.settings.grid_shape, strict=True)), row_length(self.settings.grid_shape)
         sizes: dict[str, Any] = {f"n{axis}": n for axis, n in nodes.items()}
         grad_smoothness, terms = (workspace.array(f"grid {name}", row) for name in ("smoothness", "terms"))
@@ -197,7 +198,7 @@ class GridState(ColorState):
     def differentiate(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradients of the input of `transform` and of the grid, [row], from that of its result."""
+        """Return the gradients of the input of `transform` and of the grid, [row].  gradient: that of the result."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         result = workspace.array("grad_colored", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
@@ -235,9 +236,9 @@ class GridState(ColorState):
         }
 
     def learn(self, workspace: Workspace, view: int, grad_grid: Array, step: int) -> None:
-        """Update the grid of a view by Adam, with its own update count, then center all grids.
+        """Update the grid of a view with Adam, which counts the updates of each grid.  Then center all grids.
 
-        grad_grid: gradient of the image losses, [row]; that of the total variation is in the workspace.
+        grad_grid: gradient of the image losses, [row].  The gradient of the total variation is in the workspace.
         """
         key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.grid_shape)
         self.scalars[key] = updates = self.scalars.get(key, 0.0) + 1
@@ -255,7 +256,7 @@ class GridState(ColorState):
         self._center()
 
     def _center(self) -> None:
-        """Subtract the mean over photographs and positions at each luminance."""
+        """Subtract from the grids at each luminance their mean over photographs and positions."""
         photographs, _, levels, rows, columns = self.shape
         self.device.program("color_grid_table.cl").color_grid_center(
             groups=ENTRIES * levels,
@@ -266,11 +267,14 @@ class GridState(ColorState):
 
 
 def row_length(shape: Sequence[int]) -> int:
-    """Return the number of values of one photograph's grid."""
+    """Return the number of values in the grid of one photograph.  shape: numbers of nodes, nx, ny, nz in any order."""
     return ENTRIES * math.prod(shape)
 
 
 def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
-    """Return the bytes of grids on the device.  shape: nx, ny, nz; rows: rows of the largest view, in whole tiles."""
+    """Return the size of grids on the device, in bytes.
+
+    shape: nx, ny, nz; rows: number of pixel rows of the largest view, padded to full tiles.
+    """
     row, columns = row_length(shape), ENTRIES * shape[0] * shape[2]
     return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows)

@@ -32,13 +32,13 @@ VIEW_POSES = "view_poses.json"
 ROTATIONS, TRANSLATIONS, DEPTHS, FOCALS = "rotations", "translations", "depths", "focal_lengths"
 AXES = "x", "y", "z"
 RATE, MAX_RATE = 2e-4, 2e-3  # initial learning rates
-RATE_RATIO = 100  # of the initial rate to the final one
+RATE_RATIO = 100  # ratio of the initial rate to the final rate
 ROTATION_RATIO = 0.3  # ours; a rotation about the pivot changes the image little, so its gradient is mostly noise
 REACH = 0.01  # translation, relative to the depth, to which the rates of all visits must add up
 FOCAL_RATE, MAX_FOCAL_RATE = 1e-4, 1e-3  # likewise, for the logarithms of focal lengths
-FOCAL_REACH = 0.2  # likewise; noise uses up most of it, and changes are a few hundredths
-MIN_POINTS = 10  # whose median depth is used
-MAX_ZOOM = 10.0  # largest factor of a focal length in a side file
+FOCAL_REACH = 0.2  # likewise; most of it is noise, and changes are a few hundredths
+MIN_POINTS = 10  # number of points that are required for a median depth
+MAX_ZOOM = 10.0  # largest factor on a focal length in a side file
 LOG = logging.getLogger("clsplat")
 
 
@@ -55,8 +55,8 @@ class CameraOptimizer(TrainingModule):
     fixed.  Factors are not centered, so a single camera can change.  Leave `focal` out if cameras move straight ahead,
     where a focal length is hard to distinguish from depth.
 
-    Use this module for poses from a phone's tracking, or if structure from motion left errors of more than a pixel.
-    Otherwise the poses of structure from motion are mostly better than optimized ones.
+    Use this module for poses from a phone's tracking, or if the reprojection errors of structure from motion exceed a
+    pixel.  Otherwise, the poses from structure from motion are usually better than optimized poses.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rotation", "translation", "focal", "start"})
@@ -81,7 +81,7 @@ class CameraOptimizer(TrainingModule):
     """Global step after which poses are optimized; before it, the model is too blurry to align cameras."""
 
     def rates(self, last: int, photographs: int) -> tuple[Schedule, Schedule]:
-        """Return the rate schedules of rotations and translations.  last: global step at which training ends."""
+        """Return the rate schedules for rotations and translations.  last: global step at which training ends."""
         translation = self._decay(last, photographs, REACH, (RATE, MAX_RATE))
         rotation = translation.divide(1 / ROTATION_RATIO)
         return (
@@ -90,16 +90,19 @@ class CameraOptimizer(TrainingModule):
         )
 
     def focal_rate(self, last: int, cameras: int) -> Schedule:
-        """Return the learning rate schedule of focal lengths.  last: global step at which training ends."""
+        """Return the rate schedule for focal lengths.  last: global step at which training ends."""
         automatic = self._decay(last, cameras, FOCAL_REACH, (FOCAL_RATE, MAX_FOCAL_RATE))
         return automatic if self.focal == "auto" else self.focal
 
     def _decay(self, last: int, rows: int, reach: float, bounds: tuple[float, float]) -> Decay:
-        """Return a decaying rate, within bounds, that adds up to `reach` over the visits of one of `rows` items."""
+        """Return a decaying rate that adds up to `reach` over the visits of one of `rows` photographs or cameras.
+
+        bounds: limits of the initial rate.
+        """
         steps = max(last - self.start, 1)
         visits = steps / rows
-        needed = reach * math.log(RATE_RATIO) * RATE_RATIO / (RATE_RATIO - 1) / visits
-        initial = min(max(bounds[0], needed), bounds[1])
+        min_rate = reach * math.log(RATE_RATIO) * RATE_RATIO / (RATE_RATIO - 1) / visits
+        initial = min(max(bounds[0], min_rate), bounds[1])
         return Decay(initial=initial, final=initial / RATE_RATIO, over=steps, start=self.start)
 
     def check_run(self, run: Run) -> None:
@@ -126,10 +129,10 @@ class CameraOptimizer(TrainingModule):
 
 @dataclass(frozen=True)
 class PoseChange:
-    """A rotation vector and a translation, each [3], of a camera in world axes.
+    """A change of a camera's pose: a rotation vector and a translation in world axes, each [3].
 
     The camera rotates about a pivot, the point on its optical axis at `depth`.  A rotation about the camera's center
-    would change the image almost like a translation, and Adam, which works per coordinate, could not separate the two.
+    would change the image almost like a translation.  Adam, which works per coordinate, could not separate the two.
     """
 
     rotation: Floats  # rad
@@ -137,24 +140,24 @@ class PoseChange:
     depth: float  # scene units
 
     def apply_to(self, world_to_camera: Floats) -> Floats:
-        """Return the changed pose, [3, 4]: W' = W exp([rotation]x); only the translation moves the pivot."""
-        before = world_to_camera[:, :3]
-        after = before @ scipy.spatial.transform.Rotation.from_rotvec(self.rotation).as_matrix()
-        pivot = self.depth * before[2] - before.T @ world_to_camera[:, 3]
-        return np.column_stack([after, self.depth * np.array([0, 0, 1]) - after @ (pivot + self.translation)])
+        """Return the changed pose, [3, 4], with rotation W exp([rotation]x).  Only the translation moves the pivot."""
+        old = world_to_camera[:, :3]
+        new = old @ scipy.spatial.transform.Rotation.from_rotvec(self.rotation).as_matrix()
+        pivot = self.depth * old[2] - old.T @ world_to_camera[:, 3]
+        return np.column_stack([new, self.depth * np.array([0, 0, 1]) - new @ (pivot + self.translation)])
 
     def gradients(self, pose: Floats, grad_translation: Floats, grad_rotation: Floats) -> tuple[Floats, Floats]:
         """Return the gradients of the rotation vector and of the translation, each [3].
 
-        pose: the changed pose, [3, 4]; grad_translation, grad_rotation: gradients of a translation of all Gaussians
-        and of a rotation of them about the camera, [3].
+        pose: the changed pose, [3, 4]; grad_translation, grad_rotation: gradients with respect to a translation of all
+        Gaussians, and to a rotation of all Gaussians about the camera, [3].
         """
-        about_pivot = grad_rotation - np.cross(self.depth * pose[2, :3], grad_translation)
-        return _rotation_vector_gradient(self.rotation, about_pivot), -grad_translation
+        grad_pivot = grad_rotation - np.cross(self.depth * pose[2, :3], grad_translation)
+        return _rotation_vector_gradient(self.rotation, grad_pivot), -grad_translation
 
 
 def _rotation_vector_gradient(vector: Floats, grad_rotation: Floats) -> Floats:
-    """Return the gradient of a rotation vector from that of a small rotation after it (right Jacobian of SO(3))."""
+    """Return the gradient of a rotation vector from that of a subsequent small rotation (right Jacobian of SO(3))."""
     angle, x, y, z = math.hypot(*vector), *vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle > 1e-4:
@@ -167,8 +170,8 @@ def _rotation_vector_gradient(vector: Floats, grad_rotation: Floats) -> Floats:
 class CameraState(ModuleState):
     """The learned changes of the training views' poses and of their cameras' focal lengths.
 
-    A view with several sizes has one row.  One factor scales both focal lengths.  Views with the same lens, or pinhole
-    camera, in the dataset share a camera, which has the name of the first such view.
+    All sizes of a view share a row.  A single factor scales both focal lengths.  Views with the same lens or the same
+    pinhole camera in the dataset share a camera, which has the name of the first such view.
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
@@ -178,8 +181,8 @@ class CameraState(ModuleState):
         self.settings, self.views = settings, views
         names = tuple(dict.fromkeys(view.name for view in views))
         self.pose_tables = ViewTable(ROTATIONS, names, AXES), ViewTable(TRANSLATIONS, names, AXES)
-        first: dict[object, str] = {}
-        self.cameras = {view.name: first.setdefault(view.lens or view.camera, view.name) for view in originals}
+        names_by_lens: dict[object, str] = {}
+        self.cameras = {view.name: names_by_lens.setdefault(view.lens or view.camera, view.name) for view in originals}
         self.rates: tuple[Schedule, Schedule, Schedule] = 0.0, 0.0, 0.0
 
     def can_load(self, scalars: Scalars, tables: Any) -> bool:
@@ -219,29 +222,29 @@ class CameraState(ModuleState):
         self.zoom(name, float(sums[6]), focal)
 
     def zoom(self, view: str, grad_log: float, rate: float) -> None:
-        """Update the focal lengths of a view's camera by Adam.  grad_log: gradient of the logarithm of their factor."""
+        """Update the focal lengths of a view's camera with Adam.  grad_log: gradient of the logarithm of the factor."""
         if rate:
             key = self._key(view)
             adam_step(self.scalars, {key: self.scalars.get(key, 0.0)}, {key: grad_log}, rate)
 
     @property
     def zoomed_cameras(self) -> list[str]:
-        """The cameras whose focal lengths were learned."""
+        """The names of the cameras with learned focal lengths."""
         return [camera for camera in dict.fromkeys(self.cameras.values()) if self._key(camera) in self.scalars]
 
     def pose_change(self, view: str) -> PoseChange:
-        """Return the learned change of a view's pose."""
+        """Return the learned change of the pose of a view."""
         rotation, translation = (table.row(self.scalars, view) for table in self.pose_tables)
         return PoseChange(rotation, translation, self.scalars[f"{DEPTHS}/{view}"])
 
     def pose(self, view: int) -> Floats:
-        """Return the learned pose, [3, 4], of a training view."""
+        """Return the learned pose of a training view, [3, 4].  view: the index of the view."""
         change = self.pose_change(self.views[view].name)
         pose: Floats = np.asarray(self.views[view].world_to_camera, np.float64)
         return change.apply_to(pose) if change.rotation.any() or change.translation.any() else pose
 
     def factor(self, view: str) -> float:
-        """Return the factor on a view's focal lengths."""
+        """Return the learned factor on the focal lengths of a view."""
         return math.exp(self.scalars.get(self._key(view), 0.0))
 
     def _key(self, view: str) -> str:
@@ -250,24 +253,25 @@ class CameraState(ModuleState):
     def apply_to(self, scene: Scene) -> Scene:
         """Return a scene with the learned cameras.
 
-        Other views get the focal lengths of their camera, and move with the training views as a whole: their centers
-        are scaled about the mean center.  Their rotations do not change, since learned rotations have a mean of zero.
+        Other views get the focal lengths of their camera, and follow the common motion of the training views: their
+        centers are scaled about the mean center.  Their rotations do not change, since learned rotations have a zero
+        mean.
         """
         if not self.views:
             return scene
-        learned = {view.name: self.pose(number) for number, view in enumerate(self.views)}
-        before = np.array([view.position for view in self.views])
-        after = np.array([_center(learned[view.name]) for view in self.views])
-        center, new_center = before.mean(axis=0), after.mean(axis=0)
-        offsets = before - center
+        poses = {view.name: self.pose(index) for index, view in enumerate(self.views)}
+        centers = np.array([view.position for view in self.views])
+        new_centers = np.array([_center(poses[view.name]) for view in self.views])
+        mean, new_mean = centers.mean(axis=0), new_centers.mean(axis=0)
+        offsets = centers - mean
         spread = float((offsets**2).sum())
-        scale = float((offsets * (after - new_center)).sum()) / spread if spread > 0 else 1.0
+        scale = float((offsets * (new_centers - new_mean)).sum()) / spread if spread > 0 else 1.0
 
         def pose(view: View) -> Floats:
-            if view.name in learned:
-                return learned[view.name]
+            if view.name in poses:
+                return poses[view.name]
             rotation = view.world_to_camera[:, :3]
-            return np.column_stack([rotation, -rotation @ (new_center + scale * (view.position - center))])
+            return np.column_stack([rotation, -rotation @ (new_mean + scale * (view.position - mean))])
 
         views = (replace(view, camera=view.camera.zoomed(self.factor(view.name))) for view in scene.views)
         return replace_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
@@ -300,12 +304,12 @@ class CameraState(ModuleState):
         )
         if cameras:
             factors = [self.factor(camera) for camera in cameras]
-            scale = _range(min(factors), max(factors))
+            scale = _format_range(min(factors), max(factors))
             LOG.info("scaled focal lengths of %s by %s", pluralize(len(cameras), "camera"), scale)
 
 
 def require_zoom(scene: Scene) -> None:
-    """Raise DataError if the focal length of a view's lens cannot be optimized."""
+    """Raise DataError if a view has a lens whose focal length cannot be optimized."""
     for view in scene.views:
         if view.lens is not None and not can_zoom(view.lens):
             raise DataError(
@@ -315,7 +319,7 @@ def require_zoom(scene: Scene) -> None:
 
 
 def median_depth(view: View, scene: Scene) -> float:
-    """Return the median depth of the scene's points in a view's frustum, or the extent if there are too few points."""
+    """Return the median depth of the scene's points in a view, or the scene's extent if there are too few points."""
     depths = points_in_image(view, scene.points)
     return float(np.median(depths)) if len(depths) >= MIN_POINTS else float(scene.extent)
 
@@ -324,12 +328,12 @@ def _center(pose: Floats) -> Floats:
     return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
-def _range(low: float, high: float) -> str:
+def _format_range(low: float, high: float) -> str:
     return f"{low:.4f}" if low == high else f"{low:.4f} to {high:.4f}"
 
 
 def _with_pose(path: Path, view: View, row: Any, origin: NDArray[np.floating]) -> View:
-    """Return a view with the camera from its row of a side file, in world coordinates; unchanged without a row."""
+    """Return a view with the camera in its row of a side file, in world coordinates; unchanged if it has no row."""
     if row is None:
         return view
     try:

@@ -31,25 +31,25 @@ class CameraResponse(TrainingModule):
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
     center_y are its offset from the principal point.  f is a monotone spline for each channel (Ramsay 1988), f(0) = 0
     and f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3, and 4 are the logarithms of the slope at 0, 1/4, 3/4, and
-    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and curves of powers.  All
+    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and power curves.  All
     parameters start at 0, the identity.
 
     Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are evaluated with the
-    set of their camera, or the identity if it has no training photos.  The model and its renders do not change.
+    set of their camera, or with the identity if it has no training photos.  The model and its renders do not change.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
-    order: ClassVar[int] = 25  # before modules for colors, which clip white
-    device_planes: ClassVar[int] = 8  # the image after the response, and its gradient, four channels each
+    order: ClassVar[int] = 25  # before color modules, which clamp at white
+    device_planes: ClassVar[int] = 8  # the image after the response and its gradient, with four channels each
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "the responses of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["camera_response"] = "camera_response"
     rate: NonNegative = 1e-3
-    """Learning rate (Adam) of the parameters; may be scheduled. Trainings of a few hundred steps need 5e-3."""
+    """Learning rate (Adam) of the parameters; may be scheduled. Runs of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It makes the Gaussians learn
-    what all photos have in common."""
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves what all photos
+    have in common to the Gaussians."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
@@ -60,7 +60,7 @@ class CameraResponse(TrainingModule):
 
 
 class CameraResponseState(ModuleState):
-    """Parameters of each camera, keyed by the first view that uses it."""
+    """The parameters of each camera, keyed by the first view that uses it."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
@@ -104,13 +104,13 @@ def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
 
 
 def curve_slopes(row: Floats) -> Floats:
-    """Return the slopes of the three curves at their nodes, [3, 5], from a camera's parameters, [17]."""
+    """Compute the slopes of the three curves at their nodes, [3, 5], from a camera's parameters, [17]."""
     slopes = np.exp(np.insert(row[5:].reshape(3, 4), 2, 0, axis=1))
     return np.asarray(slopes / (slopes @ AREAS)[:, None])
 
 
 def row_gradient(row: Floats, sums: Floats) -> Floats:
-    """Return the gradient of a camera's parameters, [17], from sums over pixel rows, [20, rows]."""
+    """Compute the gradient of a camera's parameters, [17], from sums over pixel rows, [20, rows]."""
     totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], curve_slopes(row)
     grad_logs = slopes * totals[5:].reshape(3, 5)
     grad_logs -= slopes * AREAS * grad_logs.sum(axis=1, keepdims=True)
@@ -120,8 +120,8 @@ def row_gradient(row: Floats, sums: Floats) -> Floats:
 def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, grad: Array | None = None) -> Array:
     """Apply a camera's response to an image, [3 or 4, rows, stride].
 
-    grad: the gradient of the result; if given, return the gradient of the image, and leave the sums over pixel rows in
-    the workspace.
+    grad: the gradient of the result.  If it is not None, the gradient of the image is returned, and the sums over pixel
+    rows are left in the workspace.
     """
     result = workspace.array("grad_response" if grad else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2

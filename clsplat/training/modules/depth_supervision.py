@@ -12,7 +12,7 @@ from clsplat.training.run import Run
 
 
 class DepthSupervision(TrainingModule):
-    """The known depths for the loss `inverse_depth`, which implies this module."""
+    """A module that supplies known depths to the loss `inverse_depth`, which implies it."""
 
     implicit_type: ClassVar[str] = "depth_supervision"
     order: ClassVar[int] = -10
@@ -25,7 +25,7 @@ class DepthSupervision(TrainingModule):
         return cls(type=cls.implicit_type, losses=losses) if losses else None
 
     def check_run(self, run: Run) -> None:
-        """Raise DataError if the scene has no tracks, or a depth map is missing; ConfigError for two folders."""
+        """Raise DataError if the scene has no tracks or a depth map is missing, and ConfigError for two folders."""
         if len({loss.folder for loss in self.losses}) > 1:
             raise ConfigError("the loss 'inverse_depth' is listed with two folders; keep only one of them")
         if run.scene.tracks is None:
@@ -38,7 +38,7 @@ class DepthSupervision(TrainingModule):
 
     @property
     def _maps(self) -> DepthMaps | None:
-        """The depth maps; None to use points only."""
+        """The depth maps; None to use only points."""
         folder = self.losses[0].folder
         return DepthMaps(Path(folder)) if folder else None
 

@@ -1,4 +1,4 @@
-"""Model objects that only one photograph shows, such as people and cars, by Gaussians in front of its camera.
+"""Represent objects that only one photograph shows, such as people and cars, by Gaussians in front of its camera.
 
 These Gaussians are not rows of the model, so growth, metrics, and files ignore them.  Their unit of length is their
 initial depth, so that rates do not depend on the scene.
@@ -28,26 +28,26 @@ from clsplat.training.modules.base import ModuleState, Scalars, Tables, Training
 from clsplat.training.run import Run
 
 UPDATES = "updates"
-WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of trained tables
-NEAR = 0.2  # near plane, in initial depths
-SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to their spacing; initial opacity
+WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of the learned tables
+NEAR = 0.2  # depth of the near plane, in initial depths
+SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to the spacing of the Gaussians; initial opacity
 GOLDEN = (5**0.5 - 1) / 2
-# A short training visits each photograph only a few dozen times, so rates are larger than those of the scene (ours)
+# A short run visits each photograph only a few dozen times, so rates are larger than those of the scene (ours).
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
 
 
 class Distractors(TrainingModule):
     """Give each photograph its own Gaussians just in front of its camera (DeSplat, Wang et al. 2024).
 
-    They absorb what is not part of the scene, and appear in no other image, metric, or file.  Their number is fixed.  A
-    loss on the area that they cover fades out Gaussians that explain little.
+    They absorb objects that are not part of the scene, and are not in any other image, metric, or file.  Their number
+    is fixed.  A loss on the area that they cover fades out Gaussians that explain little.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     order: ClassVar[int] = 20  # before the modules for colors: these Gaussians have the colors of the scene
     masks_objects: ClassVar[bool] = True
-    device_planes: ClassVar[int] = 12  # to render and compare them, at most
+    device_planes: ClassVar[int] = 12  # upper bound, to render and compare them
 
     type: Literal["distractors"] = "distractors"
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
@@ -77,10 +77,10 @@ class Distractors(TrainingModule):
 
 
 class DistractorsState(ModuleState):
-    """The Gaussians of each photograph on the device, each set with its own Adam."""
+    """The Gaussians of each photograph on the device, with a separate Adam for each photograph."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        """views: training views; rasterizer: used only for these Gaussians, since frames share its buffers."""
+        """views: the training views; rasterizer: only for these Gaussians, since frames share its buffers."""
         super().__init__()
         self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
         self._names = list(dict.fromkeys(view.name for view in views))
@@ -90,8 +90,8 @@ class DistractorsState(ModuleState):
     def start(self, run: Run) -> None:
         views = run.scene.split("train")
         photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
-        counted = run.status.counted(photographs, "photographs", len(photographs))
-        self.load({}, initial_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in counted]))
+        progress = run.status.counted(photographs, "photographs", len(photographs))
+        self.load({}, initial_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in progress]))
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
         return len(tables[UPDATES]) == len(self._names)
@@ -131,14 +131,14 @@ class DistractorsState(ModuleState):
 
 
 def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
-    """Return the initial Gaussians of photographs: evenly spread, almost transparent, with the photographs' colors.
+    """Return the initial Gaussians of photographs, which are evenly spread and almost transparent.
 
-    photographs: views and pixels, [height, width, 3].
+    They have the colors of the photographs.  photographs: pairs of a view and its pixels, [height, width, 3].
     """
-    parts = [_spread_gaussians(count, view, pixels) for view, pixels in photographs]
-    values = {name: np.concatenate([part[name] for part in parts]).astype(np.float32) for name in WIDTHS}
+    sets = [_spread_gaussians(count, view, pixels) for view, pixels in photographs]
+    values = {name: np.concatenate([tables[name] for tables in sets]).astype(np.float32) for name in WIDTHS}
     moments = {moment: np.zeros_like(table) for name, table in values.items() for moment in moment_tables(name)}
-    return {**values, **moments, UPDATES: np.zeros((len(parts), 1), np.float32)}
+    return {**values, **moments, UPDATES: np.zeros((len(sets), 1), np.float32)}
 
 
 def _spread_gaussians(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
@@ -157,7 +157,7 @@ def _spread_gaussians(count: int, view: View, pixels: NDArray[np.uint8]) -> dict
 
 
 def _restore_adam(device: Device, tables: Tables, number: int) -> Adam:
-    """Return the Adam of one photograph's Gaussians, with their moments."""
+    """Return the Adam of one photograph's Gaussians, with their moments.  number: index of the photograph."""
     count = len(tables["means"]) // len(tables[UPDATES])
     rows = slice(number * count, (number + 1) * count)
     parameters = {name: tables[name][rows] for name in WIDTHS}

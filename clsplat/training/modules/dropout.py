@@ -12,8 +12,8 @@ from clsplat.training.run import Run
 class Dropout(TrainingModule):
     """Drop each Gaussian from a step with a given probability, to regularize scenes with few photographs.
 
-    The opacities of the others are divided by 1 - probability (DropGaussian, Park et al. 2025).  Renders and metrics
-    drop none.
+    The opacities of the other Gaussians are divided by 1 - probability (DropGaussian, Park et al. 2025).  Renders and
+    metrics use all Gaussians.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"probability"})

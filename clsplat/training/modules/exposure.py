@@ -38,10 +38,10 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 VIEW_COLORS = "view_colors.json"
-TABLE, KNOWN = "colors", "known exposures"  # scalars; KNOWN: whether parameters start from measured exposures
+TABLE, KNOWN = "colors", "known exposures"  # names of scalars; KNOWN: whether the initial exposures were known
 SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
-MIN_VISITS = 400  # per photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
+MIN_VISITS = 400  # visits per photograph; with fewer, Adam with a rate of 2e-3 cannot reach a gain of 1.5
 MAX_RATE = 5e-2
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
@@ -54,16 +54,16 @@ EXPLAINED = 1 / 3
 class ColorReport:
     """The learned colors of the photographs, for side files."""
 
-    matrices: dict[str, Floats]  # by photograph, [3, 4]; the mean for a grid
+    matrices: dict[str, Floats]  # by photograph, [3, 4]; for a grid, the mean of its matrices
     facts: dict[str, Any]  # for JSON, with `meaning` and `type`
     arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the name of their .npy file
 
 
 class Appearance(TrainingModule):
-    """Color parameters of each photograph, learned with the Gaussians; their mean over the photographs stays 0.
+    """Color parameters of each photograph, learned together with the Gaussians, with zero mean over the photographs.
 
-    Without this constraint, the colors of the model would drift, because the Gaussians can undo a change that all
-    photographs share, which no loss notices.
+    Without this constraint, the colors of the model would drift: the Gaussians can undo a change that all photographs
+    share, so that no loss detects it.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
@@ -96,7 +96,7 @@ class Appearance(TrainingModule):
     @property
     @abstractmethod
     def fit(self) -> "ColorModel":
-        """The color model that metrics fit to a photograph."""
+        """The color model that metrics fit to each photograph."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.when == "always" or self.chosen == "on"
@@ -111,12 +111,12 @@ class Appearance(TrainingModule):
         visits = steps / photographs
         initial, final = (1e-2, 1e-3) if visits < MIN_VISITS else (2e-3, 2e-5)
         if not is_warm_start:
-            needed = min(math.log(10) / (0.9 * visits), MAX_RATE)  # so that decaying rates sum to 1
-            initial, final = max(initial, needed), max(final, needed / 10)
+            min_rate = min(math.log(10) / (0.9 * visits), MAX_RATE)  # so that decaying rates sum to 1
+            initial, final = max(initial, min_rate), max(final, min_rate / 10)
         return Decay(initial=initial, final=final, over=steps)
 
     def resolve_auto(self, run: Run) -> "Appearance":
-        """Decide whether `when: auto` is on, unless decided before, and return the module with the decision."""
+        """Return the module with the choice of `when: auto`.  An earlier choice is kept."""
         if self.when == "always" or self.chosen is not None:
             return self
         exposures = estimate_exposures(run)
@@ -126,8 +126,8 @@ class Appearance(TrainingModule):
         bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of the variance"
         if not any(is_small):
             return self._choose("on", f"{exposures.text}; more than {bounds[0]} and {bounds[1]}")
-        missed = " or ".join(itertools.compress(bounds, is_small))
-        return self._choose("off", f"{exposures.text}; not more than {missed}")
+        small_bounds = " or ".join(itertools.compress(bounds, is_small))
+        return self._choose("off", f"{exposures.text}; not more than {small_bounds}")
 
     def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
         level = logging.INFO if chosen == "on" else logging.DEBUG  # "off" changes nothing
@@ -154,14 +154,14 @@ class ColorModel(Settings):
     """A color transform of a photograph: one matrix for all pixels, defined by a few parameters."""
 
     columns: ClassVar[tuple[str, ...]] = ()  # names of the parameters of a photograph
-    parameters_per_channel: ClassVar[int] = 1  # fitted by `fit_matrix`
+    parameters_per_channel: ClassVar[int] = 1  # number of parameters that `fit_matrix` fits in each channel
 
     type: str
     """Name of the model."""
 
     @abstractmethod
     def fit_matrix(self, image: Floats, photograph: Floats) -> Floats:
-        """Return the matrix, [3, 4], that fits an image to a photograph by least squares.  Both: pixels, [M, 3]."""
+        """Return the matrix, [3, 4], that fits an image to a photograph by least squares.  Both have shape [M, 3]."""
 
     @abstractmethod
     def matrix(self, row: Floats) -> Floats:
@@ -169,11 +169,11 @@ class ColorModel(Settings):
 
     @abstractmethod
     def gradient(self, row: Floats, grad_matrix: Floats) -> Floats:
-        """Return the gradient of the parameters, [columns], from that of the matrix, [3, 4]."""
+        """Return the gradient of the parameters, [columns].  grad_matrix: gradient of the matrix, [3, 4]."""
 
     @abstractmethod
     def from_gains(self, log_gains: Floats) -> Floats:
-        """Return the parameters, [columns], closest to the gains of red, green, and blue with these logarithms, [3]."""
+        """Return the parameters, [columns], that best match gains.  log_gains: of red, green, and blue, [3]."""
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
         """Return a regularization loss on the parameters, and its gradient."""
@@ -183,8 +183,8 @@ class ColorModel(Settings):
 class Gain(Gains, ColorModel):
     """Exposure and white balance of each photograph.
 
-    Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that only the
-    exposure changes the luminance.
+    Channels are multiplied by exp(exposure + (red, green, blue)).  Green is computed from red and blue, so that only
+    the exposure changes the luminance.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("exposure", "red", "blue")
@@ -209,8 +209,8 @@ class Gain(Gains, ColorModel):
 class Affine(ColorModel):
     """An affine color transform of each photograph with twelve parameters (Kerbl et al. 2024).
 
-    It follows white balance, contrast, and haze, but also absorbs view-dependent color that belongs to the Gaussians;
-    `weight` limits that.  `gain` generalizes better.
+    It can represent white balance, contrast, and haze, but also absorbs view-dependent color that belongs to the
+    Gaussians; `weight` limits this.  `gain` generalizes better.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
@@ -237,14 +237,14 @@ class Affine(ColorModel):
     def fit_matrix(self, image: Floats, photograph: Floats) -> Floats:
         if len(image) == 0:
             return IDENTITY
-        with_one = np.column_stack([image, np.ones(len(image))])
-        squares = np.einsum("mi,mj->ij", with_one, with_one)  # unlike @, sums do not depend on threads
-        products = np.einsum("mi,mj->ij", with_one, photograph)
+        design = np.column_stack([image, np.ones(len(image))])
+        squares = np.einsum("mi,mj->ij", design, design)  # unlike @, sums do not depend on threads
+        products = np.einsum("mi,mj->ij", design, photograph)
         return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
 
 
 class Exposure(Appearance):
-    """Fit the exposure of each photograph, if exposures differ: one color matrix for all its pixels."""
+    """Fit the exposure of each photograph: one color matrix for all its pixels."""
 
     type: Literal["exposure"] = "exposure"
     model: OneOf[ColorModel] = Gain()
@@ -259,12 +259,12 @@ class Exposure(Appearance):
 
 
 class ColorState(ModuleState):
-    """The learned colors of the photographs; base class of all kinds."""
+    """Base class of the learned colors of the photographs."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
-        """views: names of the training views by index; the sizes of a view share a row."""
+        """views: names of the training views by index.  All sizes of a view share a row."""
         super().__init__()
         self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
         self.rate: Schedule = 0.0
@@ -279,7 +279,7 @@ class ColorState(ModuleState):
         self.rate = self.settings.rate_schedule(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
-        """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, if known."""
+        """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, for views with known gains."""
 
     @property
     def color_model(self) -> ColorModel:
@@ -344,7 +344,7 @@ class ExposureState(ColorState):
         self.learn(step.view, saved[2][0](), step.number)
 
     def learn(self, view: int, grad_matrix: Floats, step: int) -> None:
-        """Update the parameters of a view.  grad_matrix: gradient of its matrix, [3, 4]."""
+        """Update the parameters of a view.  grad_matrix: gradient of the view's matrix, [3, 4]."""
         row = self.table.row(self.scalars, self.views[view])
         gradient = self.settings.model.gradient(row, grad_matrix) + self.settings.model.penalty(row)[1]
         self.table.update(self.scalars, self.views[view], gradient, at_step(self.rate, step))
@@ -367,7 +367,7 @@ class ExposureState(ColorState):
 
 
 def estimate_exposures(run: Run) -> Exposures:
-    """Estimate the exposures of the training photographs from tracks, or else from EXIF; cached in the run."""
+    """Estimate the exposures of the training photographs from tracks and EXIF.  The run caches the result."""
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
     key = TABLE, names
@@ -377,12 +377,12 @@ def estimate_exposures(run: Run) -> Exposures:
             photograph = run.photographs.get(view)
             return photograph.image(), photograph.counted_pixels()
 
-        counted = run.status.counted(views, "photographs", len(views))
-        measured = measure_exposures(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
-        is_complete = len(measured.log_gains) == len(set(names))
-        run.cache[key] = measured if is_complete else complete_exposures(measured, exif_exposures(views))
-    exposures: Exposures = run.cache[key]
-    return exposures
+        progress = run.status.counted(views, "photographs", len(views))
+        exposures = measure_exposures(run.scene.tracks, progress, read) if run.scene.tracks else UNKNOWN
+        is_complete = len(exposures.log_gains) == len(set(names))
+        run.cache[key] = exposures if is_complete else complete_exposures(exposures, exif_exposures(views))
+    result: Exposures = run.cache[key]
+    return result
 
 
 def transform_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
@@ -397,7 +397,7 @@ def transform_colors(workspace: Workspace, camera: DeviceCamera, image: Array, m
 def color_gradients(
     workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
 ) -> tuple[Array, Callable[[], Floats]]:
-    """Return the gradient of `image`, and a function that waits for that of the matrix and returns it, [3, 4].
+    """Return the gradient of `image`, and a function that waits for the gradient of the matrix, [3, 4], and returns it.
 
     gradient: gradient of the result of `transform_colors`.  Row sums are added in double precision, in order.
     """

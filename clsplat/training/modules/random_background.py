@@ -46,5 +46,5 @@ class RandomBackgroundState(ModuleState):
 
 
 def random_color(device: Device, seed: int, step: int) -> Array:
-    """Return the background color of a global step, [3] in [0, 1)."""
+    """Draw the background color of a global step, [3] in [0, 1)."""
     return device.upload(np.random.default_rng([seed, step]).random(3, np.float32))

@@ -32,7 +32,7 @@ class SkyModule(TrainingModule):
         return cls(type=SKY) if has_sky else None
 
     def create_state(self, run: Run) -> "LearnedSky":
-        """Return the sky that the init stage created, or an empty one into which a saved state is loaded."""
+        """Return the sky that the init stage created, or a black sky into which a saved state is loaded."""
         settings = run.model_settings.sky
         assert settings
         blank = Sky(np.zeros((settings.side**2, 3), np.float32))
@@ -51,12 +51,12 @@ class SkyModule(TrainingModule):
 
 
 class LearnedSky(ModuleState):
-    """The sky of a model, with Adam's moments, their bias correction per texel, and a mask of learned texels."""
+    """The sky of a model, with Adam moments, their bias corrections per texel, and a mask of the learned texels."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
 
     def __init__(self, settings: EnvironmentMap, sky: DeviceSky, free: NDArray[np.bool_] | None = None) -> None:
-        """Updates change `sky` in place.  free: mask of the texels that are learned, [side * side]; None for all."""
+        """sky: changed in place by updates; free: mask of the learned texels, [side * side], or None for all."""
         super().__init__()
         self.settings, self.sky = settings, sky
         zeros, texels = sky.texels.device.zeros, sky.side**2
@@ -98,6 +98,6 @@ class LearnedSky(ModuleState):
         step.save(self, step.rasterizer.skies.grad_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 
     def update(self, step: TrainingStep) -> None:
-        """Update the texels that the view shows by Adam."""
+        """Update the texels that the view shows with Adam."""
         rate = at_step(self.settings.rate, step.number)
         step.rasterizer.skies.update(self.sky, step.frame.camera, step.saved_value(self), self._arrays, rate)

@@ -1,4 +1,4 @@
-"""Decide from the photographs whether a model has a sky, and initialize it."""
+"""Decide from the photographs whether a model has a sky, and initialize the sky."""
 
 import logging
 from collections.abc import Sequence
@@ -23,22 +23,22 @@ LOG = logging.getLogger("clsplat")
 
 
 def sky_fraction(run: Run) -> float | None:
-    """Return the fraction of training and validation photographs that show a sky; None if it is unknown."""
+    """Return the fraction of training and validation photographs that show a sky; None if the fraction is unknown."""
     if _reason_unknown(run):
         return None
     background = run.model_settings.background
-    sky_count, count = _count(run, (background if isinstance(background, Auto) else Auto()).share)
+    sky_count, count = _count_skies(run, (background if isinstance(background, Auto) else Auto()).share)
     return sky_count / count
 
 
 def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
-    """Return model settings in which `background: auto` is resolved; no sky is chosen if a module excludes it.
+    """Return model settings in which `background: auto` is resolved, without a sky if a module conflicts with it.
 
-    Raises ConfigError if a module excludes a sky that the settings require.
+    Raises ConfigError if a module conflicts with a sky that the settings require.
     """
     background = settings.background
-    other = next((module for module in modules if SKY in module.conflicts and module.is_active(run.scene)), None)
-    conflict = other and f"'{other.type}' cannot be combined with sky: {other.conflicts[SKY]}"
+    module = next((module for module in modules if SKY in module.conflicts and module.is_active(run.scene)), None)
+    conflict = module and f"'{module.type}' cannot be combined with sky: {module.conflicts[SKY]}"
     if conflict and settings.sky:
         raise ConfigError(f"model.background: {conflict}; remove one of them")
     if not isinstance(background, Auto) or background.chosen is not None:
@@ -52,7 +52,7 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
 def start_sky(run: Run, source: Model | None) -> None:
     """Initialize the sky of the run's new model, if it has one, from `source` or from the photographs.
 
-    source: the model from which the new model was created.
+    source: the model from which the new model was created, or None.
     """
     initial, background = source and source.sky, choose_sky(run, run.model_settings, ()).sky
     if background is None:
@@ -72,7 +72,7 @@ def start_sky(run: Run, source: Model | None) -> None:
 
 
 def sky_reason(run: Run) -> str:
-    """Return why `auto` added a sky to a run; empty if it did not."""
+    """Return the reason for which `auto` added a sky to a run; empty if it did not add one."""
     background = run.model_settings.background
     if not isinstance(background, Auto) or background.sky is None:
         return ""
@@ -80,23 +80,23 @@ def sky_reason(run: Run) -> str:
 
 
 def _reason_unknown(run: Run) -> str:
-    """Return why the photographs cannot be searched for a sky; empty if they can."""
+    """Return the reason for which no sky can be detected in the photographs; empty if it can be detected."""
     if run.scene.points is None:
         return "the dataset has no points to tell distant regions from near ones"
     return "the photographs have transparency" if is_transparent(run.scene) else ""
 
 
-def _count(run: Run, share: float) -> tuple[int, int]:
+def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
     """Count the photographs with at least this fraction of sky in their upper third, and all photographs."""
     evidence = _evidence(run, run.scene.merge_validation())
-    return sum(photo.sky_fraction >= share for photo in evidence), len(evidence)
+    return sum(photo.sky_fraction >= min_fraction for photo in evidence), len(evidence)
 
 
 def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
-    """Decide whether there is a sky; return the decision and its reason."""
+    """Decide whether the model gets a sky, and return the decision and the reason for it."""
     if reason := _reason_unknown(run):
         return "off", reason
-    sky_count, count = _count(run, background.share)
+    sky_count, count = _count_skies(run, background.share)
     text = (
         f"{sky_count} of {count} photographs show bright or blue regions above the horizon, without points, in "
         f"{background.share:.0%} or more of their upper third"
@@ -106,9 +106,9 @@ def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
 
 
 def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the initial colors of the map, [side * side, 3], and the mask of learned texels, [side * side].
+    """Return the initial colors of the map, [side * side, 3], and the mask of the learned texels, [side * side].
 
-    If no photograph shows a sky, all texels are learned, from the mean color of the photographs' upper thirds.
+    If no photograph shows a sky, all texels are learned, starting from the mean color of the photographs' upper thirds.
     """
     evidence = _evidence(run, run.scene)
     if texels := panorama(evidence, side):
@@ -121,8 +121,8 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def _evidence(run: Run, scene: Scene) -> list[SkyEvidence]:
-    """Search each training photograph of a scene, at its first size, for sky."""
+    """Detect the sky in each training photograph of a scene, at the first of its sizes."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
-    counted = run.status.counted(views, "photographs", len(views))
-    photographs = ((view, run.photographs.get(view)) for view in counted)
+    progress = run.status.counted(views, "photographs", len(views))
+    photographs = ((view, run.photographs.get(view)) for view in progress)
     return list(detect_sky(scene, ((view, photo.image(), photo.counted_pixels()) for view, photo in photographs)))

@@ -1,6 +1,6 @@
 """Mask transient objects, such as people and cars, by the residuals of their pixels.
 
-After SpotLessSplats (Sabour et al. 2024), without its network, and RobustSplat (Fu et al. 2025).
+The method follows SpotLessSplats (Sabour et al. 2024), without its network, and RobustSplat (Fu et al. 2025).
 """
 
 from collections.abc import Callable, Mapping
@@ -24,12 +24,13 @@ TAIL = 0.99  # quantile by which outliers are detected
 
 
 class Transients(TrainingModule):
-    """Mask the pixels of a photograph whose residuals are far larger than most.
+    """Mask the pixels of a photograph that have far larger residuals than most pixels.
 
-    A residual is a pixel's absolute difference, averaged over channels.  A running histogram holds the residuals of all
-    views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
-    `quantile` are masked if most of the box around them is above it too, because details that the model has not learned
-    yet are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are ours.
+    A residual is a pixel's absolute difference, averaged over channels.  A running histogram counts the residuals of
+    all views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
+    `quantile` are masked if most of the box around them is above it too.  The box excludes details that the model has
+    not learned yet, which are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are
+    ours.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset(
@@ -55,7 +56,7 @@ class Transients(TrainingModule):
     """Decay of the histogram, per step."""
 
     def threshold(self, scalars: Mapping[str, float], step: int) -> float | None:
-        """Return the residual above which pixels of a global step are masked; None to mask none."""
+        """Return the residual above which pixels of a global step are masked; None if no pixels are masked."""
         counts = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
         if step <= self.start or counts[-1] == 0:
             return None
@@ -66,13 +67,13 @@ class Transients(TrainingModule):
         return TransientsState(self)
 
     def learn(self, scalars: Scalars, counts: NDArray[np.uint32]) -> None:
-        """Add the residual counts of a step, [BINS], to the histogram."""
+        """Decay the histogram, and add the residual counts of a step, [BINS]."""
         for key, count in zip(KEYS, counts, strict=True):
             scalars[key] = self.decay * scalars.get(key, 0.0) + float(count)
 
 
 def _bin_end(index: int) -> float:
-    """Return the smallest residual above a bin; bins are the upper bits of a float32."""
+    """Return the smallest residual above a bin.  The index of a bin is the upper bits of a float32, minus FIRST_BIN."""
     return float(np.array(FIRST_BIN + index + 1 << BIN_SHIFT, np.int32).view(np.float32))
 
 
@@ -98,33 +99,32 @@ class TransientsState(ModuleState):
 def measure_residuals(
     workspace: Workspace, camera: DeviceCamera, image: Array, photograph: Array, mask: Array | None
 ) -> tuple[Array, Callable[[], NDArray[np.uint32]]]:
-    """Return the residuals, [1, rows, stride], of planes [3, rows, stride], and a function that waits for their counts
-    by bin, [BINS].
+    """Return the residuals, [1, rows, stride], and a function that waits for their counts, [BINS], and returns them.
 
-    mask: [1, rows, stride], 1 in pixels that count; None if all count.
+    image, photograph: planes, [3, rows, stride]; mask: [1, rows, stride], 1 in pixels that count; None if all count.
     """
     residuals = workspace.array("residuals", (1, camera.rows, camera.stride))
-    numbers = workspace.array("residual numbers", BINS, np.uint32)
-    numbers.fill(0)
+    counts = workspace.array("residual numbers", BINS, np.uint32)
+    counts.fill(0)
     workspace.device.program("transients.cl").measure_residuals(
         groups=(1, camera.rows),
         image=image,
         photograph=photograph,
         mask=mask or residuals,
         residuals=residuals,
-        numbers=numbers,
+        numbers=counts,
         masked=int(mask is not None),
         **camera.plane_arguments(),
     )
-    return residuals, numbers.get_later()
+    return residuals, counts.get_later()
 
 
 def mask_transients(
     workspace: Workspace, camera: DeviceCamera, residuals: Array, threshold: float, reach: int
 ) -> Array:
-    """Return a mask, [1, rows, stride], that is 0 for transients, from residuals, [1, rows, stride].
+    """Return a mask, [1, rows, stride], that is 0 for transient objects.
 
-    reach: half the side of a pixel's box, px.
+    residuals: [1, rows, stride]; reach: half the side of a pixel's box, px.
     """
     mask = workspace.array("counted pixels", (1, camera.rows, camera.stride))
     workspace.device.program("transients.cl").mask_transients(
