@@ -1,7 +1,7 @@
 /* Density control: sum statistics of each Gaussian, mark rows by rules, and write the new rows.
  *
  * Kerbl et al. 2023, section 5.  A rule is a box in (statistic, size, opacity) with an outcome of three numbers: the
- * rows that a Gaussian becomes (`copies`), how many of them are its old row (`kept`), and the factor on the scales
+ * rows that a Gaussian becomes (`copies`), how many of them are its old row (`old_rows`), and the factor on the scales
  * of its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  If `shared` is
  * set, the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local memory.
  * Deterministic. */
@@ -122,17 +122,17 @@ void accumulate_radius(
 /* Start an edit: every Gaussian keeps its row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void start_edit(
-    __global uint *restrict copies,   // [N]
-    __global uint *restrict kept,     // [N]
-    __global float *restrict shrink,  // [N]
-    __global uint *restrict shared,   // [N] 0 or 1
+    __global uint *restrict copies,    // [N]
+    __global uint *restrict old_rows,  // [N]
+    __global float *restrict shrink,   // [N]
+    __global uint *restrict shared,    // [N] 0 or 1
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i >= count)
         return;
     copies[i] = 1;
-    kept[i] = 1;
+    old_rows[i] = 1;
     shrink[i] = 1.0f;
     shared[i] = 0;
 }
@@ -146,7 +146,7 @@ void mark_rule(
     __global const float *restrict statistic,      // [S] sum over views
     __global const float *restrict divisor,        // [S] of the mean: views, or another sum
     __global uint *restrict copies,                // [N]
-    __global uint *restrict kept,                  // [N]
+    __global uint *restrict old_rows,              // [N]
     __global float *restrict shrink,               // [N]
     __global uint *restrict shared,                // [N] 0 or 1
     const float gradient_above,                    // mean of the statistic, at least
@@ -155,7 +155,7 @@ void mark_rule(
     const float opacity_below,                     // less than
     const float new_shrink,
     const uint new_copies,
-    const uint new_kept,
+    const uint new_old_rows,
     const uint new_shared,
     const uint stride,
     const uint count)
@@ -168,7 +168,7 @@ void mark_rule(
     const float gradient = divisor[i] > 0.0f ? statistic[i] / divisor[i] : 0.0f;
     if (gradient >= gradient_above && size > size_above && size <= size_below && opacity < opacity_below) {
         copies[i] = new_copies;
-        kept[i] = new_kept;
+        old_rows[i] = new_old_rows;
         shared[i] = new_shared;
         shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
     }
@@ -179,17 +179,17 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mark_chosen(
     __global const uint *restrict outcome,  // [N] new copies + 1; 0: not chosen
     __global uint *restrict copies,         // [N]
-    __global uint *restrict kept,           // [N]
+    __global uint *restrict old_rows,       // [N]
     __global float *restrict shrink,        // [N]
     const float new_shrink,
-    const uint new_kept,
+    const uint new_old_rows,
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i >= count || outcome[i] == 0 || !(outcome[i] == 1 || copies[i] == 1))
         return;
     copies[i] = outcome[i] - 1;
-    kept[i] = new_kept < copies[i] ? new_kept : copies[i];
+    old_rows[i] = new_old_rows < copies[i] ? new_old_rows : copies[i];
     shrink[i] = copies[i] == 0 ? shrink[i] : new_shrink;
 }
 
@@ -197,7 +197,7 @@ void mark_chosen(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void list_rows(
     __global const uint *restrict copies,      // [N]
-    __global const uint *restrict kept,        // [N]
+    __global const uint *restrict old_rows,    // [N]
     __global const uint *restrict row_offset,  // [N+1] scanned copies
     __global uint *restrict source,            // [M]
     __global uint *restrict fresh,             // [M] 0 or 1
@@ -208,26 +208,26 @@ void list_rows(
         return;
     for (uint copy = 0; copy < copies[i]; copy++) {
         source[row_offset[i] + copy] = i;
-        fresh[row_offset[i] + copy] = copy >= kept[i] ? 1 : 0;
+        fresh[row_offset[i] + copy] = copy >= old_rows[i] ? 1 : 0;
     }
 }
 
 /* Move and shrink the children of split Gaussians: mean + R (s * normal), s * shrink. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void spawn_children(
-    __global const uint *restrict source,   // [M] row before the edit
-    __global const uint *restrict kept,     // [N] before the edit; 0 = split
-    __global const float *restrict shrink,  // [N] before the edit
-    __global const float *restrict quats,   // [4,S] unnormalized
-    __global float *restrict means,         // [3,S] scene units
-    __global float *restrict log_scales,    // [3,S] log of scene units
+    __global const uint *restrict source,    // [M] row before the edit
+    __global const uint *restrict old_rows,  // [N] before the edit; 0 = split
+    __global const float *restrict shrink,   // [N] before the edit
+    __global const float *restrict quats,    // [4,S] unnormalized
+    __global float *restrict means,          // [3,S] scene units
+    __global float *restrict log_scales,     // [3,S] log of scene units
     const uint seed,
     const uint step,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
-    if (i >= count || kept[source[i]] > 0)
+    if (i >= count || old_rows[source[i]] > 0)
         return;
     const float3 normal = normal3((uint4)(i, step, 0, 0), (uint2)(seed, 0));
     const float ex = exp(log_scales[i]) * normal.x;

@@ -1,4 +1,4 @@
-"""Density control: statistics of Gaussians, edits, budgets, and scores that rules share."""
+"""Density control: statistics of Gaussians, edits, budgets, and the scores that several rules share."""
 
 from clsplat.core.settings import import_modules
 

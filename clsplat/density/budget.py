@@ -1,4 +1,4 @@
-"""Limit the number of Gaussians after an edit by the progress of training."""
+"""Define budgets, which limit the number of Gaussians according to the progress of training."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from clsplat.density.edit import Edit
 class BudgetContext:
     """The progress of training at an edit."""
 
-    progress: float  # fraction of the steps until the last edit that are done, 0 to 1
-    edits: int  # that remain, including this one
+    progress: float  # fraction of the steps up to the last edit that have been run, 0 to 1
+    edits: int  # remaining edits, including this one
     divisor: float  # downscale factor of the photographs
 
 
 class Budget(Settings):
-    """A limit on the number of Gaussians, at which growth stops in an edit."""
+    """Base class of limits on the number of Gaussians; an edit stops growth at the limit."""
 
     @property
     def statistics(self) -> set[str]:
@@ -26,4 +26,7 @@ class Budget(Settings):
 
     @abstractmethod
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
-        """Return the limit.  numbers: by name, kept between edits and in checkpoints."""
+        """Return the largest number of Gaussians after the edit.
+
+        numbers: values by name that the budget may change; they persist between edits and in checkpoints.
+        """

@@ -17,9 +17,9 @@ from clsplat.render.tiles import Tiler
 
 
 def apply_edit(edit: Edit, tiler: Tiler) -> None:
-    """Rearrange all tables and move the children of split Gaussians to their positions.
+    """Rearrange all tables, and sample positions for the children of split Gaussians.
 
-    Raises MemoryLimitError if there are more rows than an index can hold; then all tables are unchanged.
+    Raises MemoryLimitError, before any change, if there would be more than MAX_ROWS rows.
     """
     gaussians, device, count = edit.gaussians, edit.gaussians.device, edit.gaussians.count
     program = device.program("density.cl")
@@ -34,7 +34,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     program.list_rows(
         items=count,
         copies=edit.copies,
-        kept=edit.old_rows,
+        old_rows=edit.old_rows,
         row_offset=row_offset,
         source=source,
         fresh=fresh,
@@ -44,7 +44,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     program.spawn_children(
         items=rows,
         source=source,
-        kept=edit.old_rows,
+        old_rows=edit.old_rows,
         shrink=edit.shrink,
         quats=gaussians["quats"],
         means=gaussians["means"],
@@ -67,11 +67,11 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
 
 
 def _set_children(edit: Edit, row_offset: Array) -> None:
-    """Write the values that rules set for children, unless a later rule or limit changed the number of children."""
-    copies, first = edit.rows(), row_offset.get()
+    """Write the values that rules set for children, except where their number was changed by a later rule or limit."""
+    copies, first_rows = edit.rows(), row_offset.get()
     for name, sources, values in edit.children:
         is_complete = copies[sources] == values.shape[1]
-        rows = first[sources[is_complete], None] + np.arange(values.shape[1])
+        rows = first_rows[sources[is_complete], None] + np.arange(values.shape[1])
         edit.gaussians.set_rows(name, rows.ravel(), values[is_complete].reshape(-1, values.shape[2]))
 
 
@@ -104,7 +104,7 @@ class Box(Settings):
         return self.model_copy(update={"low": low, "high": high})
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return whether each point, [N, 3] scene units, is inside, [N]; points with NaN are not."""
+        """Return the mask, [N], of the points, [N, 3] in scene units, inside the box; points with NaN are outside."""
         is_inside = ~np.isnan(points).any(axis=1)
         for axis, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             values = points[:, axis].astype(np.float64)
@@ -118,8 +118,8 @@ class Change:
 
     before: int
     after: int
-    causes: dict[str, int]  # Gaussians whose outcome a rule decided, by the rule's name
-    grown: dict[str, int]  # likewise, only Gaussians that became several
+    causes: dict[str, int]  # number of Gaussians with an outcome set by a rule, by the rule's name
+    grown: dict[str, int]  # as causes, but only Gaussians that became several
 
 
 def densify(
@@ -130,9 +130,10 @@ def densify(
     inside: Box | None = None,
     make_room: Callable[[int], None] = lambda count: None,
 ) -> Change:
-    """Apply the rules in order, as one rearrangement of all tables, and set the statistics to zero.
+    """Apply the rules, in order, as one rearrangement of all tables; then set the statistics to zero.
 
-    limit, inside: as for `mark`.  make_room: called with the new number of Gaussians before the tables grow.
+    limit, inside: as for `mark`.  make_room: a function that is called with the new number of Gaussians before the
+    tables grow.
     """
     change = mark(edit, rules, limit, inside)
     make_room(change.after)
@@ -142,37 +143,37 @@ def densify(
 
 
 def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Box | None = None) -> Change:
-    """Let the rules mark an edit, in order; return the change that it will make.
+    """Let the rules mark an edit, in order, and return the change that it will make.
 
-    inside: the region in which Gaussians grow.  Growth stops at `limit` Gaussians; those with the largest mean of the
-    first statistic grow first.  `edit.room` gives rules the number of Gaussians that they may add.
+    limit: the number of Gaussians at which growth stops; Gaussians with the largest mean of the first statistic grow
+    first.  inside: the region in which Gaussians may grow; None for everywhere.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
-    before = gaussians.count
-    active = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
-    decided_by = np.full(before, -1)
-    for edit.rule, rule in active:
+    old_count = gaussians.count
+    active_rules = [(index, rule) for index, rule in enumerate(rules) if edit.step > rule.start]
+    rule_index = np.full(old_count, -1)
+    for edit.rule, rule in active_rules:
         rows = edit.rows()
         rule.mark(edit)
-        decided_by[edit.rows() != rows] = edit.rule
+        rule_index[edit.rows() != rows] = edit.rule
     if inside is not None:
         edit.undo_growth(~inside.contains(gaussians.get("means")))
     if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
         edit.limit(limit)
     rows = edit.rows()
-    decided_by[rows == 1] = -1
+    rule_index[rows == 1] = -1
     causes: dict[str, int] = {}
     grown: dict[str, int] = {}
-    for number, rule in active:
+    for index, rule in active_rules:
         name = getattr(rule, "type", "rule")
-        causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
-        grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
-    return Change(before, int(rows.sum(dtype=np.int64)), causes, grown)
+        causes[name] = causes.get(name, 0) + int((rule_index == index).sum())
+        grown[name] = grown.get(name, 0) + int(((rule_index == index) & (rows > 1)).sum())
+    return Change(old_count, int(rows.sum(dtype=np.int64)), causes, grown)
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Lower opacities after the 3D filter to at most `limit` (the opacity reset)."""
+    """Lower opacities so that they are at most `limit` after the 3D filter (the opacity reset)."""
     gaussians.device.program("density.cl").cap_opacity(
         items=gaussians.count,
         log_scales=gaussians["log_scales"],
@@ -185,8 +186,8 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
 
 
 def keep_rows(gaussians: Gaussians, rows: NDArray[np.int64], cause: str) -> Change:
-    """Remove all Gaussians except `rows`, [n], ascending.  cause: the name in `Change.causes`."""
-    before = gaussians.count
+    """Remove all Gaussians except `rows`, [n], in ascending order.  cause: the key in `Change.causes`."""
+    old_count = gaussians.count
     source = gaussians.device.upload(rows.astype(np.uint32))
     gaussians.rearrange(source, gaussians.device.zeros(len(rows), np.uint32), len(rows))
-    return Change(before, len(rows), {cause: before - len(rows)}, {})
+    return Change(old_count, len(rows), {cause: old_count - len(rows)}, {})

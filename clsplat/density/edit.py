@@ -1,9 +1,9 @@
 """Represent an edit of the Gaussians, and define the base class of density rules (Kerbl et al. 2023, section 5).
 
-A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a range of a statistic, size,
-and opacity, and one kernel applies them; others choose Gaussians on the host.  A size is the largest standard deviation
-relative to the scene's extent.  The first growing rule that matches a Gaussian decides.  Pruning rules override growth,
-and compare the size of the children after a split.
+A rule sets the outcome of Gaussians: the number of rows that each becomes.  Most rules match a range of a statistic,
+size, and opacity, and one kernel applies them; others select Gaussians on the host.  A size is the largest standard
+deviation relative to the scene's extent.  The first growing rule that matches a Gaussian sets its outcome.  Pruning
+rules override growth, and compare the size of the children after a split.
 """
 
 import math
@@ -28,38 +28,39 @@ MAX_ROWS = 2**32 - 2  # cl_kernels/scan.cl saturates at 2**32 - 1, which marks a
 
 
 def require_rows(copies: int, old_rows: int) -> None:
-    """Raise ValueError for numbers of rows that are negative or too large."""
-    for name, number in (("copies", copies), ("old_rows", old_rows)):
-        if not 0 <= number <= MAX_ROWS:
-            bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
-            raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
+    """Raise ValueError if a number of rows is below 0 or above MAX_ROWS."""
+    for name, rows in (("copies", copies), ("old_rows", old_rows)):
+        if not 0 <= rows <= MAX_ROWS:
+            bound = "0 or more" if rows < 0 else f"at most {MAX_ROWS}"
+            raise ValueError(f"{name}: expected a number of rows, {bound}, got {rows}")
 
 
 def encode_outcomes(
     chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, count: int
 ) -> NDArray[np.uint32]:
-    """Return copies + 1 for the chosen Gaussians, 0 for the others, [N].  Raises ValueError like `Edit.choose`."""
-    numbers = np.asarray(copies)
+    """Return copies + 1 for the Gaussians of the mask `chosen`, and 0 for the others, [N].
+
+    count: the number of Gaussians, N.  Raises ValueError like `Edit.choose`.
+    """
+    copies = np.asarray(copies)
     if chosen.dtype != np.bool_ or chosen.shape != (count,):
         raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
-    if not np.issubdtype(numbers.dtype, np.integer) or numbers.shape not in ((), (count,)):
-        raise ValueError(
-            f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
-        )
-    require_rows(int(numbers.min(initial=0)), old_rows)
-    require_rows(int(numbers.max(initial=0)), old_rows)
-    return np.where(chosen, numbers.astype(np.int64) + 1, 0).astype(np.uint32)
+    if not np.issubdtype(copies.dtype, np.integer) or copies.shape not in ((), (count,)):
+        raise ValueError(f"copies: expected an integer or integers [{count}], got {copies.dtype} {list(copies.shape)}")
+    require_rows(int(copies.min(initial=0)), old_rows)
+    require_rows(int(copies.max(initial=0)), old_rows)
+    return np.where(chosen, copies.astype(np.int64) + 1, 0).astype(np.uint32)
 
 
-MAX_BOUND = 3.0e38  # a bound above all values
-MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that every value except zero reaches
+MAX_BOUND = 3.0e38  # an upper bound of all values
+MIN_BOUND = 1.2e-38  # the smallest normal float, a lower bound of all positive values
 
 
 class Edit:
-    """The outcome of each Gaussian.
+    """An edit of the Gaussians: the outcome of each.
 
-    This is the number of rows that it becomes, how many of them are the old row, the factor on the scales of fresh
-    rows, and whether they share its opacity.
+    An outcome consists of the number of rows that the Gaussian becomes, how many of them are its old row, the factor on
+    the scales of fresh rows, and whether the rows share its opacity.
 
     Random numbers depend only on `seed`, `step`, and the rule.
     """
@@ -81,18 +82,18 @@ class Edit:
         self.shrink = device.empty(count)
         self.shared = device.empty(count, np.uint32)
         self.rule = 0  # index of the rule that is marking
-        self.max_rows: int | None = None  # rows at which growth stops; None: no limit
+        self.max_rows: int | None = None  # number of rows at which growth stops; None: no limit
         self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # arguments of set_children
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, **self._outcome, count=count)
 
     @property
     def _outcome(self) -> dict[str, Any]:
-        return {"copies": self.copies, "kept": self.old_rows, "shrink": self.shrink, "shared": self.shared}
+        return {"copies": self.copies, "old_rows": self.old_rows, "shrink": self.shrink, "shared": self.shared}
 
     @property
     def survey(self) -> Survey:
-        """The training views, rendered with the Gaussians before the edit.  Raises ConfigError if there are none."""
+        """The survey of the training views, with the Gaussians before the edit.  Raises ConfigError without views."""
         if self._survey is None:
             raise ConfigError("a rule needs training photographs, and there are none; remove the rule")
         return self._survey
@@ -117,10 +118,10 @@ class Edit:
         opacity_below: float = math.inf,
         shared: bool = False,
     ) -> None:
-        """Give an outcome to every Gaussian within the bounds; sizes are relative to the extent.
+        """Set the outcome of every Gaussian within the bounds; sizes are relative to the extent.
 
-        copies, old_rows, shrink: as for `choose`.  shared: the rows together are as opaque as the old Gaussian.  Raises
-        ValueError for numbers of rows that are negative or too large.
+        copies, old_rows, shrink: as for `choose`.  shared: whether the rows together are as opaque as the old Gaussian.
+        Raises ValueError for a number of rows below 0 or above MAX_ROWS.
         """
         require_rows(copies, old_rows)
         gaussians = self.gaussians
@@ -137,21 +138,21 @@ class Edit:
             opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
-            new_kept=old_rows,
+            new_old_rows=old_rows,
             new_shared=int(shared),
             stride=gaussians.capacity,
             count=gaussians.count,
         )
 
     def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return a threshold on `statistic` that the same number of Gaussians reach as `gradient_above` in `other`."""
+        """Return the threshold on `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
         return max(float(np.quantile(self.stats.mean(statistic), 1 - fraction)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
-        """Return a threshold on a statistic as a number, at the step of the edit."""
+        """Return the value of a threshold on a statistic, at the step of the edit."""
         if isinstance(threshold, PixelQuantile):
             return self.scene_scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
@@ -162,33 +163,33 @@ class Edit:
     def choose(
         self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, shrink: float = 1.0
     ) -> None:
-        """Give an outcome to the Gaussians of a mask, [N].
+        """Set the outcome of the Gaussians of a mask, `chosen`, [N].
 
-        copies: number of rows that each becomes, one number or [N].  old_rows: how many of them are the old row, with
-        its moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
-        Raises ValueError for a wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
+        copies: number of rows that each becomes, a scalar or [N].  old_rows: how many of them are the old row, with its
+        moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
+        Raises ValueError for a wrong shape or type, and for a number of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count
         self._program.mark_chosen(
             items=count,
             outcome=self.gaussians.device.upload(encode_outcomes(chosen, copies, old_rows, count)),
             copies=self.copies,
-            kept=self.old_rows,
+            old_rows=self.old_rows,
             shrink=self.shrink,
             new_shrink=shrink,
-            new_kept=old_rows,
+            new_old_rows=old_rows,
             count=count,
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows copy them."""
+        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows become copies of them."""
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values, [n, copies, components], of a table into the rows that distinct Gaussians, [n], become.
+        """Set values of a table, [n, copies, components], for the rows that distinct Gaussians, [n], become.
 
-        Gaussians that finally become a different number of rows, because growth was undone, are not changed.  Raises
-        ValueError for invalid rows (`check_rows`) and for values of a wrong shape.
+        They have no effect on Gaussians that become another number of rows in the end, because their growth was undone.
+        Raises ValueError for invalid rows (see `check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components
         if values.ndim != 3 or len(values) != len(rows) or values.shape[2] != components:
@@ -196,9 +197,9 @@ class Edit:
         self.children.append((name, check_rows(rows, self.gaussians.count), values))
 
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] | None = None) -> None:
-        """Set Adam's moments of distinct rows, [n], to zero, for some parameters or all trained ones."""
-        trained = self.gaussians.trained if parameters is None else parameters
-        names = [table for parameter in trained for table in moment_tables(parameter)]
+        """Set Adam's moments of distinct rows, [n], to zero.  parameters: their names; None for all trained ones."""
+        parameter_names = self.gaussians.trained if parameters is None else parameters
+        names = [table for parameter in parameter_names for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:
@@ -207,26 +208,29 @@ class Edit:
 
     @property
     def room(self) -> int | None:
-        """The number of rows that rules may still add; negative if there are too many; None if there is no limit."""
+        """The number of rows that rules may still add, negative above the limit; None if there is no limit."""
         return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
     def undo_growth(self, mask: NDArray[np.bool_]) -> None:
-        """Undo the growth of the Gaussians in a mask, [N], which then remain unchanged."""
+        """Undo the growth of the Gaussians of a mask, [N]; the edit then leaves them unchanged."""
         mask = mask & (self.rows() > 1)
         for array, unchanged in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
             array.set(np.where(mask, unchanged, array.get()))
 
     def limit(self, limit: int) -> None:
-        """Undo growth until at most `limit` rows remain, first for the smallest means of the first scalar statistic."""
+        """Undo growth until at most `limit` rows remain.
+
+        Gaussians with the smallest means of the first scalar statistic are undone first.
+        """
         rows = self.rows().astype(np.int64)
         growing = np.flatnonzero(rows > 1)
         scalars = [name for name, column in self.stats.columns.items() if column.components == 1]
         score = self.stats.mean(scalars[0]) if scalars else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
-        mask = np.zeros(len(rows), bool)
-        mask[order[total > limit]] = True
-        self.undo_growth(mask)
+        undo_mask = np.zeros(len(rows), bool)
+        undo_mask[order[total > limit]] = True
+        self.undo_growth(undo_mask)
 
 
 class Rule(Settings):
@@ -234,7 +238,7 @@ class Rule(Settings):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    grows: ClassVar[bool] = True  # whether it may add Gaussians
+    grows: ClassVar[bool] = True  # whether the rule may add Gaussians
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""
@@ -246,22 +250,22 @@ class Rule(Settings):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that the rule reads in addition to the parameters."""
+        """Names of the tables that the rule reads in addition to the parameters."""
         return set()
 
     @property
     def columns(self) -> list[type[Statistic]]:
-        """The classes of the rule's statistics, and of the statistics that divide them."""
+        """The classes of the rule's statistics and of their divisors."""
         classes = variants(Statistic)
-        read = [classes[name] for name in self.statistics if name in classes]
-        return [*read, *(classes[kind.divisor] for kind in read if kind.divisor in classes)]
+        statistic_classes = [classes[name] for name in self.statistics if name in classes]
+        return [*statistic_classes, *(classes[cls.divisor] for cls in statistic_classes if cls.divisor in classes)]
 
     def active_conflicts(self) -> Mapping[str, str]:
         conflicts = dict(self.conflicts)
-        for kind in self.columns:
-            conflicts |= kind.conflicts
+        for column in self.columns:
+            conflicts |= column.conflicts
         return conflicts
 
     @abstractmethod
     def mark(self, edit: Edit) -> None:
-        """Give outcomes with `edit.mark` or `edit.choose`; change rows of tables with `edit.set_rows`."""
+        """Set outcomes with `edit.mark` or `edit.choose`, and change rows of tables with `edit.set_rows`."""

@@ -1,4 +1,4 @@
-"""Score how much Gaussians contribute to images; choose the highest scores, or sample by score."""
+"""Score how much Gaussians contribute to images, and select the highest scores or sample by score."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -22,8 +22,8 @@ Scoring = Callable[[Iterable[RenderedView], int], NDArray[np.float32]]
 class Weights:
     """The weight of each Gaussian in some views."""
 
-    total: NDArray[Any]  # [N] blend weight, alpha T, summed over all pixels; 0 if no view sees it
-    views: NDArray[np.int64]  # [N] number of views in which it is useful; 0 if not counted
+    total: NDArray[Any]  # [N] blend weight, alpha T, summed over all pixels and views
+    views: NDArray[np.int64]  # [N] number of views in which the Gaussian is useful; 0 if they were not counted
 
 
 def weights(
@@ -31,8 +31,8 @@ def weights(
 ) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
-    weight_per_view: fraction of a view's weight that its useful Gaussians, the heaviest ones, add up to; None skips the
-    count of views.  dtype: type of the total.
+    weight_per_view: fraction of a view's total weight that its heaviest Gaussians contribute; these are useful in the
+    view.  None: do not count views.  dtype: type of the total.
     """
     total, useful_views = np.zeros(count, dtype), np.zeros(count, np.int64)
     for view in views:
@@ -44,12 +44,12 @@ def weights(
 
 
 def heaviest(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
-    """Return the mask, [N], of the smallest set of Gaussians with this fraction of the weight; none have weight 0."""
+    """Return the mask, [N], of the smallest set of Gaussians with `fraction` of the total weight, all above 0."""
     order = np.argsort(-weight, kind="stable")
-    heavier = np.cumsum(weight[order]) - weight[order]  # the sum of the weights before each
-    chosen = np.zeros(len(weight), bool)
-    chosen[order] = (heavier < fraction * weight.sum()) & (weight[order] > 0)
-    return chosen
+    heavier_sum = np.cumsum(weight[order]) - weight[order]  # the sum of all larger weights
+    mask = np.zeros(len(weight), bool)
+    mask[order] = (heavier_sum < fraction * weight.sum()) & (weight[order] > 0)
+    return mask
 
 
 def contributions(views: Iterable[RenderedView], count: int) -> NDArray[np.float32]:
@@ -76,9 +76,10 @@ Mask = NDArray[np.bool_]
 
 
 def sampling_order(candidates: Mask, odds: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
-    """Return indices of the candidates, [N], in the order of weighted sampling without replacement.
+    """Return the indices of the candidates in the order of weighted sampling without replacement.
 
-    odds: [N], 0 to infinity.  The largest ln(U) / odds comes first (Efraimidis and Spirakis 2006).
+    candidates: mask, [N].  odds: [N], 0 to infinity.  The largest ln(U) / odds comes first (Efraimidis and Spirakis
+    2006).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         keys = np.log1p(-random.random(len(odds))) / odds
@@ -87,19 +88,19 @@ def sampling_order(candidates: Mask, odds: NDArray[np.float64], random: np.rando
 
 
 def largest(score: NDArray[np.floating], limit: int, candidates: Mask | None = None) -> Mask:
-    """Return the mask, [N], of at most `limit` candidates with the largest scores; the lower index wins ties.
+    """Return the mask, [N], of the `limit` candidates with the largest scores; ties go to the lower index.
 
     candidates: mask, [N]; None for all.
     """
     indices = np.arange(len(score)) if candidates is None else np.flatnonzero(candidates)
     order = np.argsort(-score[indices], kind="stable")
-    chosen = np.zeros(len(score), bool)
-    chosen[indices[order[:limit]]] = True
-    return chosen
+    mask = np.zeros(len(score), bool)
+    mask[indices[order[:limit]]] = True
+    return mask
 
 
 class SampledPruning(Rule):
-    """Base class of rules that remove a random fraction of the faint and the large Gaussians."""
+    """Base class of rules that remove a random sample of the faint and the large Gaussians."""
 
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
@@ -113,16 +114,16 @@ class SampledPruning(Rule):
 
     @abstractmethod
     def weights(self, edit: Edit) -> NDArray[np.float64]:
-        """Return the odds of removing each Gaussian, [N], 0 to infinity."""
+        """Return the odds of removing each Gaussian, [N], from 0 to infinity."""
 
     def mark(self, edit: Edit) -> None:
-        """Mark a sample for removal; the size of a split Gaussian is that of its children."""
+        """Mark a sample of the Gaussians for removal; the size of a split Gaussian is the size of its children."""
         gaussians = edit.gaussians
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         size = np.exp(gaussians.get("log_scales").max(axis=1)) * edit.shrink.get()
         is_large = size > edit.at(self.size_above) * edit.scene_scale.extent
         candidates = ((opacity < edit.at(self.opacity_below)) | is_large) & (edit.rows() > 0)
         order = sampling_order(candidates, self.weights(edit), edit.random())
-        chosen = np.zeros_like(candidates)
-        chosen[order[: int(self.share * len(order))]] = True
-        edit.choose(chosen, copies=0, old_rows=0)
+        mask = np.zeros_like(candidates)
+        mask[order[: int(self.share * len(order))]] = True
+        edit.choose(mask, copies=0, old_rows=0)

@@ -1,4 +1,4 @@
-"""Merge pairs of Gaussians: keep the mean and covariance of their mixture, their mean color, and their mass."""
+"""Merge pairs of Gaussians so that the mean and covariance of their mixture, mean color, and mass are preserved."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ MIN_OPACITY, MAX_OPACITY = 1e-6, 0.99  # renderers of 3DGS clamp alpha at 0.99
 
 def volume(log_scales: Floats) -> Floats:
     """Return the volumes of ellipsoids divided by 4π/3, [N] scene units³."""
-    mass: Floats = np.exp(log_scales.sum(axis=1))
-    return mass
+    result: Floats = np.exp(log_scales.sum(axis=1))
+    return result
 
 
 def surface(log_scales: Floats) -> Floats:
@@ -30,23 +30,23 @@ def surface(log_scales: Floats) -> Floats:
 
 
 def masses(tables: dict[str, Floats], size: Size = volume) -> Floats:
-    """Return the mass, opacity times size, of each Gaussian, [N]."""
+    """Return the mass of each Gaussian, its opacity times its size, [N]."""
     mass: Floats = size(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
     return mass
 
 
 @dataclass(frozen=True)
 class Mixtures:
-    """The moments of mixtures of two Gaussians, each weighted by its mass."""
+    """The moments of mixtures of two Gaussians, weighted by mass."""
 
-    mass: Floats  # [pairs] total of both
-    fraction: Floats  # [pairs, 1] of the mass in the second Gaussian
+    mass: Floats  # [pairs] of both Gaussians together
+    fraction: Floats  # [pairs, 1] of the mass that the second Gaussian has
     means: Floats  # [pairs, 3] scene units
     covariance: Floats  # [pairs, 3, 3] scene units²
 
     @classmethod
     def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
-        """Compute the mixtures of rows `first` and `second`, [pairs].  mass: of all rows, from `masses`."""
+        """Compute the mixtures of rows `first` and `second`, [pairs] each.  mass: of all rows, [N], from `masses`."""
         total = mass[first] + mass[second]
         fraction = (mass[second] / total)[:, None]
         means = (1 - fraction) * tables["means"][first] + fraction * tables["means"][second]
@@ -58,14 +58,14 @@ class Mixtures:
         return cls(total, fraction, means, covariance)
 
     def opacity(self, log_scales: Floats, size: Size = volume) -> Floats:
-        """Return the opacities that preserve the mass, [pairs], clamped to the range that renderers use."""
+        """Return the opacities that preserve the mass, [pairs], clamped to MIN_OPACITY and MAX_OPACITY."""
         return np.clip(self.mass / size(log_scales), MIN_OPACITY, MAX_OPACITY)
 
 
 def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> dict[str, Floats]:
-    """Return Gaussians with the mean and covariance of the mixtures of rows `first` and `second`, by parameter.
+    """Merge rows `first` and `second`, [pairs] each, into Gaussians with the mean and covariance of their mixtures.
 
-    Each table has the shape [pairs, components].
+    Returns tables of the shape [pairs, components], by parameter.
     """
     mixtures = Mixtures.from_pairs(tables, masses(tables, size), first, second)
     fraction = mixtures.fraction
@@ -90,8 +90,8 @@ def to_log_scales(variances: Floats) -> Floats:
 
 
 def covariance_matrices(quats: Floats, log_scales: Floats) -> Floats:
-    """Return the covariances R diag(s²) Rᵀ, [N, 3, 3] scene units²."""
+    """Return the covariance matrices R diag(s²) Rᵀ, [N, 3, 3] in scene units²."""
     rotations = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)
     axes = rotations * np.exp(log_scales)[:, None, :]
-    covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)
-    return covariance
+    result: Floats = np.einsum("nij,nkj->nik", axes, axes)
+    return result

@@ -1,8 +1,8 @@
 """Accumulate statistics of each Gaussian over the views since the last edit, for density rules.
 
-A statistic is a table `stats/<name>`: the sum of one or more numbers per view over the views that see the Gaussian.
-Its mean is the sum divided by the number of these views, or by another statistic.  Only statistics that a rule reads
-are accumulated.
+A statistic is a table `stats/<name>` with one or more values for each Gaussian, summed over the views in which the
+Gaussian is visible.  Its mean is the sum divided by the number of these views, or by another statistic.  Only
+statistics that a rule reads are accumulated.
 """
 
 from abc import abstractmethod
@@ -34,14 +34,14 @@ NEEDS_CONIC = {  # with the box filter, splats and sums have other values (cl_ke
 class Statistic(Settings):
     """A sum over views for each Gaussian."""
 
-    components: ClassVar[int] = 1  # numbers per Gaussian; rules that compare a mean with a threshold need 1
+    components: ClassVar[int] = 1  # values per Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
-    divisor: ClassVar[str] = "seen"  # divides the sum: the number of views that see the Gaussian, or another statistic
+    divisor: ClassVar[str] = "seen"  # name of the table that divides the sum: the number of views, or a statistic
     is_total: ClassVar[bool] = False  # whether to multiply the mean by the number of training views
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        """Add a view to `total`, [components, capacity].  grad_mean2d: [2, capacity] px⁻¹."""
+        """Add the values of a view to `total`, [components, capacity].  grad_mean2d: [2, capacity] px⁻¹."""
 
 
 class ScreenGrad(Statistic):
@@ -121,19 +121,19 @@ StatisticName = Annotated[str, VariantName(Statistic, lambda kind: kind.componen
 
 
 class SplatStats:
-    """The statistics of a model, and the number of views that see each Gaussian.
+    """The statistics of a model, and the number of views in which each Gaussian is visible.
 
-    S is the capacity of the tables.
+    In shapes, S is the capacity of the tables.
     """
 
     def __init__(
         self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",), training_views: int = 1
     ) -> None:
-        """Add the tables for `names` and their divisors, and drop all others; existing tables keep their sums."""
+        """Add the tables of `names` and their divisors, and delete all others; existing tables keep their sums."""
         self.gaussians, self.training_views = gaussians, training_views
         classes = variants(Statistic)
-        needed = {*names, *(classes[name].divisor for name in names)}
-        self.columns = {name: kind() for name, kind in classes.items() if name in needed}
+        all_names = {*names, *(classes[name].divisor for name in names)}
+        self.columns = {name: cls() for name, cls in classes.items() if name in all_names}
         tables = {SEEN: 1} | {PREFIX + name: column.components for name, column in self.columns.items()}
         for name in [name for name in gaussians.tables if name.startswith(PREFIX) and name not in tables]:
             del gaussians.tables[name]
@@ -160,16 +160,16 @@ class SplatStats:
         return self.gaussians[PREFIX + self.columns[name].divisor]
 
     def factor(self, name: str) -> int:
-        """Return the factor that multiplies a statistic divided by its divisor."""
+        """Return the factor by which the mean of a statistic is multiplied: the number of training views, or 1."""
         return self.training_views if self.columns[name].is_total else 1
 
     @property
     def seen(self) -> Array:
-        """Number of views that see each Gaussian, [S]."""
+        """Number of views in which each Gaussian is visible, [S]."""
         return self.gaussians[SEEN]
 
     def add(self, view: ViewGradients, grad_mean2d: Array) -> None:
-        """Add one view.  grad_mean2d: [2, S] px⁻¹."""
+        """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹."""
         gaussians = self.gaussians
         gaussians.device.program("density.cl").count_seen(
             items=gaussians.count, radius=view.frame.radius, seen=self.seen, count=gaussians.count
@@ -182,7 +182,7 @@ class SplatStats:
         return self.means(name)[:, 0]
 
     def means(self, name: str) -> NDArray[np.float32]:
-        """Return the means of all components of a statistic, as `mean` does, [N, components]."""
+        """Return the means of all components of a statistic, on the host, [N, components]; 0 where the divisor is 0."""
         total, divisor = (self.gaussians.get(PREFIX + table) for table in (name, self.columns[name].divisor))
         return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0) * np.float32(self.factor(name))
 

@@ -20,7 +20,7 @@ from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.scene.view import View
 
 WEIGHT, BLENDED, SQUARE = (int(constants("splat.h")[f"SUM_{name}"]) for name in ("WEIGHT", "BLENDED", "SQUARE"))
-LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # the loss of a view in published scores (Kerbl et al. 2023)
+LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # the loss that published scores use (Kerbl et al. 2023)
 Floats = NDArray[np.float32]
 Result = TypeVar("Result")
 
@@ -45,22 +45,22 @@ class RenderedView:
     def render_all(
         cls, rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
     ) -> Iterator["RenderedView"]:
-        """Render the views of photographs, one after another.  background: [3]."""
+        """Yield the rendered views of photographs, each valid until the next is rendered.  background: [3]."""
         return (cls.render(rasterizer, model, photograph, background) for photograph in photographs)
 
     def counted_pixels(self) -> NDArray[np.bool_]:
-        """Return the mask of pixels that count, [height, width]."""
+        """Return the mask of the pixels that count, [height, width]."""
         camera, mask = self.photograph.camera, self.photograph.counted_pixels()
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
     def error(self) -> Floats:
-        """Return the absolute difference of render and photograph, averaged over channels, [height, width]."""
+        """Return the absolute difference between render and photograph, averaged over channels, [height, width]."""
         image = crop(self.frame, self.frame.image.get())
         error: Floats = np.abs(image - self.photograph.image() / np.float32(255)).mean(axis=2)
         return error
 
     def loss(self, losses: Sequence[ImageLoss]) -> float:
-        """Return the sum of losses; masked pixels of the render are black afterwards."""
+        """Return the sum of losses, and set masked pixels of the render to black."""
         workspace, camera, planes = self._workspace, self.photograph.camera, self.photograph.planes(self._workspace)
         if planes.mask is not None:
             apply_mask(workspace, camera, self.frame.image, planes.mask)
@@ -75,20 +75,20 @@ class RenderedView:
     def sum(self, number: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
         """Return a sum over pixels (`SUM_*` in cl_kernels/splat.h) for each Gaussian, [N]; 0 if it is not visible.
 
-        plane: the texture, [height, width], 0 or more; None for 0.  channel: the differentiated loss is the sum of this
-        channel over the image; None for no loss.
+        plane: the texture, [height, width], 0 or more; None for 0.  channel: index of the image channel whose sum over
+        the image is the differentiated loss; None for no loss.
         """
-        camera, counted = self.photograph.camera, self.counted_pixels()
+        camera, counted_mask = self.photograph.camera, self.counted_pixels()
         texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
-        texture[: camera.height, : camera.width] = np.where(counted, 0 if plane is None else plane, -1)
-        uploaded = self._workspace.array("surveyed texture", texture.shape)
-        uploaded.set(texture)
+        texture[: camera.height, : camera.width] = np.where(counted_mask, 0 if plane is None else plane, -1)
+        texture_array = self._workspace.array("surveyed texture", texture.shape)
+        texture_array.set(texture)
         gradient = self._gradient()
         if channel is None:
             gradient.fill(0)
         else:
             gradient.set((texture >= 0) * (np.arange(3) == channel)[:, None, None])
-        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _computed_sums(number), uploaded)
+        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _computed_sums(number), texture_array)
         return np.asarray(sums.get()[number, : self.model.gaussians.count])
 
     @property
@@ -123,7 +123,7 @@ class Survey:
         self._cache: dict[Any, Any] = {}
 
     def render(self, views: Iterable[View]) -> Iterator[RenderedView]:
-        """Render views, one after another."""
+        """Yield rendered views, each valid until the next is rendered."""
         photographs = (self._photographs.get(view) for view in views)
         return RenderedView.render_all(self._rasterizer, self._model, photographs, self._photographs.background)
 
@@ -133,13 +133,13 @@ class Survey:
         return self._model.gaussians.count
 
     def sample_views(self, number: int) -> list[View]:
-        """Return a random sample of at most `number` views, in their order; it depends on seed and step."""
+        """Return a random sample of at most `number` views, in their original order; it depends on seed and step."""
         count = len(self.views)
         indices = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
         return [self.views[index] for index in np.sort(indices)]
 
     def compute_once(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        """Return function(survey, *arguments), computed only once for all rules of the edit."""
+        """Return the result of `function(survey, *arguments)`, computed only once for all rules of the edit."""
         key = function, arguments
         if key not in self._cache:
             self._cache[key] = function(self, *arguments)
@@ -148,7 +148,7 @@ class Survey:
 
 
 def normalize(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Map values linearly so that the smallest counted one is 0 and the largest 1; all 0 if these are equal."""
+    """Scale values linearly so that those in the mask `counted` range from 0 to 1; return 0 if they are all equal."""
     low = float(np.min(values[counted], initial=np.inf))
     high = float(np.max(values[counted], initial=-np.inf))
     return (values - low) / (high - low) if high > low else np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""Define thresholds of density rules (scheduled values, or quantiles of the scene's values) and their units."""
+"""Define the thresholds of density rules, which are scheduled values or quantiles, and their units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ def _no_photographs(q: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """The units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
+    """The scene's values that thresholds of rules are relative to."""
 
-    extent: float
-    texture_quantile: Callable[[float], float] = _no_photographs
+    extent: float  # scene units
+    texture_quantile: Callable[[float], float] = _no_photographs  # quantile -> texture of the photographs, per px
