@@ -1,1 +1,1 @@
-"""Create, download, and convert datasets; only the command line imports this package."""
+"""Create, download, and convert datasets.  Only the command line imports this package."""

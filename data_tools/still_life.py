@@ -1,4 +1,7 @@
-"""Define the still life: the shapes on a table, and their procedural paints in local axes."""
+"""Define the still life: shapes on a table, and the procedural paints of their surfaces.
+
+A paint receives points in the local axes of its shape, [3, R] in scene units, and returns their albedo, [3, R].
+"""
 
 from functools import partial
 
@@ -7,13 +10,16 @@ from numpy.typing import NDArray
 
 from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
 
-SCENE_RADIUS = 1.25  # of the table
-SCENE_VERSION = 1  # increase it when the images change: folders of other versions count as incomplete
+SCENE_RADIUS = 1.25  # radius of the table, scene units
+SCENE_VERSION = 1  # increase it when the images change, so that existing folders count as incomplete
 PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # spatial hash
 
 
 def noise(points: Array, octaves: int = 1) -> Array:
-    """Smooth value noise of unit cells in [0, 1], each octave half the size and weight of the one before, [R]."""
+    """Return smooth value noise with unit cells, [R] in [0, 1].
+
+    Each octave has half the cell size and half the weight of the previous one.
+    """
     total = np.zeros(points.shape[1])
     for octave in range(octaves):
         scaled = points * 2.0**octave + 17.3 * octave
@@ -30,20 +36,20 @@ def noise(points: Array, octaves: int = 1) -> Array:
 
 
 def scramble(key: NDArray[np.uint32]) -> Array:
-    """Hash integers to [0, 1)."""
+    """Hash integers to numbers in [0, 1)."""
     for shift, factor in (13, 0x5BD1E995), (15, 0x2C1B3C6D):
         key = np.asarray((key ^ (key >> shift)) * np.uint32(factor), np.uint32)
     return np.asarray((key ^ (key >> 16)) * 2.0**-32)
 
 
 def mix(a: Vector | Array, b: Vector | Array, t: Array | NDArray[np.bool_]) -> Array:
-    """Blend colors [3] or [3, R]: `a` where t is 0, `b` where it is 1."""
+    """Blend colors, [3] or [3, R], from `a` where t is 0 to `b` where t is 1."""
     a, b = (np.reshape(c, (3, -1)) for c in (a, b))
     return np.asarray(a + (b - a) * t)
 
 
 def grain(p: Array) -> Array:
-    """Wood along x: wavy rings and fine fibers, in [0, 1]."""
+    """Return the brightness of wood along x, with wavy rings and fine fibers, [R] in [0, 1]."""
     x, y, z = p
     bend = noise(np.array([1.1 * x, 3 * y, 3 * z]), 2)
     fiber = noise(np.array([7 * x, 80 * y, 80 * z]), 2)
@@ -52,7 +58,7 @@ def grain(p: Array) -> Array:
 
 
 def planks(p: Array) -> Array:
-    """Boards 0.25 wide of different tones, with dark joints."""
+    """Paint boards of different tones, each 0.25 wide, with dark joints."""
     across = p[1] / 0.25 + 0.5
     row = np.floor(across)
     tone = scramble(row.astype(np.int64).astype(np.uint32) * np.uint32(PRIMES[0]))
@@ -61,7 +67,7 @@ def planks(p: Array) -> Array:
 
 
 def chessboard(p: Array) -> Array:
-    """8 x 8 squares of veined stone, 0.115 each, in a walnut frame."""
+    """Paint 8 x 8 squares of veined stone, each 0.115 wide, in a walnut frame."""
     odd = (np.floor(p[0] / 0.115) + np.floor(p[1] / 0.115)) % 2 > 0
     vein = np.abs(noise(9 * p, 3) - 0.5) * 2
     light, dark = (0.84, 0.79, 0.66), (0.015, 0.10, 0.075)
@@ -72,7 +78,7 @@ def chessboard(p: Array) -> Array:
 
 
 def globe(p: Array) -> Array:
-    """Sea, land, ice and a 15-degree grid; radius 0.33."""
+    """Paint sea, land, ice, and a 15-degree grid on a sphere of radius 0.33."""
     x, y, z = p / 0.33
     height = noise(p * 6 + 5.2, 5)
     sea = mix((0.01, 0.06, 0.22), (0.05, 0.33, 0.5), np.clip(height * 2.6 - 0.4, 0, 1))
@@ -86,7 +92,7 @@ def globe(p: Array) -> Array:
 
 
 def beach_ball(p: Array) -> Array:
-    """Six gores around z and a white cap."""
+    """Paint six gores around z, and a white cap."""
     white = (0.8, 0.77, 0.7)
     colors = np.array([(0.75, 0.04, 0.04), white, (0.02, 0.2, 0.6), (0.8, 0.52, 0.02), white, (0.02, 0.4, 0.15)])
     gore = np.floor(np.arctan2(p[1], p[0]) * 3 / np.pi).astype(int) % 6
@@ -94,26 +100,26 @@ def beach_ball(p: Array) -> Array:
 
 
 def dotted(p: Array) -> Array:
-    """White dots on red, spread evenly over the ball."""
+    """Paint evenly distributed white dots on a red ball."""
     direction = unit(p)
     nearest = np.maximum.reduce([dot(d, direction) for d in spiral(36, -90, 90)])
     return mix((0.62, 0.02, 0.03), (0.82, 0.79, 0.74), nearest > np.cos(0.19))
 
 
 def marble(p: Array) -> Array:
-    """White stone with dark veins."""
+    """Paint white stone with dark veins."""
     vein = np.abs(np.sin(14 * (p[0] + p[2]) + 9 * noise(p * 7, 4)))
     return mix((0.05, 0.06, 0.09), (0.83, 0.82, 0.8), np.clip(vein * 2.2, 0, 1) ** 0.6)
 
 
 def orange(p: Array) -> Array:
-    """Dimpled peel with a green calyx."""
+    """Paint a dimpled orange peel with a green calyx."""
     peel = mix((0.55, 0.17, 0.005), (0.9, 0.36, 0.02), np.clip(noise(p * 60, 2) * 1.8 - 0.4, 0, 1))
     return mix(peel, (0.1, 0.2, 0.03), (np.hypot(p[0], p[1]) < 0.02) & (p[2] > 0))
 
 
 def candy(p: Array) -> Array:
-    """Red and green stripes winding around z, rings on the ends; half height 0.26."""
+    """Paint red and green stripes that wind around z, and rings on the ends; the half height is 0.26."""
     turn = (np.arctan2(p[1], p[0]) / (2 * np.pi) + p[2] / 0.16) % 1
     side = mix(mix((0.82, 0.79, 0.74), (0.65, 0.02, 0.03), turn < 0.45), (0.02, 0.3, 0.12), np.abs(turn - 0.72) < 0.05)
     ring = np.hypot(p[0], p[1]) / 0.03 % 1 < 0.5
@@ -121,7 +127,7 @@ def candy(p: Array) -> Array:
 
 
 def tin(p: Array) -> Array:
-    """A can with a label: bands, diamonds and bare ribbed metal at both ends; radius 0.17, half height 0.22."""
+    """Paint a can of radius 0.17 and half height 0.22: a label with bands and diamonds, and ribbed metal ends."""
     x, y, z = p
     turn = np.arctan2(y, x) * 8 / np.pi
     diamond = np.abs(turn - np.round(turn)) * 0.067 + np.abs(z) * 0.5 < 0.03
@@ -132,7 +138,7 @@ def tin(p: Array) -> Array:
 
 
 def book_cover(cover: Vector, half: Vector, p: Array) -> Array:
-    """A book: cloth covers with a gilt frame and title, pages on three sides, the spine at -x."""
+    """Paint a book: cloth covers with a gilt frame and title, pages on three sides, and the spine at -x."""
     x, y, z = p / np.reshape(half, (3, 1))
     cloth = mix(cover, (0.02, 0.02, 0.02), 0.55 * noise(p * 90, 2))
     margin = np.minimum(half[0] - np.abs(p[0]), half[1] - np.abs(p[1]))
@@ -150,20 +156,20 @@ PIPS += [[(-1, -1), (-1, 0), (-1, 1), (1, -1), (1, 0), (1, 1)]]
 
 
 def die(p: Array) -> Array:
-    """Ivory with pips, opposite faces adding up to seven; half side 0.085."""
+    """Paint an ivory die of half side 0.085, whose opposite faces add up to seven."""
     p = p / 0.085
     axis = np.abs(p).argmax(axis=0)
     pip = np.zeros(p.shape[1], bool)
     for face, (side, sign) in enumerate([(0, 1), (1, 1), (2, 1), (2, -1), (1, -1), (0, -1)]):
-        here = (axis == side) & (p[side] * sign > 0)
+        on_face = (axis == side) & (p[side] * sign > 0)
         u, v = p[(side + 1) % 3], p[(side + 2) % 3]
         for a, b in PIPS[face]:
-            pip |= here & (np.hypot(u - 0.52 * a, v - 0.52 * b) < 0.19)
+            pip |= on_face & (np.hypot(u - 0.52 * a, v - 0.52 * b) < 0.19)
     return mix((0.86, 0.8, 0.66), (0.03, 0.03, 0.05), pip)
 
 
 def pencil(p: Array) -> Array:
-    """Yellow paint, a metal ferrule, a pink eraser and a black end; half length 0.34."""
+    """Paint a yellow pencil of half length 0.34 with a metal ferrule, a pink eraser, and a black end."""
     facet = np.floor(np.arctan2(p[1], p[0]) * 3 / np.pi) % 2 > 0
     body = mix((0.85, 0.5, 0.02), (0.7, 0.36, 0.01), facet)
     body = mix(body, (0.03, 0.03, 0.03), np.abs(p[2] + 0.29) < 0.02)

@@ -1,4 +1,4 @@
-"""Ray-cast scenes with exact cameras: the still life, and the dataset folder of any such scene."""
+"""Write datasets of ray-cast scenes with exact cameras, such as the still life."""
 
 import json
 import os
@@ -31,12 +31,12 @@ LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point at the center of 
 CAMERA_DISTANCE = 3.75
 POINT_COUNT = 8000
 POINT_NOISE = 0.002 * SCENE_RADIUS
-STILL_LIFE = World(SCENE, camera_angle_x=0.69, grid=4)  # a field of view that just covers the table
+STILL_LIFE = World(SCENE, camera_angle_x=0.69, grid=4)  # the field of view just covers the table
 
 
 @dataclass(frozen=True)
 class SyntheticOptions:
-    """Options of a dataset: image size in pixels, numbers of views, and seed of the surface points."""
+    """Options of a dataset: image size in pixels, number of views per split, and seed of the surface points."""
 
     size: int = 256
     train: int = 60
@@ -45,7 +45,7 @@ class SyntheticOptions:
 
     version = SCENE_VERSION
     points = POINT_COUNT
-    noise = POINT_NOISE  # of the points, scene units
+    noise = POINT_NOISE  # standard deviation of the points, scene units
 
     @property
     def world(self) -> World:
@@ -61,24 +61,25 @@ class SyntheticOptions:
         }
 
     def manifest(self) -> str:
-        """Return the text of OUT/synthetic.json, which identifies a finished dataset."""
+        """Return the content of OUT/synthetic.json, which identifies a complete dataset."""
         return json.dumps({"scene": self.version, **asdict(self)}) + "\n"
 
     def images(self) -> list[str]:
-        """Return the image files of a finished dataset."""
+        """Return the paths of all images of a complete dataset, relative to its folder."""
         return [f"{split}/r_{i:03}.png" for split, poses in self.poses().items() for i in range(len(poses))]
 
     def write_files(self, out: Path, workers: int) -> str:
-        """Write images, cameras and points into `out`; return a summary."""
+        """Write images, cameras, and points to `out`, and return a summary."""
         count = write_files(out, self, workers)
         return f"{self.train} training and {self.test} test views, {self.size} px, {count:,} points"
 
 
 def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = None) -> str:
-    """Write the folder `out`, all of it or nothing, and return a summary.
+    """Write a dataset to the folder `out`, and return a summary.  After an error, no incomplete folder remains.
 
-    `workers` processes share the views (default: one per core; 1: this process).  Raises DataError if `out` is
-    another dataset, OutputError if it cannot be written.
+    workers: number of processes that render the views; default: the number of cores; 1 renders in this process
+
+    Raises DataError if `out` contains another dataset, and OutputError if it cannot be written.
     """
     if path_exists(out):
         if is_complete(out, options):
@@ -92,7 +93,7 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
 
 
 def is_complete(out: Path, options: SyntheticOptions) -> bool:
-    """Return whether `out` contains all files of the dataset with these options."""
+    """Return whether `out` contains all files of a dataset with these options."""
     manifest = out / "synthetic.json"
     if not manifest.exists() or read_file(manifest).decode(errors="replace") != options.manifest():
         return False
@@ -123,7 +124,7 @@ def write_files(out: Path, options: SyntheticOptions, workers: int) -> int:
 def photographs(
     render: Callable[[View], NDArray[np.uint8]], views: Sequence[View], workers: int
 ) -> Iterator[NDArray[np.uint8]]:
-    """Render views in order, in processes, since threads would wait for the GIL between short NumPy calls."""
+    """Render views in order, in several processes, because threads would wait for the GIL between short NumPy calls."""
     workers = min(workers, len(views))
     if workers == 1:
         yield from map(render, views)
@@ -133,7 +134,7 @@ def photographs(
 
 
 def _exit_with_parent() -> None:
-    """Exit this worker process when its parent does; else an idle worker would wait forever."""
+    """Exit this worker process when its parent exits; otherwise an idle worker would wait forever."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
@@ -144,7 +145,7 @@ def _wait_for_parent() -> None:
 
 
 def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> None:
-    """Write the cameras of a split in the format of Blender datasets: camera-to-world, OpenGL axes."""
+    """Write the cameras of a split in the format of Blender datasets: camera-to-world matrices in OpenGL axes."""
     table = {"camera_angle_x": world.camera_angle_x, "frames": frames}
     path.write_text(json.dumps(table, indent=1) + "\n", "utf-8")
 
@@ -152,13 +153,17 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noisy surface points of a view, like those from structure from motion: positions and colors, [M, 3]."""
+    """Return the positions and colors of noisy surface points in a view, both [M, 3], as from structure from motion.
+
+    count: number of rays through opaque pixels; M is smaller if rays miss
+    noise: standard deviation of each coordinate, scene units
+    """
     rows, columns = np.nonzero(image[..., 3] == 255)
-    chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
-    x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))
+    pixels = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
+    x, y = np.stack([columns[pixels], rows[pixels]]) + rng.random((2, len(pixels)))
     origin, directions = world.camera_rays(pose, len(image), x, y)
     distance, _ = world.trace(origin, directions)
     hit = np.isfinite(distance)
     positions = (origin + distance[hit] * directions[:, hit]).T
-    colors = image[rows[chosen], columns[chosen], :3][hit] / 255
+    colors = image[rows[pixels], columns[pixels], :3][hit] / 255
     return positions + noise * rng.standard_normal(positions.shape), colors

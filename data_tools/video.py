@@ -21,19 +21,22 @@ from clsplat.scene.quality import SIDE, sharpness
 from clsplat.scene.times_file import write_times
 
 LOG = logging.getLogger("clsplat")
-RECORD = ".frames.json"  # next to the frames: the video and settings they were extracted with
+RECORD = ".frames.json"  # the video and settings from which the frames next to it were extracted
 FLOW_SIDE = 120  # px: motion is measured at this size
 CELLS = 4, 3  # motion is averaged over each cell to suppress noise
-STILL = 0.1  # px per frame: less is noise and compression artifacts
+STILL = 0.1  # px per frame: smaller motion is noise or compression artifacts
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
     """Split a video into `frames` parts of equal motion and write the sharpest frame of each; return their number.
 
-    The format is PNG because a second lossy compression changes features and colors.  An interrupted call continues:
-    frames of the same video and settings are kept.  times: also write times.json for a dynamic scene, the index of
-    each frame in the video.
-    Raises DataError if the video cannot be decoded or has only one frame, or if `out` holds other images.
+    long_side: the maximum width and height of the images, px
+    times: also write times.json, the index of each frame in the video, for a dynamic scene
+
+    The format is PNG because a second lossy compression changes features and colors.  An interrupted call can be
+    repeated; it keeps the frames that were extracted from the same video with the same settings.
+
+    Raises DataError if the video cannot be decoded or has only one frame, or if `out` contains other images.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     remove_partial_files(out, border=PIPELINE)
@@ -64,7 +67,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
 def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None:
     """Return the frame indices that an earlier call with the same settings chose, or None.
 
-    Raises DataError if the folder holds frames of another video or other settings, or other images.
+    Raises DataError if the folder contains frames of another video or of other settings, or other images.
     """
     record: dict[str, Any] = {}
     with suppress(DataError, ValueError, TypeError):
@@ -73,17 +76,19 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
     if not _are_frame_indices(chosen):  # damaged: choose the frames again
         chosen = None
     if record and record != settings:
-        changed = [name for name, value in settings.items() if record.get(name) != value]
+        differences = [name for name, value in settings.items() if record.get(name) != value]
         raise DataError(
-            f"{out}: holds frames that were extracted with another {' and another '.join(changed)}; use another "
+            f"{out}: holds frames that were extracted with another {' and another '.join(differences)}; use another "
             "folder, or remove it"
         )
     count = len(chosen) if chosen else settings["frames"] if record else 0
     expected = {_file(out, i) for i in range(1, count + 1)}
-    others = sorted(path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected)
-    if others:
+    other_images = sorted(
+        path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected
+    )
+    if other_images:
         raise DataError(
-            f"{out}: already holds {len(others)} other images, such as {others[0].name}; use another folder"
+            f"{out}: already holds {len(other_images)} other images, such as {other_images[0].name}; use another folder"
         )
     return chosen
 
@@ -108,11 +113,14 @@ def _is_readable(path: Path) -> bool:
 
 
 def sharpest(sharpness: Sequence[float], motion: Sequence[float], parts: int) -> list[int]:
-    """Return the index of the sharpest frame in each of at most `parts` parts with the same motion, the first of
-    equal ones.
+    """Return the index of the sharpest frame in each of at most `parts` parts of equal motion.
 
-    motion: of each frame relative to the previous one, px.  While the camera rests, only one frame is chosen; if it
-    always rests, all parts have the same number of frames.
+    Of equally sharp frames, the first is chosen.
+
+    motion: of each frame relative to the previous one, px
+
+    While the camera is still, only one frame is chosen.  If it is always still, all parts have equally many
+    frames.
     """
     path = np.cumsum(np.maximum(np.asarray(motion, float) - STILL, 0))
     if not path[-1] > 0:
@@ -122,7 +130,7 @@ def sharpest(sharpness: Sequence[float], motion: Sequence[float], parts: int) ->
 
 
 def _measure_frames(video: Path) -> tuple[list[float], list[float]]:
-    """Return the sharpness of each frame, and its median motion relative to the previous frame, px."""
+    """Return the sharpness of each frame, and the median motion of each frame relative to the previous one, px."""
     sharpnesses: list[float] = []
     motions: list[float] = []
     empty = np.empty(0, np.float32)
@@ -139,7 +147,7 @@ def _measure_frames(video: Path) -> tuple[list[float], list[float]]:
 
 
 def decode_frames(video: Path) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError if there are none."""
+    """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError if no frame can be decoded."""
     reader = cv2.VideoCapture(str(video))
     try:
         has_frames = False
@@ -156,7 +164,7 @@ def decode_frames(video: Path) -> Iterator[NDArray[np.uint8]]:
 
 
 def limit_size(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
-    """Return the image with no side longer than `long_side` px."""
+    """Shrink an image so that no side is longer than `long_side` px.  Smaller images are returned unchanged."""
     height, width = image.shape[:2]
     factor = max(height, width) / (long_side or max(height, width))
     if factor <= 1:
