@@ -1,9 +1,9 @@
-/* Adam's update of every parameter.
+/* Update every parameter by Adam.
  *
  * adam_step reads gradients from memory.  update_gaussians computes the gradients of the projection itself, which saves
- * writing and reading 59 values per Gaussian; it gives the same bits as project_backward and adam_step.
+ * writing and reading 59 values per Gaussian; its results equal those of project_backward and adam_step bit for bit.
  *
- * `every`: all ones to update all Gaussians; 0: culled Gaussians keep values and moments.
+ * `every`: all ones to update all Gaussians; 0: the values and moments of culled Gaussians do not change.
  * `undrawn`: all ones to update vectors without a Gaussian in the view at once; 0: their harmonics are updated later
  * (deferred.cl).
  *
@@ -11,14 +11,14 @@
 #include "adam.h"
 #include "backward.h"
 
-/* One update of one table.  Dimension 1 is the plane.  With SH_SLOTS the table is one of those in slots.h. */
+/* One update of one table.  Dimension 1 is the plane.  With SH_SLOTS the table is in slots (slots.h). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void adam_step(
     __global float *restrict values,          // [components,S]
     __global const float *restrict gradient,  // [components,S]
     __global float *restrict moment1,         // [components,S]
     __global float *restrict moment2,         // [components,S]
-    __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
+    __global const uint *restrict depth_key,  // [S] of the view; all ones when culled
     __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
@@ -52,7 +52,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
                         g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2, EPSILON);
 }
 
-/* Update plane `plane` of a table from the member `member` of the block's gradients. */
+/* Update plane `plane` of a table from the field `member` of the block's gradients. */
 #define UPDATE(table, plane, member) UPDATE_BUT(0, first, stride, table, plane, member)
 #define UPDATE_BUT(waiting, first, stride, table, plane, member)                                              \
     do {                                                                                                      \
@@ -66,7 +66,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
 
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
- * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs; vectors without an
+ * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read contiguously; vectors without an
  * updated Gaussian are skipped.  Private memory: VECTORS * LANES * 204 bytes. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(

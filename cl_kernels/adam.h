@@ -21,7 +21,7 @@ static inline void adam_values(VF *value, VF *moment1, VF *moment2, const VF g, 
     *value = *value - rate * m / (sqrt(v * correction2) + epsilon);
 }
 
-/* One update of LANES values in memory; values that are not `updated` keep their bits. */
+/* One update of LANES values in memory; values that are not `updated` do not change. */
 static inline void adam_update(__global float *values, __global float *moment1, __global float *moment2, const VF g,
                                const VI updated, const float rate, const float correction2, const float epsilon)
 {

@@ -18,7 +18,7 @@ void add_to_average(
     average[at] += (values[at] - average[at]) / (number[i] + 1.0f);
 }
 
-/* Count one more step. */
+/* Add one to the step counts. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void count_step(
     __global float *restrict number,  // [S] steps
@@ -29,7 +29,7 @@ void count_step(
         number[i] += 1.0f;
 }
 
-/* Replace values by their averages, in rows that have one. */
+/* Replace values by their averages in rows that have an average. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void take_average(
     __global float *restrict values,         // [components,S]

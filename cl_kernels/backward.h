@@ -1,6 +1,6 @@
 /* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and color.
- * The values of the forward pass are recomputed.  Both kernels that update parameters use this file, so they give the
- * same bits. */
+ * The values of the forward pass are recomputed.  Both kernels that update parameters use this file, so their
+ * results are bit-identical. */
 #ifndef CLSPLAT_BACKWARD_H
 #define CLSPLAT_BACKWARD_H
 #include "gaussian.h"
@@ -24,7 +24,7 @@ static inline VF view_direction(
 }
 
 /* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and of a factor on both
- * focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change. */
+ * focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN), so its element of J does not change. */
 static inline void shape_backward(
     const shape_t *s, __constant camera_t *camera,
     const VF *m,  // [PIXEL_SUMS] see splat.h
@@ -126,14 +126,14 @@ static inline void color_backward(
         for (uint k = 0; k < 4; k++)
             table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
     g->touched = VLOAD_PRIVATE(table[0]) > 0.0f;  // culled records are all zero
-    for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
+    for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamps
         g->color[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
-/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics start at
- * `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector without a visible Gaussian,
- * whose harmonics are not read. */
+/* The weight of each basis function in the derivative with respect to the direction, c_k . g, for the vectors whose
+ * harmonics start at `first`: plane by plane, so that memory is read contiguously.  unseen: a bit for each vector
+ * without a visible Gaussian, whose harmonics are not read. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // coefficient-major, see slots.h
     const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,

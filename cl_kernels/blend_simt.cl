@@ -5,7 +5,7 @@
 #define PIXELS (TILE * TILE)
 #define BATCH PIXELS  // splats in local memory: each item loads one
 #if INVERSE_DEPTH
-#define QUADS 4       // of four floats: the whole splat record
+#define QUADS 4       // of four floats: the full splat record
 #else
 #define QUADS 3       // of four floats: the part of a splat record that blending reads
 #endif
@@ -56,7 +56,7 @@ void blend_forward(
     __global float *restrict image,             // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
-    const uint first_tile)                      // of this launch
+    const uint first_tile)                      // of the launch
 {
     __local float4 batch[BATCH][QUADS];
     __local uint open;  // pixels of the tile that are not finished
@@ -143,7 +143,7 @@ void blend_backward(
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
-    const uint first_tile)                      // of this launch
+    const uint first_tile)                      // of the launch
 {
     __local grad_pixels_t pixels[PIXELS];
     __local float4 coming[PIXELS][QUADS];  // an item's splat of the next batch: only that item reads and writes it
@@ -185,7 +185,7 @@ void blend_backward(
                 coming[item][k] = quads[k];
             coming_pair[item] = next;
         }
-        /* after the last batch, until its last splat has seen the last pixel */
+        /* after the last batch, until its last splat has reached the last pixel */
         const uint steps = begin < last ? PIXELS : PIXELS - 1 - (begin - last);
         for (uint step = 0; step < steps; step++) {
             if (step == item) {

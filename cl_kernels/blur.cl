@@ -1,4 +1,5 @@
-/* A Gaussian blur of an image: the weighted mean of the pixels that count, so that neither edges nor a mask darken it.
+/* A Gaussian blur of an image: the weighted mean of the valid pixels, so that neither edges nor a mask darken the
+ * result.
  *
  *   blurred(x) = sum_k w(k) m(x + k) v(x + k) / sum_k w(k) m(x + k),  w(k) = exp(-k^2 / (2 sigma^2)),  |k| <= reach
  *
@@ -13,7 +14,7 @@ static inline float weight_of(const uint a, const uint b, const float falloff)
     return exp(-falloff * distance * distance);
 }
 
-/* Sums along rows: three channels times the mask, and the mask itself. */
+/* Weighted sums along rows: of three channels times the mask, and of the mask. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_rows(
     __global const float *restrict image,  // [3,H',stride]
@@ -43,7 +44,7 @@ void blur_rows(
         sums[channel * plane + y * stride + x] = total[channel];
 }
 
-/* The same along columns, and the division; pixels without a neighbor that counts stay unchanged. */
+/* Weighted sums along columns, and their quotient; pixels without a valid neighbor do not change. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_columns(
     __global const float *restrict sums,  // [4,H',stride]

@@ -6,8 +6,8 @@
 #define FARTHEST 3.0e38f  // beyond all products
 #define TOGETHER 8        // vectors that an item compares with its points at once, in registers
 
-/* Compare with the vectors from `first` to `end`, few enough to stay in a cache.  The first of vectors with equal
- * products wins; 0 for a point that is NaN.  One item = LANES points. */
+/* Compare points with the vectors from `first` to `end`, which must fit in a cache.  Among vectors with equal products,
+ * the first is chosen; the label of a point that is NaN is 0.  One item = LANES points. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void most_alike(
     __global const float *restrict points,   // [components,S]

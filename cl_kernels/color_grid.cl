@@ -23,7 +23,7 @@ static inline VF hat(const VF distance)
     return near > 0.0f ? near : (VF)(0.0f);
 }
 
-/* The derivative of `hat`; at a node, that of the next interval. */
+/* The derivative of `hat`; at a node, the derivative in the next interval. */
 static inline VF hat_slope(const VF distance)
 {
     const VF one = (VF)(1.0f), zero = (VF)(0.0f);
@@ -73,8 +73,8 @@ static inline void grid_of_row(
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* The matrices `a` of LANES pixels from x on, from the grid of their row, and their derivatives by the level, `slopes`,
- * unless that is a null pointer. */
+/* The matrices `a` of LANES pixels from x on, from the grid of their row, and, unless `slopes` is a null pointer, their
+ * derivatives with respect to the level. */
 static inline void matrices_of(
     __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level,
     VF *a, VF *slopes)
@@ -133,8 +133,8 @@ void color_grid_forward(
     }
 }
 
-/* The gradient of the image, through the matrix and through the luminance at which it is interpolated, and the part of
- * the gradient that passes the clamp.  As color_grid_forward. */
+/* The gradient of the image, through the matrix and through the luminance at which it is interpolated, and the part
+ * of the gradient that passes the clamp.  As color_grid_forward. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_backward(
     __global const float *restrict image,     // [channels,H',stride] before the transform

@@ -2,7 +2,7 @@
  *
  * The smoothness of a grid is, for each axis, the mean of the squared differences of neighboring nodes, times a weight
  * (the total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], whose length may not be a multiple of a
- * vector, so an item has one value.  Deterministic. */
+ * vector, so an item computes one value.  Deterministic. */
 #undef LANES
 #define LANES 1
 #include "adam.h"

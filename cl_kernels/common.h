@@ -48,7 +48,7 @@
 
 /* ---- constants of the method (Kerbl et al. 2023); tests change the first three to make blending smooth ---- */
 #ifndef ALPHA_MIN
-#define ALPHA_MIN (1.0f / 255.0f)  // fainter contributions are skipped: they do not change an 8-bit image
+#define ALPHA_MIN (1.0f / 255.0f)  // fainter contributions are skipped, since they do not change an 8-bit image
 #endif
 #ifndef ALPHA_MAX
 #define ALPHA_MAX 0.99f  // keeps 1 - alpha >= 0.01, so that dividing by it is safe

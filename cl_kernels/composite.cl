@@ -1,4 +1,4 @@
-/* From the outputs of a network to the color of a ray, and the gradient (Max 1995, as in Barron et al. 2021).
+/* The colors of rays from the outputs of a network, and the gradient (Max 1995, as in Barron et al. 2021).
  *
  *   density of a sample s = softplus(raw - 1), color c = (1 + 2 p) sigmoid(raw) - p with p = 0.001
  *   weight w_k = T_k (1 - exp(-s_k e_k)), T_k+1 = T_k exp(-s_k e_k), e_k its length
@@ -17,7 +17,7 @@
 #define RAY_LENGTH 7           // of a ray's values: |d| (rays.cl)
 #define RAY_STEP 8
 
-/* Replace numbers that are nearly subnormal, which are slow on some CPUs, by zero; NaN stays. */
+/* Replace numbers that are nearly subnormal, which are slow on some CPUs, with zero; NaN does not change. */
 static inline float flush_to_zero(const float x) { return fabs(x) < FLUSH_BELOW ? 0.0f : x; }
 
 static inline float density_of(const float raw)

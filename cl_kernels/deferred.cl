@@ -1,4 +1,4 @@
-/* Deferred updates of harmonics by Adam, which wait until a view sees the Gaussian (adam.h).
+/* Deferred updates of harmonics by Adam, which are postponed until a view shows the Gaussian (adam.h).
  *
  * A Gaussian that a view does not show has a gradient of zero, so that its update depends only on its own value and
  * moments.  These updates are applied later, in order, each with its own factors, and give the same bits as immediate
@@ -9,7 +9,7 @@
 #include "adam.h"
 #include "slots.h"
 
-/* Apply the pending updates of the list to the blocks in which the view sees a Gaussian.  `every`: all ones to update
+/* Apply the pending updates of the list to the blocks with a Gaussian that the view shows.  `every`: all ones to update
  * all blocks. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void replay_updates(
@@ -48,7 +48,7 @@ void replay_updates(
     done[block] = updates;
 }
 
-/* Append an update to the list, and mark it as done for the blocks in which the view sees a Gaussian. */
+/* Append an update to the list, and mark it as done for the blocks with a Gaussian that the view shows. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void note_update(
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled

@@ -1,10 +1,10 @@
-/* The Gaussians that a step drops (DropGaussian, Park et al. 2025), each with the same probability, and the Gaussians
- * that its view hides.
+/* Select the Gaussians that a step drops (DropGaussian, Park et al. 2025), each with the same probability, and the
+ * Gaussians that its view hides.
  *
  * One item = one Gaussian.  No local memory.  The random numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
-/* Draw whether each Gaussian is left out. */
+/* Decide at random whether each Gaussian is left out. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void draw_left_out(
     __global const float *restrict hidden,  // [planes,S] integers: bits of the views that hide a Gaussian

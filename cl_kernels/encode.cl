@@ -1,5 +1,5 @@
-/* The inputs of a network for a sample: the integrated positional encoding of its conical frustum, and the encoding of
- * its viewing direction (Barron et al. 2021).
+/* The inputs of a network for one sample: the integrated positional encoding of its conical frustum, and the encoding
+ * of its viewing direction (Barron et al. 2021).
  *
  * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which
  * are those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their

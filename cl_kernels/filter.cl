@@ -7,7 +7,7 @@
 
 #define VIEW_MARGIN 0.15f  // fraction of the image size beyond its edges that still counts as seen
 
-/* Smallest sampling interval of each Gaussian, 0 where no camera sees it, and the bits of the largest of all. */
+/* Smallest sampling interval of each Gaussian, 0 where no camera sees it, and the bits of the largest interval. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sampling_interval(
     __global const float *restrict means,       // [3,S] scene units

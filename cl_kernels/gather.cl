@@ -1,5 +1,5 @@
-/* Rows of tables: sum each Gaussian's gradient records, reorder tables, write rows from the host.  No local memory.
- * Deterministic: every value has one writer, and sums have a fixed order. */
+/* Operations on rows of tables: sum the gradient records of each Gaussian, reorder tables, write rows from the host.
+ * No local memory.  Deterministic: every value has one writer, and sums have a fixed order. */
 #include "splat.h"
 
 /* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */

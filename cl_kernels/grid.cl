@@ -1,12 +1,12 @@
 /* A multiresolution hash grid of features, the input of a network instead of sines (Müller et al. 2022), with each
  * level weighted by how well a sample resolves it (Barron et al. 2023, "Zip-NeRF", section 3.1).
  *
- *   place    mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
+ *   position mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
  *            the variances along the three axes, as for a sphere
- *   level    a cube of n^3 cells; at the (n + 1)^3 corners an entry of GRID_FEATURES numbers.  Where a level has fewer
- *            entries, several corners share one: index (x ^ y * HASH_Y ^ z * HASH_Z) modulo the entries (equation 4)
+ *   level    a cube of n^3 cells; each of the (n + 1)^3 corners has an entry of GRID_FEATURES values.  Where a level
+ *            has fewer entries, several corners share one: index (x ^ y * HASH_Y ^ z * HASH_Z) modulo the entries (equation 4)
  *   feature  w * (trilinear mean of the 8 entries around u), w = erf(1 / sqrt(8 v n^2)), by erf(x) ~ sqrt(1 - exp(-4/pi
- *            x^2)), which is off by 0.7 % at most: so w = sqrt(1 - exp(-1 / (2 pi v n^2)))
+ *            x^2)), whose error is at most 0.7 %: so w = sqrt(1 - exp(-1 / (2 pi v n^2)))
  *
  * Outside the cube all features are 0.  Backward: an item owns a range of a level's entries and adds the gradients of
  * all samples to it in order, without atomics, so results do not depend on the number of items per level.  No local
@@ -16,7 +16,7 @@
 
 #define GRID_FEATURES 4  // of an entry: one block of rows
 #define PLACE_ROWS 4     // of a sample: u along x, y, z, and v
-#define LEVEL_VALUES 4   // of a level: n, its first entry, how many, 1 where corners share them
+#define LEVEL_VALUES 4   // of a level: n, first entry, number of entries, 1 if corners share entries
 #define HASH_Y 2654435761u
 #define HASH_Z 805459861u
 #define CORNERS 8
@@ -67,7 +67,7 @@ static inline void find_corners(const cells_t *cells, const uint lane, const uin
     }
 }
 
-/* Places of samples in the cube.  One item = LANES samples of one ray. */
+/* Positions of samples in the cube.  One item = LANES samples of one ray. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void grid_places(
     __global const float *restrict cones,  // [rays,RAY_VALUES_READ]

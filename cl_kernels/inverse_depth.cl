@@ -7,7 +7,7 @@
  * No local memory.  Deterministic: no pixel is listed twice, and sums have a fixed order. */
 #include "splat.h"
 
-/* Add the gradient of the fourth plane; return each pixel's term.  One item = one listed pixel. */
+/* Add to the gradient of the fourth plane, and write the loss term of each pixel.  One item = one listed pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void inverse_depth_loss(
     __global const float *restrict image,     // [4,H',stride]
@@ -49,7 +49,7 @@ void sum_inverse_depths(
     sums[i] = sum;
 }
 
-/* Add the gradient through the depth of a mean.  One item = one Gaussian. */
+/* Add the gradient of the means through their depths.  One item = one Gaussian. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void inverse_depth_backward(
     __global const float *restrict splats,  // [N,RECORD]

@@ -11,7 +11,7 @@ typedef struct {
     uint begin, end;  // of the rectangle's rows
 } rows_t;
 
-/* The footprint of one splat in every lane; return the rows of it that this item computes. */
+/* The footprint of one splat in every lane; return the rows of its rectangle that this item computes. */
 static inline rows_t split_rows(__global const float *splat, const uint tiles_x, const uint row_begin,
                                 const uint row_end, footprint_t *f)
 {
@@ -93,8 +93,8 @@ static inline void list_part(const footprint_t *f, const rows_t part, uint pair,
         }
 }
 
-/* Fill the slots from `slot` up to `end` with tiles from `tile` to `last` that the slots from `cursor` to `slot`, which
- * are in order of tiles, do not contain: no tile lists the splat twice.  Return the first slot that is not filled. */
+/* Fill the slots from `slot` up to `end` with tiles from `tile` to `last`, except the tiles in the slots from `cursor`
+ * to `slot`, which are sorted, so that no tile lists the splat twice.  Return the first slot that is not filled. */
 static inline uint fill_up(uint slot, const uint end, uint cursor, uint tile, const uint last, const uint i,
                            __global uint *pair_tile, __global uint *pair_splat)
 {

@@ -2,7 +2,7 @@
  *
  * Samples come in tiles of SAMPLES: a table of R features of S samples is [S / SAMPLES, R, SAMPLES].  A tile of 128
  * features is 32 KB, which stays in a cache while all outputs of it are computed.  One item computes a block of BLOCK
- * outputs for BLOCK vectors of LANES samples: 16 sums in registers for each 4 + 4 values read. */
+ * outputs for BLOCK vectors of LANES samples: 16 sums in registers for every 4 + 4 values that it reads. */
 #ifndef CLSPLAT_LAYERS_H
 #define CLSPLAT_LAYERS_H
 #include "lanes.h"

@@ -108,7 +108,7 @@ void pixel_loss(
     }
 }
 
-/* Local means, then the SSIM map's derivatives by mean of x, variance of x and covariance:
+/* Local means, then the derivatives of the SSIM map with respect to mean of x, variance of x and covariance:
  *   a1 = 2 mx my + C1, a2 = 2 cov + C2, b1 = mx^2 + my^2 + C1, b2 = vx + vy + C2, m = a1 a2 / (b1 b2).
  * Vertical sums go to local memory (SPAN * 20 bytes + TEAM * 4), and the horizontal pass reads them. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
@@ -128,11 +128,11 @@ void ssim_maps(
     const uint plane = rows * stride, first = get_group_id(0) * BLOCK;
     const VF zero = (VF)(0.0f);
     for (uint v = item * LANES; v < SPAN; v += TEAM * LANES) {
-        const uint x = first + v - MARGIN;  // wraps to a huge number left of the image
+        const uint x = first + v - MARGIN;  // wraps to a large number left of the image
         VF mx = zero, my = zero, xx = zero, yy = zero, xy = zero;
         if (x < stride)
             for (uint k = 0; k <= 2 * REACH; k++) {
-                const uint row = y + k - REACH;  // wraps to a huge number above the image
+                const uint row = y + k - REACH;  // wraps to a large number above the image
                 if (row >= height)
                     continue;
                 const uint at = channel * plane + row * stride + x;
@@ -204,7 +204,7 @@ void ssim_gradient(
         VF mean = zero, variance = zero, covariance = zero;
         if (x < stride)
             for (uint k = 0; k <= 2 * REACH; k++) {
-                const uint row = y + k - REACH;  // wraps to a huge number above the image
+                const uint row = y + k - REACH;  // wraps to a large number above the image
                 if (row >= height)
                     continue;
                 const uint at = channel * plane + row * stride + x;
@@ -234,7 +234,7 @@ void ssim_gradient(
 }
 
 /* The error of a view, weighted by the gradient of its loss: sums of |gradient (x - y)|, by row.
- * Local memory: TEAM * 4. */
+ * Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void view_error(
     __global const float *restrict image,       // [3,H',stride]
@@ -260,7 +260,7 @@ void view_error(
         row_errors[channel * rows + y] = sum_items(sums);
 }
 
-/* Sum the errors of a view's rows, in order.  One item. */
+/* Sum the errors of a view's rows, in order.  A single item. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void sum_errors(
     __global const float *restrict row_errors,  // [count]

@@ -1,4 +1,4 @@
-/* Rows that share a vector: each becomes the weighted mean of the rows of its cluster.
+/* Rows that share a vector: each row becomes the weighted mean of the rows of its cluster.
  *
  * x_i <- x_0 + sum_j w_j (x_j - x_0) / sum_j w_j over the members j of its cluster, with x_0 the first: equal
  * rows stay bit-identical.  If all weights are zero, the mean is x_0.
@@ -6,7 +6,7 @@
  * No local memory.  Deterministic: the members are summed in the order of their rows, and each value has one writer. */
 #include "common.h"
 
-/* Share the mean.  One item = one cluster of one plane; dimension 1 is the plane. */
+/* Replace the rows of a cluster by their mean.  One item = one cluster of one plane; dimension 1 is the plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_mean(
     __global float *restrict values,        // [components,S]

@@ -2,7 +2,7 @@
  *
  * A row of the table `motion` is (planes of [W,S])
  *
- *   0-2 velocity v = b_1 · 3 center tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c, 4 planes
+ *   0-2 velocity v = b_1 · 3 center tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c (4 planes)
  *
  * With dt = t - tau, times in [0, 1] over the scene (FreeTimeGS, Wang et al. 2025; Spacetime Gaussians, Li et al.
  * 2024):
@@ -11,7 +11,7 @@
  *
  * As a logit, with o the logit of alpha: o + log g - log(1 + e^o (1 - g)), which is exactly o where g is 1: a static,
  * permanent Gaussian has the same bits as one without motion.  With D = 1 + e^o (1 - g), the derivatives of that logit
- * are 1 / D by o, and (1 + e^o) / D by log g.
+ * are 1 / D with respect to o, and (1 + e^o) / D with respect to log g.
  *
  * Where g < ALPHA_MIN, a Gaussian is invisible: its mean is infinite, so that the projection culls it, and no statistic
  * counts it as seen.
@@ -131,7 +131,7 @@ void move_backward(
             VSTORE((m.present ? grad_mean * power : zero), grad_motion + at);
         }
     }
-    const VF grad_presence = grad_logit * ((1.0f + odds) / divisor);  // by log g
+    const VF grad_presence = grad_logit * ((1.0f + odds) / divisor);  // with respect to log g
     const VF distance = m.dt * m.inverse_duration;
     grad_center = grad_center + grad_presence * (distance * m.inverse_duration);
     VSTORE((m.present ? grad_center : zero), grad_motion + MOTION_CENTER * stride + i);

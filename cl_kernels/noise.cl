@@ -1,13 +1,13 @@
 /* Noise on the means of Gaussians, more for lower opacities (3DGS-MCMC, Kheradmand et al. 2024):
  *
- *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n 3 normal numbers
+ *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n: normal, [3]
  *
  * and no noise where the opacity is REACH above opacity_below.  One item = one Gaussian.  No local memory.  Random
  * numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
 __constant float SHARPNESS = 100.0f;  // per unit of opacity: how fast the noise falls at opacity_below
-__constant float REACH = 0.1f;        // beyond it, less than 5e-5 of the noise is left
+__constant float REACH = 0.1f;        // beyond it, the noise is below 5e-5 of its maximum
 
 /* Move every mean. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))

@@ -57,7 +57,7 @@ typedef float4 piece_t;
 typedef VF_in_memory piece_t;
 #endif
 
-/* Copy one piece per item. */
+/* Copy one PIECE per item. */
 __kernel __attribute__((reqd_work_group_size(COPY_GROUP, 1, 1)))
 void peak_copy(
     __global const float *restrict values,  // [items*PIECE]

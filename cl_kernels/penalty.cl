@@ -1,8 +1,8 @@
 /* Penalties on the scales s, in scene units, and the opacities o of Gaussians: value and gradient.
  *
- *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and and only thereby the shape
- *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, whatever the size
- *   scale, opacity     sum_j s_j, and o: a pressure on all Gaussians; only Gaussians that images need resist it
+ *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and the shape only indirectly
+ *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, independently of the size
+ *   scale, opacity     sum_j s_j, and o: a pressure on all Gaussians, which only Gaussians that images need resist
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "lanes.h"

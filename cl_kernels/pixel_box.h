@@ -83,14 +83,14 @@ typedef struct {
 /* Derivatives of ln alpha on these lines; of a parameter they are base + by_z shift_by + R r_by with the pixel's
  * R = fixed + by_h wide + by_size narrow. */
 typedef struct {
-    VF base_long, shift_long, r_long;  // by the mean along the larger variance, px^-1
-    VF base_size, shift_size, r_size;  // by ln s
-    VF shift_slope, r_slope;           // by k
-    VF fixed, wide, narrow;            // d ln alpha / dr: the constant part, and the parts by w and by e
+    VF base_long, shift_long, r_long;  // with respect to the mean along the larger variance, px^-1
+    VF base_size, shift_size, r_size;  // with respect to ln s
+    VF shift_slope, r_slope;           // with respect to k
+    VF fixed, wide, narrow;            // d ln alpha / dr: the constant part, and the parts through w and through e
     VF share;                          // t^2 / e^2
 } slopes_t;
 
-/* m and v within the pixel, and their derivatives by y and ln s. */
+/* m and v within the pixel, and their derivatives with respect to y and ln s. */
 typedef struct {
     VF mean, mean_y, mean_s;              // px, 1, px
     VF variance, variance_y, variance_s;  // px^2, px, px^2
@@ -126,7 +126,7 @@ static inline within_t sharp_within(const VF dy, const float s, const rise_t f)
     const VF z = f.z, h = f.h, by_z = dy < 0.0f ? -f.by_z : f.by_z;
     const VF mean = -s * by_z, bounded = smaller(larger(mean, size - 0.5f), size + 0.5f);
     const VF part = 1.0f - f.by_size - by_z * by_z, variance = s * s * part;
-    const VF high = 0.5f * (f.by_h + by_z), low = 0.5f * (f.by_h - by_z);  // densities at the ends, by Z
+    const VF high = 0.5f * (f.by_h + by_z), low = 0.5f * (f.by_h - by_z);  // densities at the ends, divided by Z
     const VF upper = steepness(z + h, f.high) * high, lower = steepness(z - h, f.low) * low;
     const VF zz = lower - upper - by_z * by_z;
     const VF zh = -lower - upper - by_z * f.by_h;
@@ -183,8 +183,8 @@ static inline void line_of(const float *splat, const VF center, line_t *line, sl
 
 /* d ln alpha at a pixel. */
 typedef struct {
-    VF across, along;           // by the mean across and along the larger variance, px^-1
-    VF slope, longer, shorter;  // by k, ln s, ln t
+    VF across, along;           // with respect to the mean across and along the larger variance, px^-1
+    VF slope, longer, shorter;  // with respect to k, ln s, ln t
 } log_slopes_t;
 
 static inline log_slopes_t log_slopes_of(const slopes_t s, const line_t line, const rise_t f)

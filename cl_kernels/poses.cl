@@ -1,9 +1,9 @@
-/* The derivatives of the losses by the pose and the focal length of a camera, as sums over Gaussians.
+/* The derivatives of the losses with respect to the pose and focal length of a camera, as sums over Gaussians.
  *
  * Moving a camera is equivalent to moving all Gaussians the other way: rotating it by -w about its center c rotates
  * means, quaternions and viewing directions by w.  The view-dependent colors do not rotate with them, so the derivative
- * by the direction d from c, which is part of dL/dp, is subtracted.  With a mean p and a quaternion (a, v), whose
- * derivatives are (g_a, g_v), in world axes
+ * with respect to the direction d from c, which is part of dL/dp, is subtracted.  With a mean p and a quaternion (a,
+ * v), whose derivatives are (g_a, g_v), in world axes
  *
  *   shift   sum dL/dp
  *   turn    sum (p - c) x dL/dp - d x dL/dd + 1/2 (a g_v - g_a v + v x g_v)

@@ -1,7 +1,8 @@
 /* Projection of Gaussians to screen ellipses with view-dependent color, and its gradient (backward.h).
  *
- * Kerbl et al. 2023, section 4, with the linearized perspective of Zwicker et al. 2001.  Both filters are numbers:
- * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
+ * Kerbl et al. 2023, section 4, with the linearized perspective of Zwicker et al. 2001.  Both filters are
+ * variances: `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen
+ * covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
  * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant factor, which does not change the derivative by a
  * logit: the sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and `compensate` are 0.
@@ -81,7 +82,7 @@ void project_forward(
     const VF u = camera->fx * s.x * s.inverse_z + camera->cx;
     const VF v = camera->fy * s.y * s.inverse_z + camera->cy;
 
-    /* A Gaussian counts as seen when the rectangle of its 3-sigma radius overlaps the tile grid, as in the reference */
+    /* A Gaussian counts as visible when the rectangle of its 3-sigma radius meets the tile grid, as in the reference */
     const VF middle = 0.5f * (s.xx + s.yy) + screen_variance;
     const VF spread = larger(middle * middle - s.determinant, (VF)(LAMBDA_FLOOR));
     const VF r = ceil(3.0f * sqrt(middle + sqrt(spread)));
@@ -91,7 +92,7 @@ void project_forward(
     VSTORE((seen ? r : (VF)(0.0f)), radius + i);
 
     const VF opacity = sigmoid(VLOAD(logit_opacity + i)) * s.energy * opacity_factor;
-#if PIXEL_BOX  // a pixel shows at most the whole area of the splat
+#if PIXEL_BOX  // a pixel shows at most the full area of the splat
     const VI opaque = opacity * smaller(TWO_PI * sqrt(s.determinant), (VF)(1.0f)) > ALPHA_MIN;
 #else
     const VI opaque = opacity > ALPHA_MIN;

@@ -2,7 +2,7 @@
  *
  *   ray     o the camera's position in units of the field, d toward the pixel's center with depth 1 in the camera; at a
  *           distance t of 1 the cone has the radius 2 / sqrt(12) of a pixel's width (section 3.1)
- *   coarse  edges evenly from near to far; in training each is drawn up to 1/2 interval before or after
+ *   coarse  edges evenly from near to far; in training each is moved at random by up to 1/2 interval
  *   fine    edges at even values of the distribution of the blurred coarse weights (equation 18, alpha 0.01),
  *           w'_k = (max(w_k-1, w_k) + max(w_k, w_k+1)) / 2 + alpha
  *
@@ -71,7 +71,7 @@ void spread_edges(
     const float far,
     const uint samples,              // of a ray
     const uint first_ray,            // of the step
-    const uint drawn,                // 1: up to 1/2 interval before or after, 0: even
+    const uint drawn,                // 1: moved at random by up to 1/2 interval, 0: even
     const uint seed,
     const uint step,
     const uint count)

@@ -1,6 +1,6 @@
-/* A splat seen from the rows of a tile, for CPUs: the values that a row of pixels needs are precomputed for all rows of
- * a tile, LANES at once, so that loops over pixels only read them, without a branch.  The
- * formulas are those of splat.h; the bits are those of splat_at_row. */
+/* A splat at the rows of a tile, for CPUs: the values that a row of pixels needs are precomputed for all rows of
+ * a tile, LANES at once, so that loops over pixels only read them, without a branch.
+ * The formulas are those of splat.h; the results are bit-identical to those of splat_at_row. */
 #ifndef CLSPLAT_ROWS_H
 #define CLSPLAT_ROWS_H
 #include "splat.h"
@@ -80,7 +80,7 @@ static inline row_splat_t splat_on_lines(const float *splat, const float (*lines
 }
 #endif
 
-/* List, for each two rows of a tile, the splats of a segment that may reach them. */
+/* List, for each pair of rows of a tile, the splats of a segment that may reach them. */
 static inline void list_splats(const float16 *segment, const uint length, const uint tile_y,
                                uchar (*lists)[SEGMENT], uint *listed)
 {

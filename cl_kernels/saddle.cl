@@ -1,8 +1,8 @@
-/* The splitting matrix of each Gaussian (SteepGS, Wang et al. 2025): how much its loss improves by splitting it.
+/* The splitting matrix of each Gaussian (SteepGS, Wang et al. 2025): how much a split would lower the loss.
  *
  * On the screen, with p = dL/dpower, the conic K and d = mean - pixel center:
  *
- *   S2 = sum_pixels dL/dalpha Hessian of alpha by the mean = sum_pixels p (K d d^T K - K)
+ *   S2 = sum_pixels dL/dalpha Hessian of alpha with respect to the mean = sum_pixels p (K d d^T K - K)
  *
  * and in the scene S = A^T S2 A with A = d(projected mean)/d(mean), [2,3]: perspective and the shape of the splat are
  * assumed constant over the distance of the children.  One item = one Gaussian.  No local memory.  Deterministic. */
@@ -35,7 +35,7 @@ void accumulate_splitting(
     const float inverse_z = 1.0f / (w[8] * x + w[9] * y + w[10] * z + w[11]);
     const float ray_x = (w[0] * x + w[1] * y + w[2] * z + w[3]) * inverse_z;
     const float ray_y = (w[4] * x + w[5] * y + w[6] * z + w[7]) * inverse_z;
-    float u[3], v[3];  // rows of A, px by scene unit
+    float u[3], v[3];  // rows of A, px per scene unit
     for (uint k = 0; k < 3; k++) {
         u[k] = camera->fx * inverse_z * (w[k] - ray_x * w[8 + k]);
         v[k] = camera->fy * inverse_z * (w[4 + k] - ray_y * w[8 + k]);

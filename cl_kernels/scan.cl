@@ -1,7 +1,8 @@
-/* Exclusive prefix sum of unsigned integers: sum each block, then scan inside blocks, after the sums of earlier ones.
+/* Exclusive prefix sum of unsigned integers: sum each block, then scan inside each block from the sum of the earlier
+ * blocks.
  *
- * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
- * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another.  Sums saturate at
+ * A block is one work-group; each of its TEAM items owns `run` consecutive values, many on CPUs (one item per
+ * group) and few on GPUs.  Integer sums: deterministic.  No group depends on another.  Sums saturate at
  * UINT_MAX, in any order of additions, so that the total is never a small number by mistake. */
 #include "common.h"
 

@@ -1,4 +1,4 @@
-/* An environment map: the color behind the Gaussians for every direction.
+/* An environment map: the color behind the Gaussians in every direction.
  *
  * It is an octahedral map (Meyer et al. 2010, "On floating-point normal vectors", section 2.2): with s = |x| +
  * |y| + |z|, a direction (x, y, z) maps to (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z, y - sign(y) z) / s
@@ -12,10 +12,10 @@
 #include "adam.h"
 #include "planes.h"
 
-#define RUN_WORDS 8   // of a run: row, first column, column after the last, place, the four texels
+#define RUN_WORDS 8   // of a run: row, first column, column after the last, packed position, the four texels
 #define CORNERS 4     // texels around a pixel: (i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)
 #define RUN_SUMS 12   // of a run: for each corner red, green, blue
-#define PLACE_BITS 12 // of i + 1 and j + 1 in a place; then a bit for each of x, y, z that is negative
+#define PLACE_BITS 12 // of i + 1 and j + 1 in a packed position; then a bit for each of x, y, z that is negative
 #define SKY_EPSILON 1.0f  // of Adam: the L1 gradient of one wrong pixel (ours)
 #define BORDER 16         // columns of zeros on either side of the matches; rows: 1
 #define MATCH_FRACTION 0.6f  // of the 3 x 3 pixels around a pixel that must match (splatfacto-w, Xu et al. 2024)
@@ -189,14 +189,14 @@ void sky_cover(
         row_sums[y] = sum_items(sums);
 }
 
-/* Sums of T g w over the pixels of a run, for each corner's weight w and channel of the gradient g by the image.
- * One item = one run.  No local memory. */
+/* Sums of T g w over the pixels of a run, for each corner's weight w and channel of the gradient g with respect to the
+ * image.  One item = one run.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_backward(
     __global const uint *restrict runs,            // [R,RUN_WORDS]
     __constant camera_t *restrict camera,          // [1]
     __global const float *restrict transmittance,  // [H',stride]
-    __global const float *restrict gradient,       // [3 or 4,H',stride] by the image
+    __global const float *restrict gradient,       // [3 or 4,H',stride] with respect to the image
     __global float *restrict run_sums,             // [R,RUN_SUMS]
     const float half_side,                         // side / 2
     const uint plane,                              // H' * stride
@@ -245,9 +245,9 @@ void sky_gather(
     grad_texels[channel * shown + index] = sum;
 }
 
-/* Adam on the learned texels that the view shows, with bias corrections by the updates of each: 1 - BETA^t, by the
- * recursion of the moments for a gradient of 1.  The gradient is in pixels of L1: a texel that is visible in less than
- * a pixel, as behind a wall, hardly changes.  One item = one texel. */
+/* Adam on the learned texels that the view shows, with a bias correction for the number of updates of each texel: 1 -
+ * BETA^t, by the recursion of the moments for a gradient of 1.  The gradient is in pixels of L1: a texel that is
+ * visible in less than a pixel, as behind a wall, hardly changes.  One item = one texel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_update(
     __global const uint *restrict shown_texels,  // [shown]

@@ -1,8 +1,8 @@
 /* The memory layout of the harmonics above band 0, of their moments and of their gradient.
  *
  * They are in planes [(K-1)*3,S], like the other tables; or, with SH_SLOTS, in slots [slots,(K-1)*3,LANES] for the
- * blocks of LANES Gaussians that a view sees, while the host keeps all others.  Value k of row i is at sh_first(..., i)
- * + k * SH_STRIDE(stride). */
+ * blocks of LANES Gaussians that a view shows, while the host keeps all other blocks.  Value k of row i is at
+ * sh_first(..., i) + k * SH_STRIDE(stride). */
 #ifndef CLSPLAT_SLOTS_H
 #define CLSPLAT_SLOTS_H
 #include "lanes.h"

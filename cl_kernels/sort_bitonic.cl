@@ -2,7 +2,7 @@
  *
  * Pairs are first written to their tile in any order (the cursor is an integer atomic), then each tile is sorted by
  * (depth bits, pair).  This order is total, since pairs are unique, so the result does not depend on the order of
- * writing: deterministic.
+ * writes: deterministic.
  *
  * One work-group = one tile of any length: the ascending ("flip") form of the network, in which a partner beyond the
  * end counts as +infinity and is skipped.  Local memory: SORT_CAPACITY * 8 bytes; longer tiles are sorted in place. */

@@ -42,12 +42,12 @@
 #define SUM_ABS_Y 10
 #define SUM_WEIGHT 11  // w, of pixels with a known texture, >= 0
 #define SUM_TEXTURE 12 // w times the texture, of the same pixels
-#define SUM_BLENDED 13 // the texture of those of them that blend the splat: with a texture of 1, their number
+#define SUM_BLENDED 13 // the texture, summed over these pixels where they blend the splat; their number if it is 1
 #define SUM_SQUARE 14  // (dL/dG)^2 with G = e^power, so that alpha = opacity G
 #define SUM_INVERSE_DEPTH 15  // w dL/dD; only with INVERSE_DEPTH, summed separately (inverse_depth.cl)
 
-/* With PIXEL_BOX p = dL/dln(alpha), and SUM_X to SUM_YY are p times the derivatives of ln(alpha), by x and y of the
- * mean and by k, ln s and ln t of pixel_box.h. */
+/* With PIXEL_BOX p = dL/dln(alpha), and SUM_X to SUM_YY are p times the derivatives of ln(alpha) with respect to x and
+ * y of the mean and to k, ln s and ln t of pixel_box.h. */
 
 /* A gradient record is written and read in aligned parts: with one lane, the quads that contain sums; otherwise the
  * whole record. */
@@ -70,7 +70,7 @@ typedef struct {
 #if PIXEL_BOX
 #include "pixel_box.h"
 
-/* A splat seen from LANES pixels of a row. */
+/* A splat at LANES pixels of a row. */
 typedef struct {
     line_t line;
     slopes_t slopes;  // known in the backward pass
@@ -92,7 +92,7 @@ static inline row_splat_t splat_at_pixels(const float *splat, const bool turned,
     return s;
 }
 #else
-/* A splat seen from one row of pixels. */
+/* A splat at one row of pixels. */
 typedef struct {
     float x;           // mean, px
     float dy;          // px
@@ -142,7 +142,7 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
 #else
     k.dx = s.x - pixel;
     const VF power = (k.dx * s.a - s.b) * k.dx - s.c;
-    /* the bound changes no pixel that is hit; without it, distant pixels have subnormal numbers, which are slow */
+    /* the bound changes no pixel that is hit; without it, distant pixels produce subnormal numbers, which are slow */
     k.uncapped = s.opacity * exp_power(larger(power, (VF)(POWER_MIN)));
     const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
     k.hit = (power >= s.power_min) & (power <= 0.0f);

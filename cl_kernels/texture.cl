@@ -1,5 +1,5 @@
 /* Gradient magnitude of an image: |Sobel| / 8 of its luminance (Rec. 601 weights), per px; edge pixels are repeated
- * outwards.
+ * outward.
  *
  * One item = LANES pixels of a row.  No local memory.  Deterministic. */
 #include "splat.h"
@@ -57,7 +57,7 @@ void image_gradient(
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }
 
-/* Set the magnitude of masked pixels and of their neighbors to -1, for unknown.  One item = one pixel. */
+/* Set the magnitude of masked pixels and of their neighbors to -1, which means unknown.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
     __global const float *restrict mask,  // [H',stride] 0 or 1
@@ -84,7 +84,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sample_magnitude(
     __global const float *restrict magnitude,  // [H',stride] per px, negative: unknown
     __global const float *restrict splats,     // [N,RECORD] see splat.h
-    __global const float *restrict radius,     // [S] px, 0 = not seen
+    __global const float *restrict radius,     // [S] px, 0 = not visible
     __global float *restrict total,            // [S]
     const uint width,
     const uint height,

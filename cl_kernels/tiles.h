@@ -1,6 +1,6 @@
 /* The tiles that splats touch: LANES splats at once, or one splat in every lane.
  *
- * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  Pairs are
+ * The rectangle of tiles around a splat's extent contains `columns` x `rows` tiles; each is tested exactly.  Pairs are
  * derived from two numbers: `tile_box`, the rectangle's corner and width, and `tile_mask`, one bit per touched tile,
  * where the rectangle has no more than 32 tiles; larger ones have width BOX_LARGE and are listed by large.cl. */
 #ifndef CLSPLAT_TILES_H
@@ -14,7 +14,7 @@
 typedef struct {
     VF x, y;               // mean, px
     VF xx, xy, yy;         // conic, px^-2
-    VF along_x, along_y;   // where the ellipse is highest over x, and furthest right over y: -xy/yy, -xy/xx
+    VF along_x, along_y;   // where the ellipse is highest over x, and farthest right over y: -xy/yy, -xy/xx
     VF reach;              // -power where alpha is 1/255, plus EXTENT_SLACK / 2
     VF first_x, first_y;   // corner of the rectangle, tiles
     VF columns, rows;      // its size, tiles; 0 if the splat is not visible
@@ -42,7 +42,7 @@ static inline VF end_tile(const VF high, const uint begin, const uint end)
                     (VF)(begin), (VF)(end));
 }
 
-/* The footprint, in a band of rows of tiles, of splats given by the fields of their records. */
+/* The footprint of splats in a band of rows of tiles, from the fields of their records. */
 static inline footprint_t footprint_of(const VF *splat, const VI visible, const uint tiles_x, const uint row_begin,
                                        const uint row_end)
 {

@@ -7,7 +7,7 @@
 #include "planes.h"
 
 #define BINS 96        // twelve octaves, up to 1; the first and the last also count values beyond
-#define BIN_SHIFT 20   // low bits of the mantissa that bins ignore; 3 of 23 are left
+#define BIN_SHIFT 20   // low bits of the mantissa that bins ignore; 3 of 23 remain
 #define FIRST_BIN 920  // (127 - 12) * 8: the upper bits of 2^-12
 
 /* Residuals and their histogram.  One group of TEAM items = one row.  Local memory: BINS * 4 bytes. */
@@ -46,8 +46,8 @@ void measure_residuals(
             atomic_add(numbers + k, row_counts[k]);
 }
 
-/* 1 in pixels whose residual is below a threshold, or with a box around them in which at least as many residuals are
- * below it as not; else 0.  One item = one pixel; dimension 1 is the row. */
+/* 1 in pixels whose residual is below a threshold, or around which a box has at least as many residuals below it as
+ * not; else 0.  One item = one pixel; dimension 1 is the row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mask_transients(
     __global const float *restrict residuals,  // [H',stride]

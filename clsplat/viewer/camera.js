@@ -72,7 +72,8 @@ function fitted(lens, width, height) {
 }
 
 // The values of a camera on a canvas for the shaders.  exact: clamp rays as `clsplat render` does for the camera's
-// image; otherwise beyond the canvas, which shows more than that image.  native: the focal length with a scale of 1.
+// image; otherwise clamp them beyond the canvas, which shows more than that image.  native: the focal length with a
+// scale of 1.
 function framed(camera, width, height, exact, native = 1) {
   const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitted(camera.lens, width, height);
   const intrinsics = [fx * enlarged, fy * enlarged, cx * enlarged + left, cy * enlarged + top];
@@ -88,7 +89,7 @@ function framed(camera, width, height, exact, native = 1) {
 const written = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
   .map(part => part.map(v => +v.toPrecision(8)).join(",")).join(";");
 
-// Read the camera, and the timestamp if there is one, from an address' part after #; null if it has no camera.
+// Read the camera, and the timestamp if there is one, from the fragment (#) of an address; null if it has no camera.
 function read(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
   if (![3, 4].includes(parts.length) || parts.some((part, i) => part.length !== [3, 4, 6, 1][i])) return null;

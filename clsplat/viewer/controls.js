@@ -37,7 +37,7 @@ class Controls {
     const now = [event.clientX, event.clientY], shift = add(now, before, -1);
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
     this.pointers.set(event.pointerId, now);
-    if (other) { // two fingers: each event moves their center by half of the shift, and changes their distance
+    if (other) { // two fingers: each event moves their center by half of its shift, and changes their distance
       this.pan(scaled(shift, 0.5));
       this.dolly(size(add(before, other, -1)) / Math.max(1, size(add(now, other, -1))));
     } else if (this.pans) this.pan(shift);

@@ -30,7 +30,8 @@ const rowsOf = (count, texels) => Math.max(1, Math.ceil(count / splatsInRow(texe
 // An array for a texture with complete rows.
 const padded = (kind, count, texels, each) => new kind(rowsOf(count, texels) * splatsInRow(texels) * texels * each);
 
-// header, buffer: from packing.py; most: largest number of rows of a texture.  Drops the least important splats beyond.
+// header, buffer: from packing.py; most: largest number of rows of a texture; the least important splats that exceed
+// it are dropped.
 function unpacked(header, buffer, most) {
   const whole = header.count, texels = colorTexels(header.degree);
   const count = Math.min(whole, most * splatsInRow(texels), most * ROW);

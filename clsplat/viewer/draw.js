@@ -125,7 +125,7 @@ class Painter {
     this.gl.uniform1f(used.at("moment"), moment);
   }
 
-  // Compute the colors of the first splats, unless they are known for this camera position and timestamp.
+  // Compute the colors of the first splats, unless they were computed for this camera position and timestamp.
   shade(layer, eye, first, moment) {
     const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colors;
     if (key === layer.key) return;

@@ -1,4 +1,4 @@
-// The page: when it draws, and at which quality.
+// The page: when to draw, and at which quality.
 
 const REST = 200, SLOW = 40, QUICK = 20; // ms without a change before the full image; ms per frame
 
@@ -121,7 +121,7 @@ class Viewer extends Walk {
     }
   }
 
-  // The picture as it is, as a file.
+  // Save the current image as a file.
   screenshot() {
     this.draw(true);
     this.canvas.toBlob(blob => {

@@ -7,7 +7,7 @@ class Walk {
     this.pivot = info.pivot;
   }
 
-  // Take the camera and the timestamp from the address; return whether it has a camera.
+  // Read the camera and the timestamp from the address; return whether it has a camera.
   adopt() {
     const camera = location.hash === this.hash ? null : read(location.hash);
     if (camera) this.move(camera);
@@ -18,7 +18,7 @@ class Walk {
     return !!camera;
   }
 
-  // Move to a camera that is not that of a photo.
+  // Move to a camera that belongs to no photo.
   move(camera) {
     this.flight = null;
     this.at = -1;

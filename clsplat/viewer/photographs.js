@@ -2,7 +2,7 @@
 
 const COMPARISONS = ["off", "slider", "blink", "fade"], BLINK = 600; // ms
 
-// The start that all names share, up to a separator, such as "images/IMG_2024_".
+// The prefix that all names share, up to a separator, such as "images/IMG_2024_".
 function commonPrefix([first = "", ...others]) {
   let length = first.length;
   for (const name of others) while (!name.startsWith(first.slice(0, length))) length--;
@@ -103,7 +103,7 @@ class Photographs {
     if (!this.bar.hidden) this.compare(COMPARISONS[(COMPARISONS.indexOf(this.comparison) + 1) % COMPARISONS.length]);
   }
 
-  // Lay the photo exactly over the area that its camera sees.
+  // Place the photo exactly over the area that its camera shows.
   place() {
     if (this.frame.hidden || this.chosen < 0) return;
     const {width, height} = this.viewer.pane(), {lens} = this.views[this.chosen];

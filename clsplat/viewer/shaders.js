@@ -133,7 +133,7 @@ void main() {
   vec2 offset = reach * (corner.x * radii.x * along + corner.y * radii.y * across);
   p = corner * reach;
   if (mode == 1) { p = corner; offset = corner * dot_radius; }
-  if (mode == 2 && (opacity < .2 || reach * radii.x > .3 * max(size.x, size.y))) return;  // what would hide the rest
+  if (mode == 2 && (opacity < .2 || reach * radii.x > .3 * max(size.x, size.y))) return;  // would hide all other splats
   vec2 at = intrinsics.xy * m.xy / m.z + intrinsics.zw + offset;
   gl_Position = vec4(at.x / size.x * 2. - 1., 1. - at.y / size.y * 2., 0, 1);
   shade = vec4(mode == 3 ? ramp(opacity) : texelFetch(colors, spot(i), 0).rgb, opacity);

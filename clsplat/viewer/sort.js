@@ -1,7 +1,7 @@
 // Sort splats from back to front in a worker: two counting sorts of 16 bits order depths exactly, since the bits of
-// positive floats have the order of their values.  Splats in front of the near plane are dropped.
+// positive floats are ordered as their values.  Splats in front of the near plane are dropped.
 
-// The presence of splat i at a time dt after that at which it is most opaque; motion: {rows, stride, bends}.
+// The presence of splat i at a time dt after the time at which it is most opaque; motion: {rows, stride, bends}.
 function presence({rows, stride}, i, dt) {
   const late = dt * Math.exp(-rows[i * stride + 4]);
   return Math.exp(-late * late / 2);
@@ -78,7 +78,7 @@ class Sorter {
     this.worker.postMessage({positions, motion}, [positions.buffer]);
     this.near = near;
     this.number = 0; // of the last request
-    this.busy = this.current = false; // current: the last order is of the last request
+    this.busy = this.current = false; // current: the last order answers the last request
     this.worker.onmessage = ({data}) => {
       this.busy = false;
       this.current = data.number === this.number;

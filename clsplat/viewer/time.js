@@ -23,7 +23,7 @@ class Clock {
     this.show();
   }
 
-  // Go to a timestamp, and leave a photo of another one.
+  // Go to a timestamp, and leave a photo that was taken at another time.
   to(moment) {
     const {viewer} = this, shown = viewer.photographs.views[viewer.photographs.chosen];
     viewer.moment = Math.max(0, Math.min(1, moment));

@@ -1,7 +1,7 @@
-// What the page asks of the run: its state now and then, and pictures one at a time.
+// The requests of the page to the run: its state at intervals, and images one at a time.
 
 const STATE = 1000, HIDDEN = 10000, AGAIN = 1000, PATIENCE = 250, PUMP = 60; // ms
-const PAGE = Math.floor(Math.random() * 1e9); // of two pages one does not take the place of the other in the queue
+const PAGE = Math.floor(Math.random() * 1e9); // the queue of the run tells two pages apart by it
 
 class Link {
   constructor(live) {
@@ -29,7 +29,7 @@ class Link {
     this.poll();
   }
 
-  // Ask for a picture where the one that is shown is not of this camera, or not of this step.
+  // Request an image if the visible one is of another camera or another step.
   pump() {
     const {live, waiting} = this, now = performance.now(), wish = live.wish();
     if (!wish || document.hidden || now < (this.rest ?? 0)) return;
@@ -45,7 +45,7 @@ class Link {
       const answer = await fetch(`frame.jpg?page=${PAGE}&pace=${order.pace}&${order.key}`);
       if (answer.status === 200) {
         const bitmap = await createImageBitmap(await answer.blob());
-        if (order.number > this.shown) { // a newer one may have come while this one was decoded
+        if (order.number > this.shown) { // a newer image may have arrived while this one was decoded
           [this.shown, this.arrived] = [order.number, performance.now()];
           this.live.show({...order, bitmap, step: +answer.headers.get("X-Step")});
         } else bitmap.close();

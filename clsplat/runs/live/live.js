@@ -1,4 +1,4 @@
-// The page: the newest picture, moved along with the camera until the next one comes.
+// The page: the newest image, moved along with the camera until the next one arrives.
 
 const MOVING = 250; // ms since the last change of the camera
 
@@ -13,7 +13,7 @@ class Live extends Walk {
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
     addEventListener("hashchange", () => this.adopt());
-    find("strip").addEventListener("error", ({target}) => { // it was not read in time
+    find("strip").addEventListener("error", ({target}) => { // the thumbnail was not read in time
       if (target.src && !target.src.endsWith("&")) setTimeout(() => { target.src += "&"; }, 5000);
     }, true);
     if (!this.adopt() && info.first >= 0) this.photographs.choose(info.first, 0);
@@ -38,7 +38,7 @@ class Live extends Walk {
     this.draw();
   }
 
-  // The camera of the next picture: that of a view, or of the stage; pace: as in preview.py.
+  // The camera of the next image: that of a view, or that of the stage.  pace: as in preview.py.
   wish() {
     if (!this.state.drawn || this.state.ended) return null;
     const {width, height} = this.pane(), exact = this.at >= 0;
@@ -46,7 +46,7 @@ class Live extends Walk {
     const {intrinsics} = framed(this.camera, width, height, false), lens = [...intrinsics, width, height];
     const camera = exact ? this.camera : {...this.camera, lens};
     if (exact) this.moment = this.info.views[this.at].time;
-    const then = this.moment === undefined ? "" : `&time=${this.moment}`; // that of the photograph last chosen
+    const then = this.moment === undefined ? "" : `&time=${this.moment}`; // of the last chosen photograph
     const key = exact ? `view=${this.at}` : `camera=${written(camera)}${then}`, same = this.newest?.key === key;
     const moving = performance.now() - this.changed < MOVING || this.controls.pointers.size > 0 && !same;
     if (moving) return same ? null : {key, camera, pace: "moving"};
@@ -74,7 +74,7 @@ class Live extends Walk {
     if (this.newest) this.describe();
   }
 
-  // Lay the picture where its plane at the distance of the pivot is seen from the camera of now.
+  // Move the image to where its plane at the distance of the pivot is visible from the current camera.
   paint(pen, frame, ratio) {
     const {bitmap, camera} = this.newest, [fx, fy, cx, cy, width, height] = camera.lens;
     const depth = Math.max(0.05 * this.radius, dot(axis(camera, 2), add(this.pivot, camera.eye, -1)));
@@ -100,7 +100,7 @@ class Live extends Walk {
 
   pause() { if (!find("pause").disabled) link.press(!this.state.paused); }
 
-  focus() {} // a picture has no depths
+  focus() {} // an image has no depths
 
   screenshot() {
     this.canvas.toBlob(blob => {
@@ -113,7 +113,7 @@ class Live extends Walk {
   }
 }
 
-// The run as the page tells of it, with its scene once there is one.
+// The state of the run, with its scene as soon as it has been read.
 class Watch {
   constructor() {
     this.curves = new Curves();
@@ -167,7 +167,7 @@ class Watch {
 
   end({state, message}) {
     const how = {done: "The run is done", failed: "The run has failed", interrupted: "The run was interrupted"}[state];
-    const folder = "; its folder holds viewer.html and report.html";
+    const folder = "; its folder contains viewer.html and report.html";
     return `${how ?? "The run has ended"}${message ? `: ${message}` : folder}.`;
   }
 
