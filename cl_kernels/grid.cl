@@ -4,7 +4,7 @@
  *   position mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
  *            the variances along the three axes, as for a sphere
  *   level    a cube of n^3 cells; each of the (n + 1)^3 corners has an entry of GRID_FEATURES values.  Where a level
- *            has fewer entries, several corners share one: index (x ^ y * HASH_Y ^ z * HASH_Z) modulo the entries (equation 4)
+ *            has fewer entries, corners share them: index (x ^ y * HASH_Y ^ z * HASH_Z) modulo the entries (equation 4)
  *   feature  w * (trilinear mean of the 8 entries around u), w = erf(1 / sqrt(8 v n^2)), by erf(x) ~ sqrt(1 - exp(-4/pi
  *            x^2)), whose error is at most 0.7 %: so w = sqrt(1 - exp(-1 / (2 pi v n^2)))
  *

@@ -2,7 +2,7 @@
  *
  * A row of the table `motion` is (planes of [W,S])
  *
- *   0-2 velocity v = b_1 · 3 center tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c (4 planes)
+ *   0-2 velocity v = b_1 · 3 center tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c, 4 planes
  *
  * With dt = t - tau, times in [0, 1] over the scene (FreeTimeGS, Wang et al. 2025; Spacetime Gaussians, Li et al.
  * 2024):

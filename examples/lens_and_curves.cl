@@ -11,8 +11,8 @@
 #define SUMS (5 + 3 * NODES)  // gradients of the center, of a, b, c, and of the slopes of each channel
 
 /* Forward: the response to an image.  Backward: the gradient with respect to the image, from that with respect to the
- * response, and the row sums from which the parameters' gradient follows.  numbers: a, b, c, then the slopes of each
- * channel; center: px; per_px: px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
+ * response, and the row sums from which the parameters' gradient follows.  numbers: a, b, and c, then the slopes of
+ * each channel; center: px; per_px: px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void camera_response(
     __global const float *restrict image, __global const float *restrict gradient,  // [channels,H',stride] 3 or 4
