@@ -66,15 +66,15 @@ class World:
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SURFACE_OFFSET * normal
         to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
-        lit = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
+        key_light = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
         above = self if self.canopy is None else replace(self, shapes=self.canopy)
         distance, blocker = above.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
-        near = np.flatnonzero(np.isfinite(distance))
-        blocking_points = start[:, near] + distance[near] * to_sky[:, near]
-        light[:, near] *= BOUNCE * above.by_shape(Shape.texture, blocker[near], blocking_points)
-        return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * lit + light))
+        occluded = np.flatnonzero(np.isfinite(distance))
+        blocking_points = start[:, occluded] + distance[occluded] * to_sky[:, occluded]
+        light[:, occluded] *= BOUNCE * above.by_shape(Shape.texture, blocker[occluded], blocking_points)
+        return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * key_light + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:
         """Return the origin [3, 1] and unit directions [3, R] of the rays through the image positions (x, y) in pixels.

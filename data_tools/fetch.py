@@ -177,10 +177,10 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
     """Yield the name, the size, and a function that opens it, for each regular file.  Links and devices are skipped."""
     if zipfile.is_zipfile(archive):
-        with zipfile.ZipFile(archive) as zipped:
+        with zipfile.ZipFile(archive) as zip_file:
             yield [
-                (info.filename, info.file_size, lambda info=info: zipped.open(info))  # type: ignore[misc]
-                for info in zipped.infolist()
+                (info.filename, info.file_size, lambda info=info: zip_file.open(info))  # type: ignore[misc]
+                for info in zip_file.infolist()
                 if not info.is_dir() and (info.external_attr >> 28) != 0o12
             ]
     elif tarfile.is_tarfile(archive):

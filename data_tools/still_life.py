@@ -59,11 +59,11 @@ def grain(p: Array) -> Array:
 
 def planks(p: Array) -> Array:
     """Paint boards of different tones, each 0.25 wide, with dark joints."""
-    across = p[1] / 0.25 + 0.5
-    row = np.floor(across)
+    board_position = p[1] / 0.25 + 0.5
+    row = np.floor(board_position)
     tone = scramble(row.astype(np.int64).astype(np.uint32) * np.uint32(PRIMES[0]))
     wood = mix((0.66, 0.40, 0.19), (0.26, 0.12, 0.045), grain(p + 3.7 * row)) * (0.75 + 0.5 * tone)
-    return mix(wood, (0.05, 0.025, 0.012), np.abs(across - np.round(across)) < 0.025)
+    return mix(wood, (0.05, 0.025, 0.012), np.abs(board_position - np.round(board_position)) < 0.025)
 
 
 def chessboard(p: Array) -> Array:

@@ -40,16 +40,16 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     remove_partial_files(out, border=PIPELINE)
-    chosen = _read_chosen_frames(out, settings)
-    if chosen is None:
+    frame_indices = _read_chosen_frames(out, settings)
+    if frame_indices is None:
         LOG.info("%s: looking for sharp frames", video)
         sharpnesses, motions = _measure_frames(video)
         if len(sharpnesses) == 1:
             raise DataError(f"{video}: has only one frame; use a photograph directly, without `clsplat data video`")
-        chosen = sharpest(sharpnesses, motions, frames)
-        LOG.info("%d frames, of which %d are written", len(sharpnesses), len(chosen))
-        write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")
-    files = {index: _file(out, i) for i, index in enumerate(chosen, 1)}
+        frame_indices = sharpest(sharpnesses, motions, frames)
+        LOG.info("%d frames, of which %d are written", len(sharpnesses), len(frame_indices))
+        write_text(out / RECORD, json.dumps({**settings, "chosen": frame_indices}) + "\n")
+    files = {index: _file(out, i) for i, index in enumerate(frame_indices, 1)}
     count = Count("frames written", len(files))
     missing = {index for index, path in files.items() if not _is_readable(path)}
     for index, image in enumerate(decode_frames(video) if missing else ()):
@@ -72,16 +72,16 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
     record: dict[str, Any] = {}
     with suppress(DataError, ValueError, TypeError):
         record = dict(read_json(out / RECORD))
-    chosen: list[int] | None = record.pop("chosen", None)
-    if not _are_frame_indices(chosen):  # damaged: choose the frames again
-        chosen = None
+    frame_indices: list[int] | None = record.pop("chosen", None)
+    if not _are_frame_indices(frame_indices):  # damaged: choose the frames again
+        frame_indices = None
     if record and record != settings:
         differences = [name for name, value in settings.items() if record.get(name) != value]
         raise DataError(
             f"{out}: holds frames that were extracted with another {' and another '.join(differences)}; use another "
             "folder, or remove it"
         )
-    count = len(chosen) if chosen else settings["frames"] if record else 0
+    count = len(frame_indices) if frame_indices else settings["frames"] if record else 0
     expected = {_file(out, i) for i in range(1, count + 1)}
     other_images = sorted(
         path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected
@@ -90,7 +90,7 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
         raise DataError(
             f"{out}: already holds {len(other_images)} other images, such as {other_images[0].name}; use another folder"
         )
-    return chosen
+    return frame_indices
 
 
 def _file(out: Path, number: int) -> Path:

@@ -86,10 +86,10 @@ def _expand_set(arguments: list[str]) -> list[str]:
 
 def _expand_live(arguments: list[str]) -> list[str]:
     """Expand `--live` without a number to `--live=0`."""
-    following = [*arguments, ""][1:]
+    next_args = [*arguments, ""][1:]
     return [
-        f"{LIVE}=0" if argument == LIVE and not after.isdecimal() else argument
-        for argument, after in zip(arguments, following, strict=True)
+        f"{LIVE}=0" if argument == LIVE and not next_arg.isdecimal() else argument
+        for argument, next_arg in zip(arguments, next_args, strict=True)
     ]
 
 

@@ -68,10 +68,10 @@ class Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name = args[0]
         if not name.startswith("-") and not ctx.resilient_parsing and self.get_command(ctx, name) is None:
-            near = SYNONYMS.get(name) or next(iter(difflib.get_close_matches(name, self.list_commands(ctx), n=1)), None)
-            if near is None and name in self.get_command(ctx, "data").commands:
-                near = f"data {name}"
-            hint = f"did you mean '{near}'?" if near else "`clsplat --help` lists them"
+            best = SYNONYMS.get(name) or next(iter(difflib.get_close_matches(name, self.list_commands(ctx), n=1)), None)
+            if best is None and name in self.get_command(ctx, "data").commands:
+                best = f"data {name}"
+            hint = f"did you mean '{best}'?" if best else "`clsplat --help` lists them"
             raise ConfigError(f"no command '{name}'; {hint}")
         return super().resolve_command(ctx, args)
 

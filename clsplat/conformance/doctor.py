@@ -208,7 +208,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
     """Run all checks on a device; None chooses the default one.  Raises DeviceError if no device works."""
     info = device.info if isinstance(device, Device) else choose(device)
     default = resolve_schedule(info, "auto")
-    report, started = DeviceReport(info, default), time.perf_counter()
+    report, start_time = DeviceReport(info, default), time.perf_counter()
     LOG.info("device: %s; this takes a minute or two on a CPU", info.text)
     for schedule in SCHEDULES:
         if not _is_due(schedule, report):
@@ -224,7 +224,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
     for result in run_checks(info, default, SPEED):
         report.once.append(result)
         LOG.info("%s", progress("", result))
-    report.seconds = time.perf_counter() - started
+    report.seconds = time.perf_counter() - start_time
     return report
 
 

@@ -31,9 +31,9 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
     info = next(info for info in list_devices() if info.index == (platform, number))
     open_once = cache(lambda: Device(info, schedule))
     for name in names:
-        started = time.perf_counter()
+        start_time = time.perf_counter()
         _run(out, BY_NAME[name], open_once)
-        _print(out, end=name, seconds=round(time.perf_counter() - started, 3))
+        _print(out, end=name, seconds=round(time.perf_counter() - start_time, 3))
 
 
 def _run(out: TextIO, check: Check, open_once: Callable[[], Device]) -> None:

@@ -54,8 +54,8 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     Raises OutputError if the heartbeat in the run's status next to the file is recent.
     """
     owner = read_owner(file)
-    holder, this = Owner.from_record(owner), Owner.current()
-    if holder is None or (holder.boot == this.boot if owner.get("boot") and this.boot else holder.host == this.host):
+    holder, local = Owner.from_record(owner), Owner.current()
+    if holder is None or (holder.boot == local.boot if owner.get("boot") and local.boot else holder.host == local.host):
         return {}
     heartbeat = _heartbeat(path)
     if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:

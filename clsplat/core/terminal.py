@@ -211,15 +211,15 @@ class _RunBar:
         return self.bar
 
     def _training_text(self, step: int, steps: int) -> str:
-        time_now = time.monotonic()
+        now = time.monotonic()
         if self.last and self.last[1].steps == steps:
             since, report = self.last
-            seconds_left = max(0.0, report.seconds_left - (time_now - since))
+            seconds_left = max(0.0, report.seconds_left - (now - since))
             return progress_line(replace(report, step=step, seconds_left=seconds_left))
         if self.first is None or self.first[2] != steps:
-            self.first = time_now, step, steps
+            self.first = now, step, steps
         since, start_step, _ = self.first
-        seconds = (time_now - since) / (step - start_step) * (steps - step) if step > start_step else None
+        seconds = (now - since) / (step - start_step) * (steps - step) if step > start_step else None
         return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
 
 

@@ -164,12 +164,12 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
     rows = edit.rows()
     rule_index[rows == 1] = -1
     causes: dict[str, int] = {}
-    grown: dict[str, int] = {}
+    growth_counts: dict[str, int] = {}
     for index, rule in active_rules:
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((rule_index == index).sum())
-        grown[name] = grown.get(name, 0) + int(((rule_index == index) & (rows > 1)).sum())
-    return Change(old_count, int(rows.sum(dtype=np.int64)), causes, grown)
+        growth_counts[name] = growth_counts.get(name, 0) + int(((rule_index == index) & (rows > 1)).sum())
+    return Change(old_count, int(rows.sum(dtype=np.int64)), causes, growth_counts)
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:

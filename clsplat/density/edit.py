@@ -214,8 +214,8 @@ class Edit:
     def undo_growth(self, mask: NDArray[np.bool_]) -> None:
         """Undo the growth of the Gaussians of a mask, [N]; the edit then leaves them unchanged."""
         mask = mask & (self.rows() > 1)
-        for array, unchanged in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
-            array.set(np.where(mask, unchanged, array.get()))
+        for array, unchanged_value in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
+            array.set(np.where(mask, unchanged_value, array.get()))
 
     def limit(self, limit: int) -> None:
         """Undo growth until at most `limit` rows remain.

@@ -387,12 +387,12 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
 def _write_folder(path: Path, images: dict[str, bytes]) -> str:
     """Write the images and then meta.json, so that an old model stays valid until then; remove unused images."""
     old_files, new_files = set(sog_folder_files(path)), {path.with_name(name) for name in images}
-    unused = new_files - old_files
+    obsolete_files = new_files - old_files
     try:
         sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
-        unused = old_files - new_files
+        obsolete_files = old_files - new_files
     finally:
-        for file in unused - set(sog_folder_files(path)):
+        for file in obsolete_files - set(sog_folder_files(path)):
             if file.suffix == ".webp":
                 with suppress(OSError):
                     file.unlink()

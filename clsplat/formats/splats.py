@@ -56,8 +56,8 @@ def motion_degree(width: int) -> int:
 
 def motion_fields(width: int) -> dict[str, slice]:
     """Return the column slice of each field, by name and in order, of a motion table with `width` columns."""
-    degree, turns = WIDTHS[width]
-    names = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
+    degree, has_turn = WIDTHS[width]
+    names = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * has_turn]
     ends = accumulate(FIELDS[name] for name in names)
     return {name: slice(end - FIELDS[name], end) for name, end in zip(names, ends, strict=True)}
 

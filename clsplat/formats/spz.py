@@ -140,7 +140,7 @@ def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Param
             if name == "means":
                 block[:] = _positions(header, data)
             elif name == "quats":
-                block[:] = _three_bytes(data) if header.version < 3 else _four_bytes(data)
+                block[:] = _unpack_3_byte_quats(data) if header.version < 3 else _unpack_4_byte_quats(data)
             else:
                 block[:] = levels[name][data[:, : widths[name]]]
     return parameters
@@ -154,13 +154,13 @@ def _positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32
     return (integers.astype(np.float32) / np.float32(2**header.fraction)).reshape(-1, 3)
 
 
-def _three_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _unpack_3_byte_quats(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
-def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _unpack_4_byte_quats(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
     bits = packed.view("<u4")[:, 0]
     fields = [bits >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     components = np.stack([(field & 511) / 511 * 0.5**0.5 * np.where(field & 512, -1, 1) for field in fields], axis=1)
@@ -225,8 +225,8 @@ def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int
     size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(size + np.log2(relative) + fraction), 0, MAX_ZEROS)) if relative else 1.0
     multiples = np.rint(p["means"].astype(np.float64) * 2**fraction / step) * step
-    fixed = np.minimum(multiples, MAX_INT24 + 1 - step).astype("<i4")
-    return np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
+    fixed_point = np.minimum(multiples, MAX_INT24 + 1 - step).astype("<i4")
+    return np.ascontiguousarray(fixed_point.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
 
 
 def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
@@ -434,8 +434,8 @@ class _Gzip:
         """Raise DataError if the last gzip member is incomplete or followed by other data."""
         if not self.stream.eof:
             raise DataError(f"{self.path}: is truncated before the checksum of its gzip data; copy or export it again")
-        if rest := len(self.stream.unused_data) + len(self.file.read()):
-            raise DataError(f"{self.path}: has {rest} bytes after its gzip data; copy or export it again")
+        if trailing_bytes := len(self.stream.unused_data) + len(self.file.read()):
+            raise DataError(f"{self.path}: has {trailing_bytes} bytes after its gzip data; copy or export it again")
 
 
 def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:

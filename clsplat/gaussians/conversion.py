@@ -132,8 +132,8 @@ def convert(
         raise ConfigError("convert: give a model file to read and one to write")
     check_output(sources, out)
     changes = changes or Changes()
-    writing = writing_options(out, quality, changes)
-    return write_model(sources, changes.apply(read(sources)), out, writing)
+    options = writing_options(out, quality, changes)
+    return write_model(sources, changes.apply(read(sources)), out, options)
 
 
 def read(sources: Sequence[Path]) -> Model:
@@ -279,7 +279,7 @@ def convert_frames(
     for file in files:
         check_output(sources, file)
     _require_no_others(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
-    writing, model = writing_options(files[0], quality, changes), read(sources)
+    options, model = writing_options(files[0], quality, changes), read(sources)
     changes_by_frame = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for change in changes_by_frame:  # check all before anything is written
         try:
@@ -289,7 +289,7 @@ def convert_frames(
     results: list[dict[str, Any]] = []
     with _restore_on_failure([*files, *map(sky_path, files)]):
         for file, change in zip(files, changes_by_frame, strict=True):
-            results.append(write_model(sources, change.apply(model), file, replace(writing, quiet=bool(results))))
+            results.append(write_model(sources, change.apply(model), file, replace(options, quiet=bool(results))))
     return {
         **results[0],
         "file": str(out),
@@ -446,5 +446,5 @@ def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArra
     if neighbors < 2:
         return np.full(len(positions), extent**2)
     distances = scipy.spatial.cKDTree(positions).query(positions, k=neighbors, workers=-1)[0]
-    mean2: NDArray[np.float64] = np.square(distances[:, 1:]).mean(axis=1)
-    return np.maximum(mean2, MIN_DISTANCE2 * extent**2)
+    mean_squares: NDArray[np.float64] = np.square(distances[:, 1:]).mean(axis=1)
+    return np.maximum(mean_squares, MIN_DISTANCE2 * extent**2)

@@ -183,7 +183,7 @@ class Gaussians:
 
         rows: [n] integers, see `check_rows`.  Raises ValueError for invalid rows.
         """
-        uploaded = self.device.upload(check_rows(rows, self.count))
+        device_rows = self.device.upload(check_rows(rows, self.count))
         for name in names:
             table = self._up_to_date(name)
             if self.on_host and name in self.on_host:
@@ -191,7 +191,7 @@ class Gaussians:
                 continue
             self._rows.zero_rows(
                 items=(len(rows), table.components),
-                rows=uploaded,
+                rows=device_rows,
                 table=table.array,
                 stride=self.capacity,
                 count=len(rows),

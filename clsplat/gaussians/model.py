@@ -285,12 +285,12 @@ class Model:
         if self.filter_variance is None:
             return self
         scale2 = np.exp(np.clip(2 * self.log_scales.astype(np.float64), -MAX_EXPONENT, MAX_EXPONENT))
-        filtered2 = scale2 + self.filter_variance.astype(np.float64)
-        opacity = np.sqrt(np.prod(scale2 / filtered2, axis=1, keepdims=True))
+        filtered_scale2 = scale2 + self.filter_variance.astype(np.float64)
+        opacity = np.sqrt(np.prod(scale2 / filtered_scale2, axis=1, keepdims=True))
         opacity /= inverse_opacities(self.logit_opacity)
         with np.errstate(divide="ignore"):
             logit = np.log(opacity) - np.log1p(-opacity)
-        log_scales = (0.5 * np.log(filtered2)).astype(np.float32)
+        log_scales = (0.5 * np.log(filtered_scale2)).astype(np.float32)
         logits = np.clip(logit, MIN_LOGIT, -MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 

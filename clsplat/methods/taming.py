@@ -95,9 +95,9 @@ class GrowScored(ByScore):
         for group, fraction in ((is_clone, (is_undone & is_clone).sum() / is_undone.sum()), (~is_clone, 1.0)):
             order = sampling_order((rows > 1) & group, score, random)
             added_rows = np.cumsum(rows[order] - 1)
-            fits = added_rows <= round(fraction * room)
-            is_undone[order[fits]] = False
-            room -= int(added_rows[fits][-1]) if fits.any() else 0
+            is_affordable = added_rows <= round(fraction * room)
+            is_undone[order[is_affordable]] = False
+            room -= int(added_rows[is_affordable][-1]) if is_affordable.any() else 0
         edit.undo_growth(is_undone)
 
 

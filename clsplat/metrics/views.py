@@ -193,8 +193,8 @@ def fit_colors(
     others remain.
     """
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
-    middle, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
-    left, right = np.s_[:, :middle], np.s_[:, middle:]
+    half_width, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
+    left, right = np.s_[:, :half_width], np.s_[:, half_width:]
     min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
     if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
         return None
@@ -355,8 +355,8 @@ def measure(
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
-        extra = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, extra, color, static_psnr))
+        scores = perceptual.measure(rendered, image)
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, scores, color, static_psnr))
         if results[-1].psnr < EMPTY_PSNR and painter.render_layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
             empty_names.append(view.name)
     if empty_names:

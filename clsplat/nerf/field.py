@@ -113,9 +113,9 @@ class Levels:
 
     def render(self, parameters: Array, rays: Rays) -> Iterator[SampleLevel]:
         """Render rays: yield the coarse level, then the fine level."""
-        coarse = self._level(parameters, rays, self._coarse_edges(rays), "coarse")
-        yield coarse
-        yield self._level(parameters, rays, self._fine_edges(coarse), "fine")
+        level = self._level(parameters, rays, self._coarse_edges(rays), "coarse")
+        yield level
+        yield self._level(parameters, rays, self._fine_edges(level), "fine")
 
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
         """Add the gradient of the loss of the last rendered level to `gradient`, [P].
@@ -253,8 +253,8 @@ class Field:
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the image of the fine level, [3, rows, stride], zero outside the camera's pixels."""
         image = self._empty(camera)
-        for _, fine in self._passes(camera):
-            self.levels.write_colors(fine, image)
+        for _, level in self._passes(camera):
+            self.levels.write_colors(level, image)
         return image
 
     def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
@@ -264,9 +264,9 @@ class Field:
         """
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
-        for pixels, fine in self._passes(camera):
-            self.levels.write_colors(fine, image)
-            weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
+        for pixels, level in self._passes(camera):
+            self.levels.write_colors(level, image)
+            weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (level.weights, level.edges))
             opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
             alpha[pixels] = np.minimum(opacity, 1)  # rounding may exceed 1
             mean_depths = np.divide(weighted_depth, opacity, out=np.zeros_like(opacity), where=opacity > 0)
@@ -285,5 +285,5 @@ class Field:
         for first in range(0, len(pixels), count):
             batch = pixels[first : first + count]
             rays = self.levels.cast(camera, self.workspace.device.upload(batch))
-            *_, fine = self.levels.render(self.parameters, rays)
-            yield batch, fine
+            *_, level = self.levels.render(self.parameters, rays)
+            yield batch, level

@@ -118,8 +118,8 @@ class Network:
 
     def _trunk_outputs(self, i: int, tiles: int) -> Array:
         """Return the outputs of layer i of the trunk, with room for the encoded position if it is appended there."""
-        extra = self.shape.position_rows if i == self.shape.skip else 0
-        return self._table(f"hidden {i}", tiles, self.shape.width + extra)
+        extra_rows = self.shape.position_rows if i == self.shape.skip else 0
+        return self._table(f"hidden {i}", tiles, self.shape.width + extra_rows)
 
     def _table(self, name: str, tiles: int, rows: int) -> Array:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))

@@ -153,14 +153,14 @@ class LearnedField(TrainedField):
 
     def loss(self, coarse_weight: float) -> tuple[float, float]:
         """Return the loss of the last step, and the mean squared difference of its fine level."""
-        coarse, fine = (
+        coarse_loss, fine_loss = (
             sum(
                 scale * float(photo_errors.sum(dtype=np.float64))
                 for (_, scale), photo_errors in zip(self._scales, self._split_by_photo(array.get()), strict=True)
             )
             for array in self._errors(sum(rays for rays, _ in self._scales))
         )
-        return fine + coarse_weight * coarse, fine
+        return fine_loss + coarse_weight * coarse_loss, fine_loss
 
     def _split_by_photo(self, errors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         return np.split(errors, np.cumsum([rays for rays, _ in self._scales])[:-1])

@@ -27,8 +27,8 @@ POCL_KERNEL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")
 
 def kernel_caches() -> str:
     """Return the paths of all folders of built kernels, joined for a message."""
-    *others, last = map(str, _kernel_folders())
-    return f"{', '.join(others)} and {last}"
+    *other_folders, last = map(str, _kernel_folders())
+    return f"{', '.join(other_folders)} and {last}"
 
 
 def kernel_cache_advice() -> str:

@@ -58,9 +58,9 @@ def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitEr
     limit = process_limit("RLIMIT_AS")
     if limit is None:
         return DeviceError(f"{fault}; {advice}" if advice else fault)
-    otherwise = f"; if that does not help, {advice}" if advice else ""
+    suffix = f"; if that does not help, {advice}" if advice else ""
     return MemoryLimitError(
-        f"{fault}; a process may use only {limit >> 20} MiB of address space (`ulimit -v`): raise this limit{otherwise}"
+        f"{fault}; a process may use only {limit >> 20} MiB of address space (`ulimit -v`): raise this limit{suffix}"
     )
 
 

@@ -177,6 +177,6 @@ def from_options(values: dict[str, Any]) -> Execution:
     try:
         return Execution.model_validate(values)
     except ValidationError as error:
-        path, complaint = first_fault(error, Execution)
+        path, message = first_fault(error, Execution)
         option = "-".join(map(str, path)).replace("engine", "scheduler")
-        raise ConfigError(f"--{option}: {complaint}" if path else complaint) from error
+        raise ConfigError(f"--{option}: {message}" if path else message) from error

@@ -122,9 +122,9 @@ EXPECTATIONS = {
 
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
     """Return a message about the first fault, with its file, line, and key."""
-    key_path, complaint = first_fault(error, root)
+    key_path, message = first_fault(error, root)
     prefix = f"{key_path_text(key_path)}: " if key_path else ""  # "": a fault of the entire file
-    return f"{path}:{document.line(key_path)}: {prefix}{complaint}"
+    return f"{path}:{document.line(key_path)}: {prefix}{message}"
 
 
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
@@ -134,10 +134,10 @@ def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath,
     """
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     key_path, model, annotation = _follow(first["loc"], root)
-    return key_path, _complaint(dict(first), key_path, model, annotation)
+    return key_path, _describe_error(dict(first), key_path, model, annotation)
 
 
-def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] | None, annotation: Any) -> str:
+def _describe_error(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] | None, annotation: Any) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         if advice := getattr(model, "unavailable", {}).get(key_path[-1]):

@@ -176,13 +176,13 @@ class PipelineFile(Settings):
         for path, settings in items:
             settings.check_pipeline(self)
             for name, reason in settings.active_conflicts().items():
-                for rival_path, rival in items:
-                    stage, rival_stage = path.partition(".")[0], rival_path.partition(".")[0]
-                    is_elsewhere = rival_stage.startswith("stages[") and rival_stage != stage
-                    if name in rival.conflict_names() and not is_elsewhere:
+                for other_path, other_settings in items:
+                    stage, other_stage = path.partition(".")[0], other_path.partition(".")[0]
+                    is_elsewhere = other_stage.startswith("stages[") and other_stage != stage
+                    if name in other_settings.conflict_names() and not is_elsewhere:
                         label = getattr(settings, "type", getattr(settings, "stage", path))
                         remedy = "" if ";" in reason else "; leave one of them out"
-                        text = f"{path}: '{label}' cannot be combined with {name} ({rival_path}): {reason}{remedy}"
+                        text = f"{path}: '{label}' cannot be combined with {name} ({other_path}): {reason}{remedy}"
                         raise ConfigError(text)
 
     @property

@@ -159,10 +159,10 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
             settings.check_conflicts()
             conflict = None
         except ValidationError as error:
-            fault_path, complaint = first_fault(error, PipelineFile)
+            fault_path, message = first_fault(error, PipelineFile)
             contains_key = fault_path == key_path[: len(fault_path)]
             raise OverrideError(
-                override, complaint if contains_key else f"{key_path_text(fault_path)}: {complaint}"
+                override, message if contains_key else f"{key_path_text(fault_path)}: {message}"
             ) from error
         except ConfigError as error:
             conflict = (conflict[0] if conflict else override), error

@@ -240,12 +240,12 @@ def list_keys(settings: BaseModel) -> list[Key]:
 
 
 def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[Key]:
-    plain = model.model_dump(mode="json")
-    lacks_cadence = hasattr(model, "every") and model.every is None
-    fields, texts = type(model).model_fields, descriptions(type(model))
+    plain_values = model.model_dump(mode="json")
+    has_no_cadence = hasattr(model, "every") and model.every is None
+    fields, help_texts = type(model).model_fields, descriptions(type(model))
     for name in sorted(fields, key=lambda name: name != "type"):
         value = getattr(model, name)
-        if name in ("stage", *NOT_SETTABLE) or (lacks_cadence and name in CADENCE):
+        if name in ("stage", *NOT_SETTABLE) or (has_no_cadence and name in CADENCE):
             continue
         items = value if isinstance(value, list) and value and isinstance(value[0], BaseModel) else None
         if isinstance(value, BaseModel):
@@ -255,7 +255,7 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
                 key = item.type if getattr(item, "keyed_by_type", False) else i
                 yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{key}") + ".", addresses)
         else:
-            yield Key(prefix + name, plain.get(name), texts.get(name, ""))
+            yield Key(prefix + name, plain_values.get(name), help_texts.get(name, ""))
 
 
 def _addresses(settings: BaseModel) -> dict[int, str]:

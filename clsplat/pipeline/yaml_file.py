@@ -49,8 +49,8 @@ class Document:
 class _BadValue(Exception):
     """Raised for a value that is not allowed in a file of settings; `line` is its line number."""
 
-    def __init__(self, node: Any, complaint: str) -> None:
-        super().__init__(complaint)
+    def __init__(self, node: Any, problem: str) -> None:
+        super().__init__(problem)
         self.line = node.start_mark.line + 1
 
 
@@ -160,18 +160,18 @@ def _parse(text: str, name: str) -> Document:
         root = yaml.compose(text)
         return _Reader(yaml).document(root)
     except _BadValue as error:
-        line, complaint = error.line, str(error)
+        line, problem = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        complaint = shorten((error.problem or error.context or "this is not YAML").splitlines()[0], 200)
+        problem = shorten((error.problem or error.context or "this is not YAML").splitlines()[0], 200)
     except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
-        complaint = f"the character U+{ord(text[error.position]):04X} is not allowed in YAML"
+        problem = f"the character U+{ord(text[error.position]):04X} is not allowed in YAML"
     except RecursionError:
-        line, complaint = 1, "lists and maps are nested too deeply"
+        line, problem = 1, "lists and maps are nested too deeply"
     except (YAMLError, ValueError, IndexError, AttributeError, TypeError) as error:
-        line, complaint = 1, f"this is not YAML ({type(error).__name__})"
-    raise ConfigError(f"{name}:{line}: {complaint}" if name else complaint)
+        line, problem = 1, f"this is not YAML ({type(error).__name__})"
+    raise ConfigError(f"{name}:{line}: {problem}" if name else problem)
 
 
 class _Reader:

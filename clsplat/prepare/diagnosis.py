@@ -107,16 +107,16 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
 
     models: the names of the photographs in each model, the largest model first.
     """
-    placed = models[0]
-    sample = sorted(placed)[:: max(1, len(placed) // MAX_COMPARED)]
+    main_model = models[0]
+    sample = sorted(main_model)[:: max(1, len(main_model) // MAX_COMPARED)]
     typical_sharpness = np.median([graph.measure_sharpness(name) for name in sample], axis=0)
     reasons = {}
-    for name in sorted(set(graph.features) - placed):
+    for name in sorted(set(graph.features) - main_model):
         model = next((model for model in models[1:] if name in model), None)
         reasons[name] = (
             f"in another model, with {first_few(sorted(model - {name}))}"
             if model
-            else _reason(graph, name, placed, typical_sharpness)
+            else _reason(graph, name, main_model, typical_sharpness)
         )
     return reasons
 

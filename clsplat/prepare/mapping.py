@@ -93,10 +93,10 @@ def map_cameras(
     graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
     if reason := no_depth_reason(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {reason}")
-    models, best, extra_pairs, tries = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
         placed_count = models[0].num_reg_images() if models else 0
-        if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
+        if count == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
             break
         if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
@@ -105,7 +105,7 @@ def map_cameras(
                 continue
             if attempt is not first:
                 LOG.info("placed %d of %d photographs; trying again with %s", placed_count, len(names), attempt.label)
-            tries += 1
+            count += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.wider:
                 graph = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
@@ -128,11 +128,11 @@ def map_cameras(
         graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == PAIR:
         models[0] = triangulate_pairs(models[0], database, out, threads)
-    figures = {**_write_best(models, out, names), "attempt": best.label, "denser_tried": (out / DENSE).exists()}
-    figures["reasons"] = explain_unplaced(graph, [_names(model) for model in models])
+    result = {**_write_best(models, out, names), "attempt": best.label, "denser_tried": (out / DENSE).exists()}
+    result["reasons"] = explain_unplaced(graph, [_names(model) for model in models])
     _remove_hidden(out)
-    log_warnings(figures)
-    return figures
+    log_warnings(result)
+    return result
 
 
 def _remove_hidden(folder: Path) -> None:

@@ -258,7 +258,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
         run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
         run.harmonics = pipeline.settings.harmonics
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
-            _warn_of_near(pipeline.settings.model.near, near_depth(run.scene))
+            _warn_about_near_plane(pipeline.settings.model.near, near_depth(run.scene))
         return pipeline
 
 
@@ -275,7 +275,7 @@ def with_lengths(pipeline: Pipeline, scene: Scene) -> Pipeline:
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)
 
 
-def _warn_of_near(near: float | str, nearest: float | None) -> None:
+def _warn_about_near_plane(near: float | str, nearest: float | None) -> None:
     """Warn if the nearest points are in front of the near plane.  Both distances are in scene units."""
     if isinstance(near, float) and nearest is not None and nearest < near:
         LOG.warning(

@@ -123,7 +123,7 @@ class RunFolder:
         if len(times) == 1:
             return []
         steps, cpu_seconds = zip(*times, strict=True)
-        return [(float(np.interp(step, steps, cpu_seconds)), figure) for step, figure in points]
+        return [(float(np.interp(step, steps, cpu_seconds)), value) for step, value in points]
 
     @property
     def renders(self) -> Path:

@@ -133,8 +133,8 @@ def _format_numbers(record: dict[str, Any], names: tuple[str, ...]) -> str:
 def _process(status: dict[str, Any]) -> str:
     """Return where a run is executed: its host, or its process on this machine."""
     owner = Owner.from_record(status)
-    elsewhere = owner is not None and not owner.is_local
-    return f"; it runs on {status.get('host')}" if elsewhere else f"; process {status.get('process')}"
+    is_remote = owner is not None and not owner.is_local
+    return f"; it runs on {status.get('host')}" if is_remote else f"; process {status.get('process')}"
 
 
 # The summary of a finished run: quality, files, photos, time, and the next command.

@@ -206,14 +206,14 @@ def _find_cells(out: Path, is_done: bool) -> dict[str, RunState]:
 
 def verdict(result: dict[str, Any]) -> str:
     """Format the result of `verify` as one sentence."""
-    damaged = [entry["file"] for entry in result["objects"] if not entry["whole"]]
-    if not damaged:
+    files = [entry["file"] for entry in result["objects"] if not entry["whole"]]
+    if not files:
         return f"{result['run']}: {result['state']}; all {len(result['objects'])} files are intact"
     if all(entry["whole"] or entry["detail"] == NO_SUMS for entry in result["objects"]):
-        return f"{result['run']}: {result['state']}; {damaged[0]} {NO_SUMS}"
-    names = ", ".join(damaged[:3]) + (", …" if len(damaged) > 3 else "")
+        return f"{result['run']}: {result['state']}; {files[0]} {NO_SUMS}"
+    names = ", ".join(files[:3]) + (", …" if len(files) > 3 else "")
     return (
-        f"{result['run']}: {result['state']}; {len(damaged)} of {len(result['objects'])} files are damaged or missing: "
+        f"{result['run']}: {result['state']}; {len(files)} of {len(result['objects'])} files are damaged or missing: "
         f"{names}; copy them again, or {result['remedy']}"
     )
 

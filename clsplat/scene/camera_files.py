@@ -160,18 +160,18 @@ def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
     The test views are also listed as validation views, because nerfstudio evaluates those.  Raises OutputError.
     """
     lenses = [_lens(view) for view in scene.views]
-    model, common = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    model, common_fields = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     matrices = [opengl_matrix(view.world_to_camera).tolist() for view in scene.views]
     frames = [
         {
             "file_path": f"{IMAGES}/{view.name}",
-            **({} if common else {key: value for key, value in lens.items() if key != "camera_model"}),
+            **({} if common_fields else {key: value for key, value in lens.items() if key != "camera_model"}),
             **({} if view.time is None else {"time": view.time}),
             "transform_matrix": matrix,
         }
         for view, lens, matrix in zip(scene.views, lenses, matrices, strict=True)
     ]
-    table: dict[str, Any] = {"camera_model": model, **common, "frames": frames}
+    table: dict[str, Any] = {"camera_model": model, **common_fields, "frames": frames}
     if scene.test:
         names = [f"{IMAGES}/{view.name}" for view in scene.views]
         train = [name for i, name in enumerate(names) if i not in scene.test]
@@ -222,8 +222,8 @@ TRACKS = "colmap"  # the format that stores which points each photograph shows
 
 def check_cameras(scene: Scene, format_: str) -> Scene:
     """Return the scene with views named like their images.  Raises DataError if the format cannot represent it."""
-    named, view_by_model = with_image_names(scene), dict[str, str]()
-    for view in named.views if format_ == "nerfstudio" else ():
+    renamed_scene, view_by_model = with_image_names(scene), dict[str, str]()
+    for view in renamed_scene.views if format_ == "nerfstudio" else ():
         if (model := photo_lens(view).model) not in DISTORTION:
             raise DataError(f"{view.name}: nerfstudio has no camera model {model}; {REMEDY}")
         view_by_model[DISTORTION[model][0]] = view.name
@@ -231,7 +231,7 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
         model, name = view_by_model.popitem()
         first = next(iter(view_by_model))
         raise DataError(f"{name}: is {model}, other views are {first}; nerfstudio allows one model per file; {REMEDY}")
-    return named
+    return renamed_scene
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", overwrite: bool = False) -> list[Path]:
@@ -245,18 +245,18 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if value not in choices:
             raise ConfigError(f"{name}: expected one of {', '.join(choices)}, got {quote(value)}")
     scene = scene.in_world()
-    named = check_cameras(scene, format_)
+    renamed_scene = check_cameras(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(view.lens is not None for view in scene.views):
         raise DataError(
             f"{scene.path}: {format_} has no lens distortion, and these photos are distorted; "
             "run `clsplat data undistort` first, or write only the cameras"
         )
-    copies = image_files(named.views, out / IMAGES) if images == "copy" else {}
+    copies = image_files(renamed_scene.views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if overwrite else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
-    files = WRITERS[format_](out, named)
+    files = WRITERS[format_](out, renamed_scene)
     if format_ != SPLIT and scene.test:
         test_views = f"{len(scene.test)} of {len(scene.views)}"
         LOG.warning("%s: %s does not store which views are for testing, %s; %s does", out, format_, test_views, SPLIT)
@@ -269,5 +269,5 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
             shutil.copyfileobj(src, dst)
     if copies:
         exposures = load_exposures(scene.views)  # looked up by the names in the dataset
-        write_exposures(out / IMAGES, dict(zip((view.name for view in named.views), exposures, strict=True)))
+        write_exposures(out / IMAGES, dict(zip((view.name for view in renamed_scene.views), exposures, strict=True)))
     return files

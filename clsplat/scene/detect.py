@@ -125,11 +125,11 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
         return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
-    unread = f"; {text}" if (text := unread_cameras(path)) else ""
+    unread_text = f"; {text}" if (text := unread_cameras(path)) else ""
     if any(is_image(file) for file in path.iterdir()):
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {parent}: give that folder" if parent else remedy
-        raise DataError(f"{path}: photos without cameras; {remedy}{unread}")
+        raise DataError(f"{path}: photos without cameras; {remedy}{unread_text}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
-    raise DataError(f"{path}: no dataset found; looked for {formats}{unread}")
+    raise DataError(f"{path}: no dataset found; looked for {formats}{unread_text}")

@@ -52,16 +52,16 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
 
     Returns the result for each file; a file that several views share is read once.  Views without files are skipped.
     """
-    users: dict[Path, list[View]] = defaultdict(list)
+    views_by_path: dict[Path, list[View]] = defaultdict(list)
     for view in views:
         for file in (view.image_path, view.mask_path, view.static_path):
             if file is not None and file != NO_FILE:
-                users[file].append(view)
-    files = {file: ImageFile() for file in users}
-    cache, count = DecodedSizes(), Count("photos decoded", len(users))
+                views_by_path[file].append(view)
+    files = {file: ImageFile() for file in views_by_path}
+    cache, count = DecodedSizes(), Count("photos decoded", len(views_by_path))
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "decoding")
     try:
-        futures = [pool.submit(_examine, file, users[file], files[file], cache) for file in users]
+        futures = [pool.submit(_examine, file, views_by_path[file], files[file], cache) for file in views_by_path]
         for number, future in enumerate(as_completed(futures), 1):
             future.result()
             count.reach(number)
@@ -211,12 +211,12 @@ class Identity:
         for key in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(key) != new[name].get(key)]
             changes += [f"the {key} of {_list_views(names)}"] if names else []
-        moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
+        moved_names = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
-        changes += [f"the split of {_list_views(moved)}"] if moved else []
+        changes += [f"the split of {_list_views(moved_names)}"] if moved_names else []
         changes += [f"{_list_views(removed)}, removed"] if removed else []
         changes += [f"{_list_views(added)}, added"] if added else []
-        if not (moved or removed or added) and list(self.train) != list(before.train):
+        if not (moved_names or removed or added) and list(self.train) != list(before.train):
             changes.append("the order of the training views")
         return changes + (["the points"] if self.points != before.points else [])
 

@@ -74,8 +74,8 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
         if folder != path and RESULTS & set(files):
             folders.clear()
             continue
-        is_deep = len(folder.parts) - len(path.parts) >= depth
-        folders[:] = [] if is_deep else sorted(name for name in folders if name[0] != ".")
+        is_at_max_depth = len(folder.parts) - len(path.parts) >= depth
+        folders[:] = [] if is_at_max_depth else sorted(name for name in folders if name[0] != ".")
         yield folder, sorted(files)
 
 
@@ -155,11 +155,11 @@ class FileLookup:
     @cached_property
     def _files(self) -> dict[str, list[tuple[Parts, Path]]]:
         """The image files below `root` with the normalized parts of their paths, by normalized stem."""
-        files, real = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
+        files, real_root = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
         for folder, names in walk_folders(self.root, MAX_DEPTH):
             parts = tuple(map(_normalize, folder.relative_to(self.root).parts))
             for path in (folder / name for name in names if name[0] != "." and is_image(PurePath(name))):
-                if os.path.isfile(path) and Path(os.path.realpath(path)).is_relative_to(real):
+                if os.path.isfile(path) and Path(os.path.realpath(path)).is_relative_to(real_root):
                     files[_stem(path.name)].append(((*parts, _normalize(path.name)), path))
         return files
 
@@ -170,29 +170,29 @@ class FileLookup:
             for key in _keys(target):
                 by_key[key].add(target)
         for i in unmatched:
-            ranked = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
+            candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
             siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
             for parts, path in siblings or files:
                 if rank := self._rank(self.listing[i], targets[i], parts, path):
-                    ranked[rank].append((parts, path))
-            best = ranked[max(ranked)] if ranked else []
+                    candidates_by_rank[rank].append((parts, path))
+            best = candidates_by_rank[max(candidates_by_rank)] if candidates_by_rank else []
             if len(best) > 1:
                 self.choices[i] = [path for _, path in best]
             for parts, path in best if len(best) == 1 else ():
-                length = _common_end(targets[i], parts)
-                rivals = by_key[_stem(path.name)] - {targets[i]}
-                if all(_common_end(rival, parts) < length for rival in rivals):
+                length = _common_suffix(targets[i], parts)
+                other_targets = by_key[_stem(path.name)] - {targets[i]}
+                if all(_common_suffix(other_target, parts) < length for other_target in other_targets):
                     base = self.folder if path.is_relative_to(self.folder) else self.root
                     self.names[i], self.paths[i], self.matches[i] = path.relative_to(base).as_posix(), path, length
                     self.downscaled_files |= {path} if _divisor(parts[:-length]) > 1 else set()
 
     def _rank(self, dataset_name: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
         """Return the rank of a file as a match of a name (larger is better), or None if it does not match."""
-        length, name = _common_end(target, parts), PureWindowsPath(dataset_name)
+        length, name = _common_suffix(target, parts), PureWindowsPath(dataset_name)
         parents = {*parts[:-length]}
-        is_other = any(map(OTHER_CONTENT.search, parents)) or (SPLITS & parents and SPLITS.intersection(target))
-        if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_other:
+        is_unrelated = any(map(OTHER_CONTENT.search, parents)) or (SPLITS & parents and SPLITS.intersection(target))
+        if length < min(len(parts), len(target), len(name.parts)) if self.strict else is_unrelated:
             return None
         is_equal = parts[-1] == target[-1], path.name == name.name, path.stem == name.stem
         return length, -_divisor(parts[:-length]), *is_equal
@@ -215,9 +215,9 @@ class FileLookup:
         is "refuse".
         """
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
-        if absent := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
-            fault = f"{source}: {_missing_text([str(self.paths[i]) for i in absent], len(self.paths))}"
-            for name in [self.listing[i] for i in absent if not _is_safe(self.listing[i])][:1]:
+        if missing_indices := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
+            fault = f"{source}: {_missing_text([str(self.paths[i]) for i in missing_indices], len(self.paths))}"
+            for name in [self.listing[i] for i in missing_indices if not _is_safe(self.listing[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
                 skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
@@ -232,14 +232,14 @@ class FileLookup:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
         for i, choices in self.choices.items():
-            fit = [relative[path].as_posix() for path in choices]
-            return f" ({first_few(fit)} fit {quote(self.listing[i])} equally well)"
+            matching_files = [relative[path].as_posix() for path in choices]
+            return f" ({first_few(matching_files)} fit {quote(self.listing[i])} equally well)"
         if not relative:
             return " (no images in that folder)"
-        used = {*self.paths}
-        free = {_stem(path.name): name for path, name in relative.items() if path not in used}
-        similar = difflib.get_close_matches(_stem(self.skipped[0]), [*free][:MAX_COMPARED], 1)
-        nearest = f"the nearest file is {free[similar[0]].as_posix()}, " if similar else ""
+        used_paths = {*self.paths}
+        unused_names = {_stem(path.name): name for path, name in relative.items() if path not in used_paths}
+        similar_stems = difflib.get_close_matches(_stem(self.skipped[0]), [*unused_names][:MAX_COMPARED], 1)
+        nearest = f"the nearest file is {unused_names[similar_stems[0]].as_posix()}, " if similar_stems else ""
         folders = Counter(path.parent.as_posix() for path in relative.values())
         return f" ({nearest}searched: {first_few([folder for folder, _ in folders.most_common()])})"
 
@@ -259,7 +259,7 @@ def _keys(parts: Parts) -> set[str]:
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 
-def _common_end(a: Parts, b: Parts) -> int:
+def _common_suffix(a: Parts, b: Parts) -> int:
     """Return the number of equal parts at the end of two paths whose file names match."""
     return 1 + len([*takewhile(lambda pair: pair[0] == pair[1], zip(a[-2::-1], b[-2::-1], strict=False))])
 

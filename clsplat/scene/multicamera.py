@@ -34,8 +34,8 @@ class MulticameraReader(Reader):
 
     def matches(self, path: Path) -> bool:
         """Return whether an entry of `videos` has the name of a camera; otherwise, it may be the source of a scene."""
-        named = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
-        return bool(named) and not named.isdisjoint(_camera_names(path))
+        names = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
+        return bool(names) and not names.isdisjoint(_camera_names(path))
 
     def read(self, path: Path, holdout: int) -> Scene:
         frames = _frames(path)
@@ -122,12 +122,12 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
         transforms = Transforms(path / TRANSFORMS)
         first = next(iter(frames.values()))[0]
         size = stored_size(first)
-        posed = [make_view(frame, frame.image_name(), size) for frame in transforms.frames]
+        views = [make_view(frame, frame.image_name(), size) for frame in transforms.frames]
         points = transforms.points(Clock(0.0, 1.0))
     else:
-        posed, points = camera_views(path)
+        views, points = camera_views(path)
     cameras: dict[str, View] = {}
-    for view in posed:
+    for view in views:
         name = next((name for name in names_of(view.name) if name in frames), None)
         if name is None:
             continue
@@ -140,6 +140,6 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
             f"{path}: {len(unposed)} of {len(frames)} cameras have no pose: {first_few(unposed)}; expected an image "
             f"NAME.png of each camera among the poses, or remove {VIDEOS}/{unposed[0]}"
         )
-    if len(posed) > len(cameras):
-        LOG.info("%s: left out %d images of cameras without frames in %s", path, len(posed) - len(cameras), VIDEOS)
+    if len(views) > len(cameras):
+        LOG.info("%s: left out %d images of cameras without frames in %s", path, len(views) - len(cameras), VIDEOS)
     return cameras, points

@@ -70,10 +70,10 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     """
     if folder is None:
         return scene
-    existing = next((view.mask_path for view in scene.views if view.mask_path), None)
-    if existing is not None:
+    existing_mask = next((view.mask_path for view in scene.views if view.mask_path), None)
+    if existing_mask is not None:
         raise DataError(
-            f"{scene.path}: the dataset already has masks, such as {existing}; remove scene.masks, "
+            f"{scene.path}: the dataset already has masks, such as {existing_mask}; remove scene.masks, "
             "or the masks of the dataset"
         )
     photographs = [view.name if view.lens is None else photograph_name(view.name) for view in scene.views]

@@ -72,8 +72,8 @@ def sweep_points(
         positions.append(_unproject(view, rows, columns, 1 / surface.inverse[mask]))
         colors.append(image[mask])
     all_positions, all_colors = np.concatenate(positions), np.concatenate(colors)
-    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(all_positions))[:count])
-    return PointCloud(all_positions[chosen].astype(np.float32), all_colors[chosen])
+    sampled_rows = np.sort(np.random.default_rng([seed, count]).permutation(len(all_positions))[:count])
+    return PointCloud(all_positions[sampled_rows].astype(np.float32), all_colors[sampled_rows])
 
 
 def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
@@ -97,8 +97,8 @@ def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArr
 def _neighbors(i: int, views: Sequence[View]) -> list[int]:
     """Return the indices of the views nearest to the i-th, of which the viewing directions differ by at most 60°."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
-    alike = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
-    return sorted(alike, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
+    similar_views = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
+    return sorted(similar_views, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
 
 
 def _best_planes(

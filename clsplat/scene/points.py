@@ -96,7 +96,7 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         table[name] = points.positions[:, i]
     for i, name in enumerate(RGB):
         table[name] = np.rint(points.colors[:, i] * 255)
-    words = {"|u1": "uchar", "<f4": "float", "<f8": "double"}
-    properties = [f"{words[kind[name].str]} {name}" for name in kind.names or ()]
+    ply_types = {"|u1": "uchar", "<f4": "float", "<f8": "double"}
+    properties = [f"{ply_types[kind[name].str]} {name}" for name in kind.names or ()]
     with open_atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())

@@ -258,9 +258,9 @@ def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
     model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if model is None else model
     keys = LENSES.get(model) if isinstance(model, str) else None
     values = {key: frame.number(key) or 0.0 for key in DISTORTION}
-    surplus = [key for key, value in values.items() if value and key not in (keys or DISTORTION)]
-    if keys is None or surplus:
-        fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
+    unsupported_keys = [key for key, value in values.items() if value and key not in (keys or DISTORTION)]
+    if keys is None or unsupported_keys:
+        fault = f"camera_model {quote(model)}" + (f" with {', '.join(unsupported_keys)}" if unsupported_keys else "")
         raise DataError(
             f"{frame.source}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "export the cameras with one of these, or pinhole images without distortion"

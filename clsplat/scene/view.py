@@ -227,15 +227,15 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     """
     pixels = _read_original(view, view.image_path)
     width, height = view.camera.width, view.camera.height
-    opaque, is_resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
-    if opaque and not is_resized and pixels.dtype == np.uint8:
+    is_opaque, is_resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
+    if is_opaque and not is_resized and pixels.dtype == np.uint8:
         return pixels
     # Double precision with alpha, to truncate as the reference does; single precision saves memory otherwise.
-    values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
+    values: NDArray[Any] = pixels.astype(np.float32 if is_opaque else np.float64)
     if is_resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
     limit = int(np.iinfo(pixels.dtype).max)
-    if opaque:
+    if is_opaque:
         return np.asarray(np.rint(values * (255 / limit)), np.uint8)
     unit = values / limit
     color, alpha = unit[:, :, :3], unit[:, :, 3:]

@@ -248,18 +248,18 @@ class Split:
                     f"{remedy}, or set scene.holdout to 0 for none"
                 )
             scene = _with_test(scene, test)
-        left_out: list[str] = []
+        left_out_names: list[str] = []
         if self.train is not None:
             remaining = _select_training(scene, "train", self.train, folders) | set(scene.test)
             if remaining == set(scene.test):
                 raise DataError(f"{scene.path}: scene.train leaves no photograph to train on; expected some")
             LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(remaining), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in remaining]
-            left_out = [view.name for i, view in enumerate(scene.views) if i not in remaining]
-            tested = {scene.views[i].name for i in scene.test}
-            smaller = replace(scene, views=tuple(views))
-            scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
-        return self.with_validation(scene, left_out)
+            left_out_names = [view.name for i, view in enumerate(scene.views) if i not in remaining]
+            test_names = {scene.views[i].name for i in scene.test}
+            subset = replace(scene, views=tuple(views))
+            scene = _with_test(subset, {i for i, view in enumerate(views) if view.name in test_names})
+        return self.with_validation(scene, left_out_names)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
         """Raise DataError for lists with unknown names, or with a photograph that is in two lists.

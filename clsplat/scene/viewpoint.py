@@ -59,14 +59,14 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     viewing direction.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
-    right, mean, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
+    right, up, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
     squares, axes = np.linalg.eigh(right.T @ right / len(right))
-    axis, length = axes[:, 0], np.linalg.norm(mean)
-    leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
-    if squares[1] >= MIN_TURN and squares[0] <= MAX_ROLL * squares[1] and not leans:
-        sign = axis @ mean if abs(axis @ mean) > MIN_UP else -axis @ forward  # cameras look down more often than up
+    axis, length = axes[:, 0], np.linalg.norm(up)
+    is_tilted = length > AGREED and abs(axis @ up) < length * np.cos(np.radians(FURTHEST))
+    if squares[1] >= MIN_TURN and squares[0] <= MAX_ROLL * squares[1] and not is_tilted:
+        sign = axis @ up if abs(axis @ up) > MIN_UP else -axis @ forward  # cameras look down more often than up
         return np.asarray(axis if sign > 0 else -axis)
-    axis = mean if length > np.linalg.norm(forward) / 2 else -forward
+    axis = up if length > np.linalg.norm(forward) / 2 else -forward
     axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 

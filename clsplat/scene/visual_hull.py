@@ -47,9 +47,9 @@ class Silhouette:
         # no matrix product: BLAS sums in an order that depends on the number of threads
         x, y, depth = (sum(row[k] * points[:, k] for k in range(3)) + row[3] for row in matrix)
         in_front = depth > 0
-        safe = np.where(in_front, depth, 1)
-        row = np.floor(y / safe).clip(-1, c.height).astype(int)
-        column = np.floor(x / safe).clip(-1, c.width).astype(int)
+        safe_depth = np.where(in_front, depth, 1)
+        row = np.floor(y / safe_depth).clip(-1, c.height).astype(int)
+        column = np.floor(x / safe_depth).clip(-1, c.width).astype(int)
         inside = in_front & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
         return Projection(inside, row[inside], column[inside], depth[inside])
 
@@ -84,34 +84,34 @@ def hull_points(
     `count` of them are on the surface, or until FINEST of them are along each side of the box.
     """
     silhouettes = list(_silhouettes(views, load))
-    full, number = np.zeros((COARSEST,) * 3, bool), COARSEST
-    cells: Cells = np.argwhere(~full)
+    is_full, resolution = np.zeros((COARSEST,) * 3, bool), COARSEST
+    cells: Cells = np.argwhere(~is_full)
     while True:
-        centers, side = _centers(cells, center, half_side, number)
+        centers, side = _centers(cells, center, half_side, resolution)
         inside, cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
-        full[tuple(cells[inside].T)] = True
-        cells, number = _split(cells[cut]), 2 * number
-        full = full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
-        if cut.sum() >= count or number == FINEST:
+        is_full[tuple(cells[inside].T)] = True
+        cells, resolution = _split(cells[cut]), 2 * resolution
+        is_full = is_full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+        if cut.sum() >= count or resolution == FINEST:
             break
-    inside, _ = _classify(silhouettes, _centers(cells, center, half_side, number)[0], 0)
-    full[tuple(cells[inside].T)] = True
+    inside, _ = _classify(silhouettes, _centers(cells, center, half_side, resolution)[0], 0)
+    is_full[tuple(cells[inside].T)] = True
     points, side = _centers(
-        np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), center, half_side, number
+        np.argwhere(is_full & ~scipy.ndimage.binary_erosion(is_full, border_value=1)), center, half_side, resolution
     )
     colors, visible = _colors(silhouettes, points, side)
     points, colors = points[visible], colors[visible]
-    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
-    return PointCloud(points[chosen], colors[chosen])
+    sampled_rows = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
+    return PointCloud(points[sampled_rows], colors[sampled_rows])
 
 
 def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
     for index in np.unique(np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)):
         view = views[index]
-        small = view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
-        rgba = load(small)
+        small_view = view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
+        rgba = load(small_view)
         if rgba is not None:
-            yield Silhouette(small, rgba)
+            yield Silhouette(small_view, rgba)
 
 
 def _split(cells: Cells) -> Cells:
@@ -142,10 +142,10 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
         is_remaining = ~projection.inside
         is_remaining[projection.inside] = cv2.dilate(silhouette.alpha, kernel)[projection.row, projection.column] > HALF
         remaining = remaining[is_remaining]
-    touched = np.zeros(len(centers), bool)
-    touched[remaining] = True
-    touched &= view_counts >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
-    return touched & full, touched & ~full
+    is_candidate = np.zeros(len(centers), bool)
+    is_candidate[remaining] = True
+    is_candidate &= view_counts >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
+    return is_candidate & full, is_candidate & ~full
 
 
 def _colors(

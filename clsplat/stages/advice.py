@@ -38,8 +38,8 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     """
     views = learned_scene(run).downscaled(run.downscale).split("train")
     sample = sample_views(views, MAX_MEASURED)
-    counted = run.status.counted(run.until_interrupted(sample), "views", len(sample))
-    metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), counted=counted)
+    counted_views = run.status.counted(run.until_interrupted(sample), "views", len(sample))
+    metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), counted=counted_views)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test_psnr = {
         line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step
@@ -51,10 +51,10 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     limits = [edit["limit"] for edit in run.records.read("densify") if "limit" in edit]
     key = find_limit(stages)
     growth = (limits[-1], f"{rerun} --set {key}=null") if limits and key else None
-    longer = f"{resume} --steps {2 * run.step}"
+    train_longer = f"{resume} --steps {2 * run.step}"
     sentences = [
         *advise_on_training_views(metrics, has_exposures, rerun, run.step if can_mask else None),
-        *advise_on_fit(metrics, is_overfit, growth, rerun, longer),
+        *advise_on_fit(metrics, is_overfit, growth, rerun, train_longer),
         *advise_on_test_views(test_psnr, rerun),
         *advise_on_capture(views, run.original.views, rerun),
     ]
@@ -67,45 +67,45 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
 
 
 def advise_on_training_views(
-    metrics: Sequence[ViewMetrics], has_exposures: bool, again: str, steps: int | None
+    metrics: Sequence[ViewMetrics], has_exposures: bool, rerun: str, steps: int | None
 ) -> Iterator[str]:
     """Yield advice from the metrics of training views.
 
-    has_exposures: whether training learns exposures.  again: the command that repeats the run.  steps: the number of
+    has_exposures: whether training learns exposures.  rerun: the command that repeats the run.  steps: the number of
     training steps, or None if moving objects cannot be masked.
     """
     if names := find_outliers({view.view: view.psnr for view in metrics}):
         text = f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos"
         if steps is None:
-            yield f"{text}: remove blurred photos and photos with wrong poses, then `{again}`"
+            yield f"{text}: remove blurred photos and photos with wrong poses, then `{rerun}`"
         else:
             transients = shell_quote(f"optimize.modules.transients={{start: {round(TRANSIENTS_START * steps)}}}")
-            yield f"{text}: remove blurred photos; if objects move, `{again} --set {transients}`"
+            yield f"{text}: remove blurred photos; if objects move, `{rerun} --set {transients}`"
     gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
     gain = float(np.mean(gains)) if gains else 0.0
     if not has_exposures and gain >= MIN_EXPOSURE_GAIN:
         yield (
             f"exposures or colors differ between photos: matching them would gain {gain:.1f} dB; "
-            f"try `{again} --set optimize.modules.exposure={{}}`"
+            f"try `{rerun} --set optimize.modules.exposure={{}}`"
         )
 
 
 def advise_on_fit(
-    metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, again: str, longer: str
+    metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, rerun: str, train_longer: str
 ) -> Iterator[str]:
     """Yield advice if the model overfits, if its growth was limited, or if it fits the photos badly, in this order.
 
-    growth: the limit that stopped growth, and the command that trains without it.  again: the command that repeats the
-    run.  longer: the command that trains longer.
+    growth: the limit that stopped growth, and the command that trains without it.  rerun: the command that repeats the
+    run.  train_longer: the command that trains longer.
     """
     train_psnr = float(np.mean([view.psnr for view in metrics])) if metrics else np.inf
     if is_overfit:
-        yield f"the model overfits: add photos between the existing ones, then `{again}`"
+        yield f"the model overfits: add photos between the existing ones, then `{rerun}`"
     elif growth:
         limit, command = growth
         yield f"growth stopped at its limit of {limit:,} Gaussians, {train_psnr:.1f} dB at training views: `{command}`"
     elif train_psnr < LOW_PSNR:
-        yield f"the model underfits: only {train_psnr:.1f} dB at training views; train longer: `{longer}`"
+        yield f"the model underfits: only {train_psnr:.1f} dB at training views; train longer: `{train_longer}`"
 
 
 def find_limit(stages: Sequence[Mapping[str, Any]]) -> str | None:

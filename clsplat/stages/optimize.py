@@ -114,9 +114,9 @@ class ValidatedTraining(Training):
         trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
         if self.refit and (count := sum(isinstance(stage, ValidatedTraining) for stage in trainings)) > 1:
             raise ConfigError(f"optimize.refit: expected a single stage that trains, got {count}")
-        earlier = list(itertools.takewhile(lambda stage: stage is not self, trainings))
-        if not any(getattr(stage, "patience", None) for stage in earlier):  # else the first step is unknown
-            self.require_measurement(sum(stage.steps for stage in earlier))
+        earlier_stages = list(itertools.takewhile(lambda stage: stage is not self, trainings))
+        if not any(getattr(stage, "patience", None) for stage in earlier_stages):  # else the first step is unknown
+            self.require_measurement(sum(stage.steps for stage in earlier_stages))
 
     def require_measurement(self, first: int) -> None:
         """Raise ConfigError if `keep: best` measures nothing until the last step.

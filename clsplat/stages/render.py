@@ -55,8 +55,8 @@ class Render(Stage):
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
     """Return the paths of the renders of views.  Views whose names differ only in their suffix keep it."""
     paths = [image_path(folder, view, suffix) for view in views]
-    uses = Counter(paths)
-    return [path if uses[path] == 1 else folder / f"{view}{suffix}" for path, view in zip(paths, views, strict=True)]
+    counts = Counter(paths)
+    return [path if counts[path] == 1 else folder / f"{view}{suffix}" for path, view in zip(paths, views, strict=True)]
 
 
 def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:

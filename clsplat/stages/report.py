@@ -42,11 +42,11 @@ DOTTED = 2  # index into DASHES
 
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, number of Gaussians and time per step over the steps."""
-    train = run.records.read("train")
+    records = run.records.read("train")
     psnr_lines, trial_lines = _psnr_lines(run), _psnr_lines(run, trial=True)
     dash = DOTTED if any(line.name == NAMES["train"] for line in psnr_lines) else 0
-    psnr = list(zip([r["step"] for r in train], moving_average([r["psnr"] for r in train]), strict=True))
-    line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
+    psnr = list(zip([r["step"] for r in records], moving_average([r["psnr"] for r in records]), strict=True))
+    line = {key: [(r["step"], r[key]) for r in records if key in r] for key in ("loss", "gaussians", "ms")}
     running_mean = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], dash)
     return safe_charts(
         [
@@ -56,7 +56,7 @@ def training_charts(run: Run) -> list[Markup]:
             curve("Gaussians", [Line(line["gaussians"])]),
             curve("milliseconds per step", [Line(line["ms"])]),
         ]
-        if train
+        if records
         else []
     )
 

@@ -60,8 +60,8 @@ class Snapshot(Scheduled):
             return (scene.split("test") or scene.views)[0]
         by_name = {view.name: view for view in scene.views}
         if self.view not in by_name:
-            near = difflib.get_close_matches(self.view, by_name, n=1, cutoff=0.0)
-            raise ConfigError(f"snapshot: the scene has no view {quote(self.view)}; did you mean {quote(near[0])}?")
+            matches = difflib.get_close_matches(self.view, by_name, n=1, cutoff=0.0)
+            raise ConfigError(f"snapshot: the scene has no view {quote(self.view)}; did you mean {quote(matches[0])}?")
         return by_name[self.view]
 
     def run(self, run: Run) -> None:

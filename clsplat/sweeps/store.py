@@ -70,17 +70,17 @@ def copy_files(source: Path, target: Path, excluded: Collection[str]) -> None:
     """
     for base, folders, files in os.walk(source):
         relative = Path(base).relative_to(source)
-        is_top = relative == Path()
-        skipped = excluded if is_top else ()
-        folders[:] = [name for name in folders if name not in skipped]
-        if not is_top and (target / relative).is_symlink():  # a link may point outside of the target
+        is_root = relative == Path()
+        skipped_names = excluded if is_root else ()
+        folders[:] = [name for name in folders if name not in skipped_names]
+        if not is_root and (target / relative).is_symlink():  # a link may point outside of the target
             (target / relative).unlink()
         (target / relative).mkdir(parents=True, exist_ok=True)
         for name in files:
-            if name in skipped or PARTIAL.fullmatch(name):
+            if name in skipped_names or PARTIAL.fullmatch(name):
                 continue
             (target / relative / name).unlink(missing_ok=True)
-            copy = shutil.copyfile if is_top and name in GROWING else link_or_copy
+            copy = shutil.copyfile if is_root and name in GROWING else link_or_copy
             with suppress(FileNotFoundError):
                 copy(Path(base) / name, target / relative / name)
 

@@ -281,8 +281,8 @@ def save(run: Run, keep: int | None = None) -> Path:
     """
     if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
-    if broken := run.not_finite():
-        raise NotFiniteError(f"step {run.step}: {save_failed(run, broken)}")
+    if bad_tables := run.not_finite():
+        raise NotFiniteError(f"step {run.step}: {save_failed(run, bad_tables)}")
     path = _write(run, "refit" if run.is_refit else "step")
     run.status.saved_at = time.monotonic()
     run.status.note(checkpoint=path.name)
@@ -382,11 +382,11 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
 def rename_damaged(out: Path, restored: Path | None) -> None:
     """Rename the damaged checkpoints that follow the restored one, so that `save` does not count them."""
     files = list_files(out)
-    for damaged in files[files.index(restored) + 1 :] if restored else ():
+    for damaged_file in files[files.index(restored) + 1 :] if restored else ():
         try:
-            damaged.rename(damaged.with_name(re.sub("^(step|refit)", "damaged", damaged.name)))
+            damaged_file.rename(damaged_file.with_name(re.sub("^(step|refit)", "damaged", damaged_file.name)))
         except OSError as error:
-            LOG.warning("%s: cannot be renamed (%s); remove it", damaged, error.strerror)
+            LOG.warning("%s: cannot be renamed (%s); remove it", damaged_file, error.strerror)
 
 
 def _remove(files: Iterable[Path]) -> None:
@@ -501,9 +501,9 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 
     Raises NotFiniteError, after saving the state as failed_N.npz, if the loss or the model is not finite.
     """
-    broken, loss = run.not_finite(), losses.loss
-    if broken or not math.isfinite(loss):
-        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {save_failed(run, broken)}")
+    bad_tables, loss = run.not_finite(), losses.loss
+    if bad_tables or not math.isfinite(loss):
+        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {save_failed(run, bad_tables)}")
     return loss, psnr(losses.comparison)
 
 

@@ -133,8 +133,8 @@ def plan(
     bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}
     sizes = list(bytes_by_table.values())
     gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # for penalties and edits
-    moving = 4 * components[MOTION] + MOVED_GAUSSIAN if MOTION in components else 0
-    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
-    fixed = photographs + FRAME_PIXEL * pixels
+    motion_bytes = 4 * components[MOTION] + MOVED_GAUSSIAN if MOTION in components else 0
+    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + motion_bytes
+    fixed_bytes = photographs + FRAME_PIXEL * pixels
     host = sum(4 * components.get(name, 0) for name in fractions)
-    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), limits.memory, limits.allocation, host)
+    return MemoryPlan(gaussian, FRAME_PAIR, fixed_bytes, max(sizes), limits.memory, limits.allocation, host)

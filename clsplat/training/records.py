@@ -119,12 +119,12 @@ class Records:
     def _parse(self, path: Path) -> Iterator[dict[str, Any]]:
         if not path.exists():
             return
-        texts = read_file(path).decode(errors="replace").split("\n")
-        for number, text in enumerate(texts, 1):
+        json_lines = read_file(path).decode(errors="replace").split("\n")
+        for number, text in enumerate(json_lines, 1):
             try:
                 line = json.loads(text)
             except (ValueError, RecursionError):
-                if number == len(texts):  # empty, or incomplete after a crash
+                if number == len(json_lines):  # empty, or incomplete after a crash
                     break
                 line = None
             if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):

@@ -53,14 +53,14 @@ def device_capacity(run: Run, needed: float = math.inf) -> int:
 
 def offload_advice(run: Run) -> str:
     """Return the advice to offload harmonics, as the end of an error message; "" if it would not help."""
-    helps = run.pipeline["rasterizer"]["harmonics"] == "device" and not run.device.info.unified
-    return ", or rasterizer.harmonics=auto" if helps else ""
+    is_helpful = run.pipeline["rasterizer"]["harmonics"] == "device" and not run.device.info.unified
+    return ", or rasterizer.harmonics=auto" if is_helpful else ""
 
 
 def _plan(run: Run, harmonics: Location, visible: float = VISIBLE_FRACTION) -> MemoryPlan:
     """Return the memory plan, including Adam moments that are not allocated yet."""
-    widths, trained = run.model.gaussians.components, run.model.gaussians.trained
-    moments = {moment: widths[name] for name in trained for moment in moment_tables(name)}
+    widths, trained_names = run.model.gaussians.components, run.model.gaussians.trained
+    moments = {moment: widths[name] for name in trained_names for moment in moment_tables(name)}
     return run.memory_plan({**widths, **moments}, harmonics, visible)
 
 

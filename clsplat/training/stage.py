@@ -228,8 +228,8 @@ class Training(Stage):
     def act_between(self, run: Run) -> None:
         """Run the stages that are due and do not edit; a failed stage runs again on resume."""
         for index, stage in enumerate(self.inner):
-            due = run.stage_step > 0 and (stage.is_due(run.step, self.has_ended(run)) or stage.is_overdue(run))
-            if index < run.during_index or stage.edits or not due:
+            is_due = run.stage_step > 0 and (stage.is_due(run.step, self.has_ended(run)) or stage.is_overdue(run))
+            if index < run.during_index or stage.edits or not is_due:
                 continue
             run.during_index = index + 1  # before it runs, for the checkpoint that it may write
             try:

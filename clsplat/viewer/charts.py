@@ -55,14 +55,14 @@ def curve(
     parts = _svg_start(title)
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    whole_y = not logarithmic and _are_integers(ys)
-    y_ticks = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, whole_y)
-    for tick, label in zip(y_ticks, _tick_labels([10**t if logarithmic else t for t in y_ticks], whole_y), strict=True):
+    int_y = not logarithmic and _are_integers(ys)
+    y_ticks = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, int_y)
+    for tick, label in zip(y_ticks, _tick_labels([10**t if logarithmic else t for t in y_ticks], int_y), strict=True):
         _, y = pixel(x_low, tick)
         parts += _grid_line(y, label)
-    whole_x = _are_integers(xs)
-    x_ticks = _ticks(x_low, x_high, whole_x)
-    for tick, label in (ticks or dict(zip(x_ticks, _tick_labels(x_ticks, whole_x), strict=True))).items():
+    int_x = _are_integers(xs)
+    x_ticks = _ticks(x_low, x_high, int_x)
+    for tick, label in (ticks or dict(zip(x_ticks, _tick_labels(x_ticks, int_x), strict=True))).items():
         x, _ = pixel(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(axis_lines):

@@ -58,9 +58,9 @@ class Packed:
     @property
     def count_text(self) -> str:
         """The number of splats as text: "8,389 Gaussians and 10,000 of the sky"."""
-        faint, sky = self.header["faint"], self.header.get("sky", 0)
-        text = size_text(self.count - sky, None, sky)
-        return text + (f" + {faint:,} too faint to draw" if faint else "")
+        faint_count, sky_count = self.header["faint"], self.header.get("sky", 0)
+        text = size_text(self.count - sky_count, None, sky_count)
+        return text + (f" + {faint_count:,} too faint to draw" if faint_count else "")
 
 
 def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> Packed:

@@ -333,8 +333,8 @@ def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measu
         else:
             reduced_model = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
             reduced_model.save(file, Writing(quality=quality, quiet=True))
-        size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
-        point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *figures)
+        size, measurements = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
+        point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *measurements)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
         points.append(point)
     return points

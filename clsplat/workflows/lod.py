@@ -289,8 +289,8 @@ def _levels(gaussians: Model, plan: LodPlan, trainer: LevelTrainer | None) -> li
 def _level_record(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
     """Return the record of a written level: its number, Gaussians, bytes, and PSNR."""
     size = sum(file.stat().st_size for file in folder.glob(f"{number}_*/*"))
-    figures = {"level": number, "gaussians": len(level.model), "bytes": size}
-    return {**figures, "merged_psnr": level.merged_psnr, "psnr": level.psnr}
+    record = {"level": number, "gaussians": len(level.model), "bytes": size}
+    return {**record, "merged_psnr": level.merged_psnr, "psnr": level.psnr}
 
 
 # A text table of levels of detail.

@@ -277,12 +277,12 @@ class Partitioner:
     ) -> tuple[Membership, Bits]:
         """Return the views of each block, and whether each Gaussian is visible in them or in no view, [B, N]."""
         positions = np.stack([view.position for view in self.views])
-        inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
-        coverage, visible_in_block = np.zeros(inside.shape), np.zeros((len(partition), len(owner)), bool)
+        is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
+        coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(owner)), bool)
         for view, render in enumerate(self._render(self.views)):
             coverage[view], visible = view_coverage(render, owner, len(partition))
-            visible_in_block[Membership(coverage[[view]], inside[[view]], min_coverage).view_blocks[0]] |= visible
-        members = Membership(coverage, inside, min_coverage)
+            visible_in_block[Membership(coverage[[view]], is_inside[[view]], min_coverage).view_blocks[0]] |= visible
+        members = Membership(coverage, is_inside, min_coverage)
         for view, block in np.argwhere(members.assignment & ~members.view_blocks):
             (render,) = self._render([self.views[view]])
             visible_in_block[block] |= view_coverage(render, owner, len(partition))[1]

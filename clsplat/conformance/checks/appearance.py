@@ -69,13 +69,13 @@ def check_grid(
     camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
-    planes, uploaded = to_planes(device, camera, image), to_planes(device, camera, gradient)
+    planes, grads = to_planes(device, camera, image), to_planes(device, camera, gradient)
     exact = image[:3].astype(np.float64)
     colors = grids.transform(workspace, camera, planes, 1).get()
     expected = ref.apply_color_grid(exact, grid)
     yield compare_max("color_grid_forward", f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield match("color_grid_forward", f"pixels outside the image, {label}", blank_image(camera, colors[:3]), 0.0)
-    gradients = grids.differentiate(workspace, camera, planes, uploaded, 1)
+    gradients = grids.differentiate(workspace, camera, planes, grads, 1)
     grad_image, grad_grid = (array.get() for array in gradients)
     expected_image, expected_grid = ref.color_grid_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(expected_image).max()), 1.0)
@@ -88,7 +88,7 @@ def check_grid(
         yield compare_max(kernel, f"gradient of the grid, {label}", actual, expected_grid, SUM, floor=floor)
     if channels > 3:
         yield match("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
-        yield match("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
+        yield match("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], grads.get()[3])
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
@@ -153,8 +153,8 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     expected = ref.apply_color_matrix(exact, matrix)
     yield compare_max("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
     yield match("colors_forward", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
-    uploaded = to_planes(device, camera, gradient)
-    grad_image, wait_for_matrix = color_gradients(workspace, camera, planes, matrix, uploaded)
+    grads = to_planes(device, camera, gradient)
+    grad_image, wait_for_matrix = color_gradients(workspace, camera, planes, matrix, grads)
     expected, grad_matrix = ref.color_matrix_backward(exact, matrix, gradient[:3].astype(np.float64))
     grad = grad_image.get()
     yield compare_max("colors_backward", f"gradient, {label}", grad[:3, :height, :width], expected, 2e-6, floor=1.0)
@@ -165,7 +165,7 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     )
     if channels > 3:
         yield match("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
-        yield match("colors_backward", f"gradient of the fourth plane, {label}", grad[3], uploaded.get()[3])
+        yield match("colors_backward", f"gradient of the fourth plane, {label}", grad[3], grads.get()[3])
 
 
 @CHECKS.add("colors_forward", "colors_backward")
@@ -186,9 +186,9 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     camera, workspace = replace(make_camera(device, width, height), values=values), Workspace(device)
     for name in ("response", "grad_response"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
-    planes, uploaded = to_planes(device, camera, image), to_planes(device, camera, gradient)
+    planes, grads = to_planes(device, camera, image), to_planes(device, camera, gradient)
     colors = respond(workspace, camera, planes, row).get()
-    grad_image = respond(workspace, camera, planes, row, uploaded).get()
+    grad_image = respond(workspace, camera, planes, row, grads).get()
     sums = workspace.array("response sums", (20, camera.rows)).get()
     exact, upstream = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.apply_response(exact, row, center)
@@ -203,7 +203,7 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     yield compare_max(kernel, f"gradient of the parameters, {label}", actual, grad_row, SUM, floor=floor)
     if channels > 3:
         yield match(kernel, f"fourth plane, {label}", colors[3], planes.get()[3])
-        yield match(kernel, f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
+        yield match(kernel, f"gradient of the fourth plane, {label}", grad_image[3], grads.get()[3])
 
 
 @CHECKS.add("camera_response")

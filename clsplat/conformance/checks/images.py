@@ -214,26 +214,26 @@ def check_transient(
     """Compare residuals, their histogram, and masks; `fraction` of the pixels count, all if it is None."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
-    counted = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
+    valid = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
     camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("residuals", "counted pixels"):
         workspace.array(name, (1, camera.rows, camera.stride)).fill(7)
-    mask = None if fraction is None else to_planes(device, camera, counted[None])
+    mask = None if fraction is None else to_planes(device, camera, valid[None])
     planes = to_planes(device, camera, x), to_planes(device, camera, y)
     actual, wait_for_histogram = measure_residuals(workspace, camera, *planes, mask)
     label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
-    yield compare_max("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
+    yield compare_max("measure_residuals", f"residuals, {label}", values[valid], exact[valid], 1e-6, floor=1e-6)
     excluded_pixels = actual.get()[0].copy()
-    excluded_pixels[:height, :width][counted] = -1
+    excluded_pixels[:height, :width][valid] = -1
     yield match("measure_residuals", f"pixels that do not count, {label}", excluded_pixels, -1.0)
-    histogram = ref.residual_histogram(values[counted].astype(np.float64))
+    histogram = ref.residual_histogram(values[valid].astype(np.float64))
     yield match("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
         threshold = float(np.float32(np.quantile(values, quantile)))
         mask = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
         expected = np.zeros_like(mask)
-        expected[:height, :width] = ref.mask_transients(values, counted, threshold, reach)
+        expected[:height, :width] = ref.mask_transients(values, valid, threshold, reach)
         yield match("mask_transients", f"mask, {label}", mask, expected)
 
 

@@ -38,12 +38,12 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
 
 def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
     """Compare the tables at TIME, and the gradients of the motion."""
-    case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
+    case, (degree, has_rotation) = moving_case(rng, count, width), WIDTHS[width]
     model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
     actual_gaussians = evaluate_motion(Workspace(device), model, camera).gaussians
-    means, quats, logits = ref.move_gaussians(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
+    means, quats, logits = ref.move_gaussians(p[MOTION], p["means"], p["quats"], logit, TIME, degree, has_rotation)
     is_present = np.isfinite(means).all(axis=1)
     actual = actual_gaussians.get("means")
     yield count_true("move_forward", f"presence, {label}", np.isfinite(actual).all(axis=1) != is_present)
@@ -62,9 +62,9 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     backpropagate_motion(model, camera, gradients)
     g = {name: values.astype(np.float64) for name, values in grads.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
-    grad_motion, grad_logit = ref.move_gaussians_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
+    grad_motion, grad_logit = ref.move_gaussians_backward(p[MOTION], logit, *upstream, TIME, degree, has_rotation)
     actual, grad_center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
-    kernel = "turn_backward" if turns else "move_backward"
+    kernel = "turn_backward" if has_rotation else "move_backward"
     for name, columns in motion_fields(width).items():
         yield compare(kernel, f"by {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
     yield compare("move_backward", f"by the logit at the center, {label}", grad_center, grad_logit, CONIC)

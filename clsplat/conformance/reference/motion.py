@@ -31,18 +31,18 @@ def move_gaussians(
     logit_opacity: NDArray[Any],
     time: float,
     degree: int,
-    turns: bool,
+    has_rotation: bool,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return means, [N, 3], quaternions, [N, 4], and logits, [N], at a time; absent Gaussians have infinite means.
 
-    turns: whether Gaussians rotate.
+    has_rotation: whether Gaussians rotate.
     """
     means, quats, logits = means.copy(), quats.copy(), logit_opacity.copy()
     for n, row in enumerate(motion):
         dt, factor = time - row[3], presence(row, time)
         for order, vector in enumerate(coefficients(row, degree), 1):
             means[n] += vector * dt**order
-        if turns:
+        if has_rotation:
             quats[n] += row[-4:] * dt
         if factor < PRESENCE_MIN:
             means[n] = np.inf
@@ -60,7 +60,7 @@ def move_gaussians_backward(
     grad_logit: NDArray[Any],
     time: float,
     degree: int,
-    turns: bool,
+    has_rotation: bool,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return dL/d(motion), [N, W], and dL/d(logit_opacity), [N], from the gradients at a time.
 
@@ -80,7 +80,7 @@ def move_gaussians_backward(
             first = (0, 5, 8)[order - 1]
             grad_motion[n, first : first + 3] = grad_means[n] * dt**order
             grad_motion[n, 3] -= order * dt ** (order - 1) * (grad_means[n] @ vector)
-        if turns:
+        if has_rotation:
             grad_motion[n, -4:] = grad_quats[n] * dt
             grad_motion[n, 3] -= grad_quats[n] @ row[-4:]
         grad_motion[n, 3] += grad_factor * factor * dt / duration**2

@@ -117,9 +117,9 @@ def _measure_photo(file: Path) -> PhotographMeasures | DataError:
         gray = read_gray(file, SIDE)[0]
     except DataError as error:
         return error
-    small = cv2.resize(gray, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+    thumbnail = cv2.resize(gray, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     brightness = np.maximum([gray.mean(), np.median(gray)], 1.0)
-    return PhotographMeasures(sharpness_values(gray), brightness, small.astype(np.float32).ravel(), is_blank(gray))
+    return PhotographMeasures(sharpness_values(gray), brightness, thumbnail.astype(np.float32).ravel(), is_blank(gray))
 
 
 def _brightness_steps(
@@ -184,15 +184,15 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     distance = np.linalg.norm(finite_positions - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = finite_positions[:: max(1, -(-len(finite_positions) // SAMPLE_SIZE))]
     views = list(parts.scene.views) if parts.scene else parts.views  # with the faces of wide photographs
-    in_two, behind = _coverage(sample, views) if len(sample) and views else (None, None)
+    two_view_fraction, behind_fraction = _coverage(sample, views) if len(sample) and views else (None, None)
     return PointFacts(
         count=len(positions),
         not_finite=int(np.count_nonzero(~is_finite)),
         distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
         error_mean=float(errors.mean()) if len(errors) else None,
         error_90=float(np.quantile(errors, 0.9)) if len(errors) else None,
-        in_two=in_two,
-        behind=behind,
+        in_two=two_view_fraction,
+        behind=behind_fraction,
     )
 
 
@@ -209,16 +209,16 @@ def _errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
 
 def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
     """Return the fractions of points, [M, 3], that project into at least two views, and that are behind all views."""
-    inside, is_ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
+    visible_counts, ever_in_front = np.zeros(len(points), int), np.zeros(len(points), bool)
     for view in views:
         camera = view.camera
         x, y, z = view.world_to_camera[:, :3] @ points.T + view.world_to_camera[:, 3:]
         in_front = z > 0
         depth = np.where(in_front, z, 1)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-        inside += in_front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        is_ahead |= in_front
-    return float((inside >= min(2, len(views))).mean()), float((~is_ahead).mean())
+        visible_counts += in_front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        ever_in_front |= in_front
+    return float((visible_counts >= min(2, len(views))).mean()), float((~ever_in_front).mean())
 
 
 MIN_SEEN = 30  # points visible in a view; COLMAP does not register images with fewer inliers
@@ -399,12 +399,12 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         lens, camera = views[0].lens, views[0].camera
         original = lens.camera if lens else camera
         model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
-        kept_fraction = camera.width * camera.height / (original.width * original.height)
+        area_fraction = camera.width * camera.height / (original.width * original.height)
         is_centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
         faces = len(lens.faces) if lens and lens.is_wide else 0
-        displacement, kept_fraction = (0.0, 1.0) if faces or not lens else (distortion(lens), kept_fraction)
-        cameras.append(CameraFacts(len(views), model, *size, focal, displacement, kept_fraction, is_centered, faces))
+        displacement, area_fraction = (0.0, 1.0) if faces or not lens else (distortion(lens), area_fraction)
+        cameras.append(CameraFacts(len(views), model, *size, focal, displacement, area_fraction, is_centered, faces))
     return sorted(cameras, key=lambda facts: -facts.views)
 
 

@@ -309,9 +309,9 @@ class Inspection:
         facts = self.facts
         if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
             return None
-        elsewhere = facts.refusal.partition("photos without cameras; the cameras are ")[2]
+        camera_folder = facts.refusal.partition("photos without cameras; the cameras are ")[2]
         command = f"`clsplat run photos --scene {shell_quote(facts.path)}`"
-        return f"use the cameras {elsewhere}" if elsewhere else command
+        return f"use the cameras {camera_folder}" if camera_folder else command
 
     @property
     def verdict(self) -> str:
@@ -418,5 +418,5 @@ def show(inspection: Inspection, console: Console) -> None:
         table.add_row(Text(finding.level, STYLES[finding.level]), Text(finding.text))
     console.print(table, soft_wrap=not console.is_terminal)
     if inspection.trainable or inspection.next_step:
-        ready = inspection.verdict.startswith("ready")
-        console.print(Text(inspection.verdict, "bold green" if ready else "bold yellow"))
+        is_ready = inspection.verdict.startswith("ready")
+        console.print(Text(inspection.verdict, "bold green" if is_ready else "bold yellow"))

@@ -216,11 +216,11 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
     Charts over steps have a line per run, or per variant if there are more than MAX_LINES runs.
     """
     downscale = rows[0].runs[0].scene.downscale
-    are_many = sum(len(row.runs) for row in rows) > MAX_LINES
-    suffix = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
+    shows_means = sum(len(row.runs) for row in rows) > MAX_LINES
+    suffix = " (means)" if shows_means and any(len(row.runs) > 1 for row in rows) else ""
 
     def lines(get_points: Callable[[RunFolder], Points]) -> list[Line]:
-        if are_many:
+        if shows_means:
             row_means = [_mean([get_points(run) for run in row.runs]) for row in rows]
             return [
                 Line(points, row.variant.letter, row.variant.color, i // len(COLORS))
@@ -355,12 +355,12 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
     """Return the values of the template for the section of a scene."""
     crops, no_crops = _crops(rows)
-    several_seeds = any(len(row.runs) > 1 for row in rows)
-    explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
+    has_several_seeds = any(len(row.runs) > 1 for row in rows)
+    explanations = ["mean ± standard deviation over seeds"] if has_several_seeds else []
     return dict(
         name=name,
         variants=[row.variant for row in rows],
-        several_seeds=several_seeds,
+        several_seeds=has_several_seeds,
         explanations=[*_sizes(rows[0].runs[0].scene), *explanations, *(["bold: the best"] if len(rows) > 1 else [])],
         remarks=list(differing_conditions(rows)),
         main=main_table(rows),

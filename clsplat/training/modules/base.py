@@ -231,15 +231,15 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> li
     """
     trainable = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
     groups = {module.group for module in trainable}
-    earlier = [m for m in modules_so_far(run).values() if m.type in run.modules and m.group not in groups]
-    active = [module for module in earlier if run.modules[module.type].after_training == "active"]
+    earlier_modules = [m for m in modules_so_far(run).values() if m.type in run.modules and m.group not in groups]
+    active = [module for module in earlier_modules if run.modules[module.type].after_training == "active"]
     states, old_states = list[ModuleState](), run.modules
-    run.modules = {module.type: old_states[module.type] for module in earlier}
+    run.modules = {module.type: old_states[module.type] for module in earlier_modules}
     for module in sorted([*trainable, *active], key=lambda module: module.order):
-        state, old = module.create_state(run), old_states.get(module.type)
-        if old and old is not state and state.can_load(old.scalars, tables := old.tables()):
-            state.load(old.scalars, tables)
-        elif old is not state:
+        state, old_state = module.create_state(run), old_states.get(module.type)
+        if old_state and old_state is not state and state.can_load(old_state.scalars, tables := old_state.tables()):
+            state.load(old_state.scalars, tables)
+        elif old_state is not state:
             state.start(run)
         state.prepare(run, last, module in trainable)
         if state.is_saved:

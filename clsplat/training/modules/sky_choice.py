@@ -43,9 +43,9 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
         raise ConfigError(f"model.background: {conflict}; remove one of them")
     if not isinstance(background, Auto) or background.chosen is not None:
         return settings
-    chosen, reason = ("off", conflict) if conflict else _choose(background, run)
-    LOG.log(logging.INFO if chosen == "on" else logging.DEBUG, "model.background: %s, since %s", chosen, reason)
-    resolved = background.model_copy(update={"chosen": chosen, "reason": reason})
+    choice, reason = ("off", conflict) if conflict else _choose(background, run)
+    LOG.log(logging.INFO if choice == "on" else logging.DEBUG, "model.background: %s, since %s", choice, reason)
+    resolved = background.model_copy(update={"chosen": choice, "reason": reason})
     return settings.model_copy(update={"background": resolved})
 
 
@@ -113,10 +113,10 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
     evidence = _evidence(run, run.scene)
     if texels := panorama(evidence, side):
         return texels
-    uppers = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
-    if not uppers:
+    upper_colors = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
+    if not upper_colors:
         LOG.warning("masks exclude the upper thirds of all photographs; the sky starts black")
-    mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
+    mean = np.mean(upper_colors, axis=0) if upper_colors else np.zeros(3)
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 

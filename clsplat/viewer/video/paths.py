@@ -173,7 +173,7 @@ def _nearest_neighbor_tour(distances: Floats) -> Indices:
 def _shorten(tour: Indices, distances: Floats) -> Indices:
     """Reverse parts of a tour while that makes it shorter (2-opt), in place."""
     for _ in range(ROUNDS):
-        changed = False
+        has_improved = False
         for i in range(len(tour) - 2):
             steps = np.append(distances[tour[i + 2 : -1], tour[i + 3 :]], 0.0)  # nothing follows the last view
             ends = np.append(distances[tour[i + 1], tour[i + 3 :]], 0.0)
@@ -181,8 +181,8 @@ def _shorten(tour: Indices, distances: Floats) -> Indices:
             j = int(gain.argmax())
             if gain[j] > 1e-9:
                 tour[i + 1 : i + 3 + j] = tour[i + 1 : i + 3 + j][::-1].copy()
-                changed = True
-        if not changed:
+                has_improved = True
+        if not has_improved:
             break
     return tour
 
@@ -428,5 +428,5 @@ def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
     """
     distance = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
     angle = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
-    delay = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
-    return views[int((distance + angle + TIME_WEIGHT * delay).argmin())]
+    time_gap = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
+    return views[int((distance + angle + TIME_WEIGHT * time_gap).argmin())]
