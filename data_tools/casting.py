@@ -68,12 +68,12 @@ class World:
         to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
         key_light = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
-        above = self if self.canopy is None else replace(self, shapes=self.canopy)
-        distance, blocker = above.trace(start, to_sky)
+        occluders = self if self.canopy is None else replace(self, shapes=self.canopy)
+        distance, blocker = occluders.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
         occluded = np.flatnonzero(np.isfinite(distance))
         blocking_points = start[:, occluded] + distance[occluded] * to_sky[:, occluded]
-        light[:, occluded] *= BOUNCE * above.by_shape(Shape.texture, blocker[occluded], blocking_points)
+        light[:, occluded] *= BOUNCE * occluders.by_shape(Shape.texture, blocker[occluded], blocking_points)
         return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * key_light + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:

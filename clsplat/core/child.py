@@ -32,8 +32,8 @@ def run_module(
     try:
         process = subprocess.run(command, input=stdin, capture_output=True, timeout=seconds, env=environment)
     except subprocess.TimeoutExpired as error:
-        return ChildResult(None, _text(error.stdout, error.stderr))
-    return ChildResult(process.returncode, _text(process.stdout, process.stderr))
+        return ChildResult(None, _decode(error.stdout, error.stderr))
+    return ChildResult(process.returncode, _decode(process.stdout, process.stderr))
 
 
 def signal_name(code: int) -> str:
@@ -41,5 +41,5 @@ def signal_name(code: int) -> str:
     return {member.value: member.name for member in signal.Signals}.get(-code, f"signal {-code}")
 
 
-def _text(*streams: bytes | None) -> str:
+def _decode(*streams: bytes | None) -> str:
     return "\n".join((stream or b"").decode("utf-8", "replace") for stream in streams)

@@ -185,7 +185,7 @@ def check_free(folder: Path) -> bool:
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 raise
-            _ended_owner(file, path, folder)
+            _require_exited_owner(file, path, folder)
             return True
         try:
             require_stale_heartbeat(file, path, folder)
@@ -254,7 +254,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
         if error.errno not in NO_LOCKS:
             raise
     if not is_new:
-        owner = _ended_owner(file, path, folder)
+        owner = _require_exited_owner(file, path, folder)
         LOG.info("%s: taken over from process %s, which has exited", folder, owner.get("process"))
         _remove(file, path)
         return False
@@ -262,7 +262,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
     return True
 
 
-def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
+def _require_exited_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Return the owner on a file system without locks.  Raises OutputError unless that process has exited."""
     owner = read_owner(file)
     if not _has_exited(Owner.from_record(owner)):

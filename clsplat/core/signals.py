@@ -67,8 +67,8 @@ def _watch_stdin() -> None:
 
 def _handlers() -> dict[int, Any]:
     """Return signals and their handlers, except ignored ones: SIGHUP stays ignored under nohup."""
-    numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
-    handlers = {number: signal.getsignal(number) for number in numbers}
+    signal_numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+    handlers = {number: signal.getsignal(number) for number in signal_numbers}
     return {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
 
 
@@ -101,7 +101,7 @@ def stop_at_once() -> None:
     """Raise KeyboardInterrupt; during an import, which it would break, wait for the import to end."""
     wait_seconds = time.monotonic() - _received.since if _received.number else 0.0
     if wait_seconds < IMPORT_SECONDS and _is_importing():
-        _thread.start_new_thread(_signal_again, (_received.number or signal.SIGINT,))  # `threading` would take a lock
+        _thread.start_new_thread(_resend_signal, (_received.number or signal.SIGINT,))  # `threading` would take a lock
     else:
         raise KeyboardInterrupt
 
@@ -120,7 +120,7 @@ def _is_importing() -> bool:
     return False
 
 
-def _signal_again(number: int) -> None:
+def _resend_signal(number: int) -> None:
     time.sleep(0.02)
     _thread.interrupt_main(signal.Signals(number))
 
@@ -171,7 +171,7 @@ class Stream:
             return
         except (OSError, ValueError) as error:  # ValueError: closed by this process
             self.fault = error
-            _silence(stream)
+            _redirect_to_null(stream)
 
     def install(self) -> None:
         """Replace the stream in `sys` by this wrapper."""
@@ -215,7 +215,7 @@ def _is_closed_by_reader(fault: OSError | ValueError) -> bool:
     return isinstance(fault, BrokenPipeError) or windows
 
 
-def _silence(stream: Any) -> None:
+def _redirect_to_null(stream: Any) -> None:
     """Redirect a stream to the null device, so that flushing its buffer at exit does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         null = os.open(os.devnull, os.O_WRONLY)

@@ -213,13 +213,13 @@ class _RunBar:
     def _training_text(self, step: int, steps: int) -> str:
         now = time.monotonic()
         if self.last and self.last[1].steps == steps:
-            since, report = self.last
-            seconds_left = max(0.0, report.seconds_left - (now - since))
+            start_time, report = self.last
+            seconds_left = max(0.0, report.seconds_left - (now - start_time))
             return progress_line(replace(report, step=step, seconds_left=seconds_left))
         if self.first is None or self.first[2] != steps:
             self.first = now, step, steps
-        since, start_step, _ = self.first
-        seconds = (now - since) / (step - start_step) * (steps - step) if step > start_step else None
+        start_time, start_step, _ = self.first
+        seconds = (now - start_time) / (step - start_step) * (steps - step) if step > start_step else None
         return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
 
 

@@ -34,7 +34,7 @@ class PixelQuantile(Settings):
 Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explain_schedule(", or {quantile, of}")]
 
 
-def _no_photographs(q: float) -> float:
+def _raise_no_photographs(q: float) -> float:
     raise ConfigError("a quantile of pixels needs training photographs, and there are none; give a number")
 
 
@@ -43,4 +43,4 @@ class SceneScale:
     """The scene's values that thresholds of rules are relative to."""
 
     extent: float  # scene units
-    texture_quantile: Callable[[float], float] = _no_photographs  # quantile -> texture of the photographs, per px
+    texture_quantile: Callable[[float], float] = _raise_no_photographs  # quantile -> texture of the photographs, per px

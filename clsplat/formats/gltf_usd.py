@@ -86,11 +86,11 @@ class Gltf:
 
     def parameters(self) -> Parameters:
         """Return the parameters of all Gaussians in the axes of a PLY, without the transform `placement`."""
-        return concatenate([self._place(primitive, matrix) for primitive, matrix in self.primitives])
+        return concatenate([self._transform_primitive(primitive, matrix) for primitive, matrix in self.primitives])
 
-    def _place(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
+    def _transform_primitive(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
         """Return the Gaussians of a primitive, transformed relative to the first primitive."""
-        part, first = flip_axes(self._part(primitive)), self.primitives[0][1]
+        part, first = flip_axes(self._read_primitive(primitive)), self.primitives[0][1]
         if np.allclose(matrix, first, rtol=1e-7):
             return part
         relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
@@ -101,7 +101,7 @@ class Gltf:
             raise DataError(f"{self.path}: the transform of a node is not supported: {error}") from error
         return part | {name: table.astype(np.float32) for name, table in transformed.items()}
 
-    def _part(self, primitive: dict[str, Any]) -> Parameters:
+    def _read_primitive(self, primitive: dict[str, Any]) -> Parameters:
         """Return the Gaussians of one primitive, in the axes of glTF."""
         extensions = _extensions(primitive)
         extension, names = extensions.get(EXTENSION, {}), primitive["attributes"]
@@ -109,7 +109,7 @@ class Gltf:
         if kernel != "ellipse":
             raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
         if (view := _spz_view(extensions)) is not None:
-            part = self._spz(view, names)
+            part = self._read_spz(view, names)
         elif compressed := [name for name in extension.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
         else:
@@ -123,7 +123,7 @@ class Gltf:
             self.notes.add(f"its colors are {quote(space)}; they are used unchanged")
         return part
 
-    def _spz(self, view: Any, names: dict[str, Any]) -> Parameters:
+    def _read_spz(self, view: Any, names: dict[str, Any]) -> Parameters:
         """Return the Gaussians of an SPZ file in a buffer view, in the axes of glTF.
 
         Unpacked axes should be x left, y up, z front, but some programs keep those of SPZ; the declared bounds decide.

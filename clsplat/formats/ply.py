@@ -261,11 +261,11 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     with open_hashed(path) as file:
         file.write(format_ply_header(rendering_comments(rendering), vertex=(count, properties)))
         for first in range(0, count, ROWS):
-            file.write(_body({name: table[first : first + ROWS] for name, table in parameters.items()}))
+            file.write(_encode_rows({name: table[first : first + ROWS] for name, table in parameters.items()}))
     return file.sha256
 
 
-def _body(parameters: Parameters) -> bytes:
+def _encode_rows(parameters: Parameters) -> bytes:
     """Return the rows of a file as bytes."""
     count, rest = parameters["sh_rest"].shape
     means = parameters["means"]

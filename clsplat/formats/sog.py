@@ -201,7 +201,7 @@ class _Sog:
             "log_scales": scales,
             "logit_opacity": logit,
             "sh_base": self._decode("sh0", base[:, :3]),
-            "sh_rest": self._rest(),
+            "sh_rest": self._sh_rest(),
         }
         mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
         return SplatFile(parameters, read_extras(self.path, self.meta), "mip" if mip else "default")
@@ -222,7 +222,7 @@ class _Sog:
         quats[~is_valid] = [1, 0, 0, 0]
         return quats
 
-    def _rest(self) -> NDArray[np.float32]:
+    def _sh_rest(self) -> NDArray[np.float32]:
         if "shN" not in self.meta:
             return np.zeros((self.count, 0), np.float32)
         files = self._data("shN")
@@ -258,11 +258,11 @@ class _Sog:
     def _decode(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Decode the bytes of a part, [N, c], to values: codebook indices, or, in version 1, 255ths of its range."""
         if not self.is_version_1:
-            entries = self._numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
+            entries = self._read_numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
         part = self._part(name)
         if name == "shN":
-            minimum, maximum = (self._numbers(f"shN.{key}", [part.get(key)], 1) for key in ("mins", "maxs"))
+            minimum, maximum = (self._read_numbers(f"shN.{key}", [part.get(key)], 1) for key in ("mins", "maxs"))
         else:
             minimum, maximum = (values[: levels.shape[1]] for values in self._ranges(name, 3))
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
@@ -301,10 +301,10 @@ class _Sog:
 
     def _ranges(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part = self._part(name)
-        minimum, maximum = (self._numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
+        minimum, maximum = (self._read_numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
         return minimum, maximum
 
-    def _numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
+    def _read_numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
         """Return a list of at least `count` numbers as an array.  Raises DataError for another value."""
         is_list = isinstance(value, list) and count <= len(value) <= 256
         if not is_list or not all(isinstance(number, int | float) and abs(number) < LIMIT for number in value):
@@ -377,7 +377,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     for name, table, alpha in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
         entries = codebook(p[table])
         planes = nearest_entries(p[table], entries).T
-        meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *alpha)]}
+        meta[name] = {"codebook": [_round(number) for number in entries], "files": [image(name, *planes, *alpha)]}
     if harmonics is not None:
         meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
@@ -403,7 +403,7 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
     means = p["means"].astype(np.float64)
     t = np.sign(means) * np.log1p(np.abs(means))
     extrema = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
-    minimum, maximum = (np.array([_short(value, rounding) for value in values]) for values, rounding in extrema)
+    minimum, maximum = (np.array([_round(value, rounding) for value in values]) for values, rounding in extrema)
     span = np.where(maximum > minimum, maximum - minimum, 1)
     levels = np.rint(65535 * (t - minimum) / span).astype(np.uint16)
     files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
@@ -447,7 +447,7 @@ class Harmonics:
         cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None
     ) -> "Harmonics":
         """Quantize palette vectors, [E, c], with a codebook.  labels: [N] rows of `vectors`, one per splat."""
-        entries = np.array([_short(entry) for entry in codebook(vectors, step)])
+        entries = np.array([_round(entry) for entry in codebook(vectors, step)])
         return cls(entries, nearest_entries(vectors, entries), labels)
 
     @property
@@ -496,7 +496,7 @@ def _write_harmonics(sh: Harmonics, bands: int, image: Any) -> dict[str, Any]:
     return {"count": len(sh.palette), "bands": bands, "codebook": sh.codebook.tolist(), "files": files}
 
 
-def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
+def _round(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
     """Round to 8 significant digits, because the last bits of logarithms and means differ between processors."""
     return float(Context(8, rounding).create_decimal(float(number)))
 

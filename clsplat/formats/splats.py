@@ -39,14 +39,12 @@ def is_timestamp(time: float) -> bool:
     return math.isfinite(time) and 0 <= time <= 1
 
 
-def motion_width(degree: int, turns: bool) -> int:
-    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; turns: with rotations."""
-    return 2 + 3 * degree + TURN * turns
+def motion_width(degree: int, has_turn: bool) -> int:
+    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; has_turn: with rotations."""
+    return 2 + 3 * degree + TURN * has_turn
 
 
-WIDTHS = {
-    motion_width(degree, turns): (degree, turns) for degree in range(1, MAX_DEGREE + 1) for turns in (False, True)
-}
+WIDTHS = {motion_width(degree, turn): (degree, turn) for degree in range(1, MAX_DEGREE + 1) for turn in (False, True)}
 
 
 def motion_degree(width: int) -> int:

@@ -52,7 +52,7 @@ def read_lod(path: Path) -> SplatFile:
         raise DataError(f"{path}: its leaves have no file of level 0; export it again")
     count = sum(count for leaves in runs.values() for _, count in leaves)
     require_plausible(path, count, sum(file.stat().st_size for file in lod_files(path) if file.is_file()))
-    parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
+    parts = [_read_splats(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
     _require_count(path, meta, 0, runs)
     if "environment" in meta:
         parts.append(read_sog(path.parent / _check_name(path, meta["environment"])))
@@ -78,7 +78,7 @@ def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
     faults = []
     for file, leaves in sorted(runs.items()):
         try:
-            _part(path, meta["filenames"][file], leaves)
+            _read_splats(path, meta["filenames"][file], leaves)
         except DataError as error:
             faults.append(str(error))
     return faults
@@ -134,7 +134,7 @@ def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
                 raise DataError(
                     f"{path}: a leaf refers to level {quote(name)}; expected 0 to {len(levels) - 1}; export it again"
                 )
-            file, offset, count = (_whole_number(path, key, run) for key in ("file", "offset", "count"))
+            file, offset, count = (_parse_integer(path, key, run) for key in ("file", "offset", "count"))
             levels[numbers[name]].setdefault(file, []).append((offset, count))
     for level, runs in enumerate(levels):
         if max(runs, default=-1) >= len(meta["filenames"]):
@@ -164,14 +164,14 @@ def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
             raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods; export it again")
 
 
-def _whole_number(path: Path, key: str, run: Any) -> int:
+def _parse_integer(path: Path, key: str, run: Any) -> int:
     value = run.get(key) if isinstance(run, dict) else None
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number; export it again")
     return value
 
 
-def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
+def _read_splats(path: Path, name: str, runs: list[Run]) -> SplatFile:
     """Return the splats of a file that belong to leaves.  runs: in ascending order."""
     splats = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
@@ -297,7 +297,7 @@ class _Files:
 
     def shape(self, node: Node) -> dict[str, Any]:
         """Return a node as JSON data, and assign the rows of its leaves to files."""
-        bound = {"bound": {"min": _short(node.low), "max": _short(node.high)}}
+        bound = {"bound": {"min": _round(node.low), "max": _round(node.high)}}
         if node.children:
             return {**bound, "children": [self.shape(child) for child in node.children]}
         lods = {str(level): self._run(level, rows) for level, rows in enumerate(node.rows) if len(rows)}
@@ -314,6 +314,6 @@ class _Files:
         return {"file": list(self.rows).index(name), "offset": offset, "count": len(rows)}
 
 
-def _short(numbers: NDArray[np.float64]) -> list[float]:
+def _round(numbers: NDArray[np.float64]) -> list[float]:
     """Round numbers to 7 digits, the precision of float32."""
     return [float(f"{number:.7g}") for number in numbers]

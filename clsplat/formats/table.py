@@ -93,8 +93,8 @@ def model_bytes(path: Path) -> int:
     try:
         return sum(file.stat().st_size for file in model_files(main))
     except OSError as error:
-        missing = "" if error.filename == str(main) else f"names {quote(error.filename)}, which "
-        raise DataError(f"{main}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
+        prefix = "" if error.filename == str(main) else f"names {quote(error.filename)}, which "
+        raise DataError(f"{main}: {prefix}cannot be read ({error.strerror}); copy or export it again") from error
 
 
 LOG = logging.getLogger("clsplat")

@@ -53,7 +53,7 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     if len(models) == 1:
         return first
     for model, name in zip(models, names, strict=True):
-        kinds = [_kind(m) for m in (first, model)]
+        kinds = [_describe_filter(m) for m in (first, model)]
         if kinds[0] != kinds[1]:
             raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
         values, first_values = model.rendering.comment(), first.rendering.comment()
@@ -69,7 +69,7 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     return Model(**merged, rendering=first.rendering, sky=first.sky, origin=origin)
 
 
-def _kind(model: Model) -> str:
+def _describe_filter(model: Model) -> str:
     """Describe the screen filter of a model."""
     if model.rendering.pixel_box:
         return "a model with a pixel box filter"
@@ -278,7 +278,7 @@ def convert_frames(
     files = [folder / f"{prefix}{number:0{digits}}{suffix}" for number in range(frames)]
     for file in files:
         check_output(sources, file)
-    _require_no_others(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
+    _require_no_other_frames(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
     options, model = writing_options(files[0], quality, changes), read(sources)
     changes_by_frame = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for change in changes_by_frame:  # check all before anything is written
@@ -335,7 +335,7 @@ def _link_or_copy(file: Path, target: Path) -> None:
         shutil.copy2(file, target)
 
 
-def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
+def _require_no_other_frames(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
     """Raise ConfigError if a folder has frames of another series, since players would show them too.
 
     names: the pattern of the frames' names.

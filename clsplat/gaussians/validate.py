@@ -47,10 +47,10 @@ def examine(path: Path) -> dict[str, Any]:
     """
     codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
-    is_bad = not_finite(model.tables())
-    finite = model[~is_bad] if is_bad.any() else model
-    fault = f"{int(is_bad.sum()):,} of {len(model):,} Gaussians have values that are not finite"
-    findings = [fault] if is_bad.any() else []
+    is_nonfinite = not_finite(model.tables())
+    finite = model[~is_nonfinite] if is_nonfinite.any() else model
+    fault = f"{int(is_nonfinite.sum()):,} of {len(model):,} Gaussians have values that are not finite"
+    findings = [fault] if is_nonfinite.any() else []
     findings += [message] if (message := too_large_message(finite.tables())) else []
     findings += _find_activated(finite)
     lengths = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
@@ -72,7 +72,7 @@ def examine(path: Path) -> dict[str, Any]:
         "bounds": [finite.means.min(axis=0).tolist(), finite.means.max(axis=0).tolist()] if len(finite) else [],
         **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
-            "not_finite": int(is_bad.sum()),
+            "not_finite": int(is_nonfinite.sum()),
             "no_rotation": no_rotation,
             "flat": int((finite.log_scales < np.log(FLAT * typical_size(finite.means))).any(axis=1).sum()),
             "invisible": int((finite.opacities < FAINT).sum()),

@@ -100,8 +100,8 @@ class AddNoise(Scheduled):
     """Opacity at which the noise is half as strong."""
 
     def run(self, run: Run) -> None:
-        rate, below = at_step(self.rate, run.step) / run.scene.extent, at_step(self.opacity_below, run.step)
-        add_noise(run.model.gaussians, rate, below, run.seed, run.step)
+        rate, max_opacity = at_step(self.rate, run.step) / run.scene.extent, at_step(self.opacity_below, run.step)
+        add_noise(run.model.gaussians, rate, max_opacity, run.seed, run.step)
 
 
 def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:

@@ -253,7 +253,7 @@ class Field:
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the image of the fine level, [3, rows, stride], zero outside the camera's pixels."""
         image = self._empty(camera)
-        for _, level in self._passes(camera):
+        for _, level in self._render_batches(camera):
             self.levels.write_colors(level, image)
         return image
 
@@ -264,7 +264,7 @@ class Field:
         """
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
-        for pixels, level in self._passes(camera):
+        for pixels, level in self._render_batches(camera):
             self.levels.write_colors(level, image)
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (level.weights, level.edges))
             opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
@@ -279,7 +279,7 @@ class Field:
         image.fill(0)
         return image
 
-    def _passes(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], SampleLevel]]:
+    def _render_batches(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], SampleLevel]]:
         """Yield batches of pixels, [n], row * width + column, with their fine level, valid until the next batch."""
         pixels, count = np.arange(camera.width * camera.height, dtype=np.uint32), rays_per_pass(self.shape)
         for first in range(0, len(pixels), count):

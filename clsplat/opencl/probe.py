@@ -45,25 +45,25 @@ def main(platform: int, device: int) -> None:
     cl_device = cl.get_platforms()[platform].get_devices()[device]
     context = cl.Context([cl_device])
     queue = cl.CommandQueue(context)
-    numbers = np.arange(8, dtype=np.float32)
+    values = np.arange(8, dtype=np.float32)
     flags = cl.mem_flags
-    source = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=numbers)
-    reversed_numbers = cl.Buffer(context, flags.WRITE_ONLY, numbers.nbytes)
+    source = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=values)
+    reversed_values = cl.Buffer(context, flags.WRITE_ONLY, values.nbytes)
     lanes = 16 if cl_device.native_vector_width_float >= 16 else 8 if cl_device.native_vector_width_float >= 8 else 4
     program = cl.Program(context, SOURCE % {"lanes": lanes}).build(["-cl-std=CL1.2"])
     if WITHOUT_VECTORS in program.get_build_info(cl_device, cl.program_build_info.LOG):
         raise SystemExit("error: kernels are compiled without the vectors of the processor")
-    cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_numbers)
-    result = np.empty_like(numbers)
-    cl.enqueue_copy(queue, result, reversed_numbers)
-    if not np.array_equal(result, 2 * numbers[::-1]):
+    cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_values)
+    result = np.empty_like(values)
+    cl.enqueue_copy(queue, result, reversed_values)
+    if not np.array_equal(result, 2 * values[::-1]):
         raise SystemExit(f"error: the test kernel computed {result.tolist()}")
-    numbers = np.arange(lanes, dtype=np.float32)
-    squares = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=numbers**2)
+    values = np.arange(lanes, dtype=np.float32)
+    squares = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=values**2)
     cl.Kernel(program, "vector_root")(queue, (1,), (1,), squares)
-    roots = np.empty_like(numbers)
+    roots = np.empty_like(values)
     cl.enqueue_copy(queue, roots, squares)
-    if not np.array_equal(roots, numbers):
+    if not np.array_equal(roots, values):
         raise SystemExit(f"error: the test kernel computed square roots {roots.tolist()}")
 
 

@@ -100,7 +100,7 @@ def check_runtimes(loader: str) -> None:
         return
     fault = _loading_fault({})
     if fault is not None:
-        raise no_device_error(f"an OpenCL runtime {fault}") if limit else _blame(drivers, fault)
+        raise no_device_error(f"an OpenCL runtime {fault}") if limit else _find_faulty_driver(drivers, fault)
     with suppress(OutputError):
         write_text(record, state)
 
@@ -120,7 +120,7 @@ def _drivers() -> dict[Path, str]:
     return drivers
 
 
-def _blame(drivers: Mapping[Path, str], fault: str) -> DeviceError:
+def _find_faulty_driver(drivers: Mapping[Path, str], fault: str) -> DeviceError:
     """Load each driver separately, and return an error about the first one that crashes the process."""
     remedy = f"correct or unset {variables}" if (variables := _user_variables()) else OTHER_DRIVERS
     for path, library in drivers.items():

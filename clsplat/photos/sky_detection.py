@@ -75,7 +75,7 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
         usable = (
             np.ones(reduced.shape[:2], bool) if unmasked is None else _reduce(255 * unmasked.astype(np.uint8)) == 255
         )
-        mask = sky_mask(reduced, _points_in(scene, view) * (reduced.shape[1] / view.camera.width), usable)
+        mask = sky_mask(reduced, _visible_points(scene, view) * (reduced.shape[1] / view.camera.width), usable)
         yield SkyEvidence(view, reduced, mask, usable, up)
 
 
@@ -140,7 +140,7 @@ def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Ma
     return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > MIN_DISTANCE)
 
 
-def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:
+def _visible_points(scene: Scene, view: View) -> NDArray[np.float64]:
     """Return the positions of points in a photograph, [K, 2] px: the points with a track in it, or else all points."""
     if scene.tracks is not None and view.name in scene.tracks.rows:
         positions = scene.tracks.positions[scene.tracks.rows[view.name]]

@@ -149,10 +149,10 @@ def _describe_error(error: dict[str, Any], key_path: KeyPath, model: type[BaseMo
     if kind == "union_tag_invalid":
         names = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shorten(str(error["ctx"]["tag"]))
-        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, names)}; plug-ins need --plugin FILE.py"
+        return f"no {_describe_kind(annotation)} named '{tag}'{_nearest(tag, names)}; plug-ins need --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
-        return f"expected a '{tag}', the name of the {_kind(annotation)}"
+        return f"expected a '{tag}', the name of the {_describe_kind(annotation)}"
     suffix = f", got {quote(value)}"
     if kind in EXPECTATIONS:
         return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{suffix}"
@@ -169,7 +169,7 @@ def _nearest(name: str, names: list[str]) -> str:
     return f"; expected one of {', '.join(sorted(names))}" if names else "; remove it: no keys are allowed here"
 
 
-def _kind(annotation: Any) -> str:
+def _describe_kind(annotation: Any) -> str:
     """Return the name of a field's base class in words, such as 'world filter' for variants of WorldFilter."""
     base = bases(annotation)[0]
     family = base.__mro__[base.__mro__.index(Settings) - 1]

@@ -151,7 +151,7 @@ def load_experiment(
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
     if file.matrix.steps is not None:
-        cells = [_in_steps(cell, file.matrix.steps) for cell in cells]
+        cells = [_with_steps(cell, file.matrix.steps) for cell in cells]
     _check_names(path, cells)
     data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
     if execution is None:
@@ -221,7 +221,7 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
     return Cell(name, pipeline)
 
 
-def _in_steps(cell: Cell, steps: int) -> Cell:
+def _with_steps(cell: Cell, steps: int) -> Cell:
     return replace(cell, pipeline=replace(cell.pipeline, settings=stretch_to_steps(cell.pipeline.settings, steps)))
 
 

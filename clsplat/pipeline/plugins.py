@@ -52,7 +52,7 @@ def load_file(path: Path) -> Plugin:
             raise ConfigError(
                 f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {plugin.path}; rename the file"
             )
-        if plugin.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
+        if plugin.digest != digest_of(path, *_imported_files(sys.modules[name], path.parent)):
             raise ConfigError(f"--plugin {path}: its files have changed since it was loaded; restart Python")
         return plugin
     spec = importlib.util.spec_from_file_location(name, path)
@@ -61,7 +61,7 @@ def load_file(path: Path) -> Plugin:
     with _importing(name, path) as kinds:
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    digest = digest_of(path, *_helpers(module, path.parent))
+    digest = digest_of(path, *_imported_files(module, path.parent))
     _loaded[path.stem] = Plugin(path.stem, path, digest, installed=False, kinds=tuple(kinds))
     return _loaded[path.stem]
 
@@ -130,7 +130,7 @@ def digest_of(*modules: Path) -> str:
 def _load_entry(entry: EntryPoint) -> Plugin:
     with _importing(entry.module) as kinds:
         module = importlib.import_module(entry.module)
-        package = _package_of(module)
+        package = _root_package(module)
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
         digest = digest_of(path, *files)
@@ -184,14 +184,14 @@ def _is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(f"{package}.")
 
 
-def _package_of(module: ModuleType) -> ModuleType:
+def _root_package(module: ModuleType) -> ModuleType:
     """Return the outermost package of a module that is not a namespace package, or the module itself."""
     parts = module.__name__.split(".")
     packages = [sys.modules[".".join(parts[:i])] for i in range(1, len(parts) + 1)]
     return next((package for package in packages if package.__file__), module)
 
 
-def _helpers(module: ModuleType, folder: Path) -> list[Path]:
+def _imported_files(module: ModuleType, folder: Path) -> list[Path]:
     """Return the files in a folder that a module imports, directly or indirectly."""
     stack, files = [module], set[Path]()
     while stack:

@@ -85,13 +85,13 @@ def read_pipeline(path: Path) -> str:
     """
     file = origin(path)
     text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
-    return text if file == path else _short(text, path, file)
+    return text if file == path else _apply_short(text, path, file)
 
 
 # The text of NAME_7k.yaml is that of NAME.yaml with the values of `short`, and with the comment above that key.
 
 
-def _short(text: str, path: Path, file: Path) -> str:
+def _apply_short(text: str, path: Path, file: Path) -> str:
     document = _parse(text, str(file))
     if not isinstance(document.data, dict) or not isinstance(document.data.get("short"), dict):
         raise ConfigError(f"{file}: expected a map 'short', with values of {path.name}; add one, or run {file.name}")

@@ -89,7 +89,7 @@ def prepare(
         with counts_as_debug():  # each step logs its own progress
             count.reach(i)
         with _lock_result(planned_step) if planned_step.reason else nullcontext():
-            if planned_step.reason and _fault(planned_step.folder):  # another process may have made it meanwhile
+            if planned_step.reason and _find_fault(planned_step.folder):  # another process may have made it meanwhile
                 with stage(planned_step.step.stage):
                     _run_step(planned_step, source, root)
             else:
@@ -204,7 +204,7 @@ def _sizes(folder: Path) -> dict[str, int]:
     return {name: size for name, size in sizes.items() if name != RECORD}
 
 
-def _fault(folder: Path) -> str:
+def _find_fault(folder: Path) -> str:
     """Return the fault of a result, or "" if its record exists and every listed file has the recorded size."""
     record = read_record(folder)
     if not record:
@@ -222,7 +222,7 @@ def _fault(folder: Path) -> str:
 def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
     """Return the reason to run a step: a damaged result, or the difference from the newest one.  "" if it exists."""
     if folder.exists():
-        fault = _fault(folder)
+        fault = _find_fault(folder)
         return fault and f"{fault}; the result is recomputed"
     results = []
     for path in folder.parent.glob(f"{step.stage}-*"):

@@ -105,7 +105,7 @@ def match_database(database: Path, pairing: Pairing) -> Matching:
             LOG.info("matching %d photographs, each with the %d most similar", count, 2 * neighbors)
             pairs = _find_similar_pairs(pycolmap, database, 2 * neighbors)
             with _count_pairs(database, len(pairs)):
-                _match_listed(database, pairs, common_options)
+                _match_pairs(database, pairs, common_options)
         else:
             LOG.info("matching all pairs of %d photographs", count)
             with _count_pairs(database, count * (count - 1) // 2):
@@ -124,7 +124,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         return
     LOG.info("matching %s of photographs that are not placed yet", pluralize(len(new_pairs), "more pair"))
     with raising_data_error(database, "match photographs"), _count_pairs(database, matched_count + len(new_pairs)):
-        _match_listed(database, new_pairs, _options(pycolmap, threads))
+        _match_pairs(database, new_pairs, _options(pycolmap, threads))
 
 
 def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
@@ -175,7 +175,7 @@ def _options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
     return {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
 
 
-def _match_listed(database: Path, pairs: Sequence[tuple[str, str]], options: dict[str, Any]) -> None:
+def _match_pairs(database: Path, pairs: Sequence[tuple[str, str]], options: dict[str, Any]) -> None:
     pycolmap = require_pycolmap()
     list_file = database.with_name(PAIRS)
     write_text(list_file, "".join(f"{a} {b}\n" for a, b in pairs))
@@ -237,7 +237,7 @@ def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64
     if not len(sample):
         return np.zeros((len(descriptors), len(descriptors)))
     counts = np.zeros((len(descriptors), WORDS))
-    words = _words(sample)
+    words = _visual_words(sample)
     for row, matrix in enumerate(descriptors):
         if len(matrix):
             distance = (words**2).sum(axis=1) - 2 * matrix @ words.T
@@ -248,7 +248,7 @@ def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64
     return np.asarray(vectors @ vectors.T)
 
 
-def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
+def _visual_words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the visual words, [at most WORDS, 128]: the centers of k-means over a sample of descriptors, [M, 128]."""
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)

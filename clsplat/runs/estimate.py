@@ -114,7 +114,7 @@ def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, 
     low, high = step_seconds(units, size, initial)[0], step_seconds(units, size, maximum)[1]
     steps = training.min_steps, training.steps * (2 if training.refit else 1)
     steps_text, counts_text = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (initial, maximum)))
-    reason = f"{steps_text} steps of {_ms(low, high)}, with {counts_text} Gaussians at {size[0]}x{size[1]} px"
+    reason = f"{steps_text} steps of {_format_ms(low, high)}, with {counts_text} Gaussians at {size[0]}x{size[1]} px"
     return Estimate(training.stage, (steps[0] * low, steps[1] * high), reason)
 
 
@@ -124,7 +124,7 @@ def _field_estimate(training: TrainField, units: int) -> Estimate:
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
     sample_seconds = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
     low = LAUNCHES + samples * sample_seconds / units
-    reason = f"{training.steps:,} steps of {_ms(low, SLOWER * low)}, of {training.rays:,} rays"
+    reason = f"{training.steps:,} steps of {_format_ms(low, SLOWER * low)}, of {training.rays:,} rays"
     return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), reason)
 
 
@@ -153,7 +153,7 @@ def minutes_text(seconds: Sequence[float]) -> str:
     return _range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
 
 
-def _ms(low: float, high: float) -> str:
+def _format_ms(low: float, high: float) -> str:
     return _range(f"{1e3 * low:.0f}", f"{1e3 * high:.0f}") + " ms"
 
 

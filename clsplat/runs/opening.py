@@ -184,7 +184,7 @@ def _check_split(pipeline: Pipeline, planned_steps: Sequence[PlannedStep], out: 
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
     with suppress(MissingViewError):  # a dry run reports it
-        _scene_of_names(pipeline, names)
+        _placeholder_scene(pipeline, names)
 
 
 def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
@@ -193,10 +193,10 @@ def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | No
     Only the number of training and validation photos is known, and only if all of them get a camera.  Raises DataError
     if the split rejects the photos.
     """
-    return Measures(len(_scene_of_names(pipeline, names).merge_validation().train)) if names else None
+    return Measures(len(_placeholder_scene(pipeline, names).merge_validation().train)) if names else None
 
 
-def _scene_of_names(pipeline: Pipeline, names: Sequence[str]) -> Scene:
+def _placeholder_scene(pipeline: Pipeline, names: Sequence[str]) -> Scene:
     """Return a scene of the named photos with placeholder cameras, split as in the pipeline.  Raises DataError."""
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
     pose = np.eye(3, 4, dtype=np.float32)

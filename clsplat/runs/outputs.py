@@ -117,14 +117,14 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
         raise ConfigError(f"{out}: is the root of a file system; use another folder for the run")
     reserved = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # `prepare` hashes the photos' folder
     is_inside = scene.path is not None and (
-        scene.folder.resolve() in reserved or (state.phase < Phase.BEGUN and _is_among_photos(folder, scene.folder))
+        scene.folder.resolve() in reserved or (state.phase < Phase.BEGUN and _is_in_photo_folder(folder, scene.folder))
     )
     if is_inside:
         raise ConfigError(f"{out}: is, or is inside, the folder of the photos; use another folder for the run")
     check_names(state, RUN_FILES, [path for stage in pipeline.stages for path in stage.outputs(out)])
 
 
-def _is_among_photos(out: Path, scene: Path) -> bool:
+def _is_in_photo_folder(out: Path, scene: Path) -> bool:
     """Return whether `out`, or a folder between it and the scene folder that contains it, has photos."""
     folders_between = [path for path in (out, *out.parents) if scene.resolve() in path.parents and path.is_dir()]
     return any(is_image(file) for path in folders_between for file in path.iterdir())

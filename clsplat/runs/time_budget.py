@@ -75,7 +75,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     `execute`.
     """
     deadline = time.perf_counter() + 60 * minutes
-    _require_one_training(pipeline)
+    _require_single_training(pipeline)
     check_run(pipeline, run)
     rehearsal = rehearse_enough(pipeline, run, minutes, deadline)
     steps, planned_steps = pipeline.settings.training.steps, rehearsal.steps_in(deadline - time.perf_counter())
@@ -222,7 +222,7 @@ def _add_reports(settings: PipelineFile) -> PipelineFile:
     return map_trainings(settings, Training, with_reports)
 
 
-def _require_one_training(pipeline: Pipeline) -> None:
+def _require_single_training(pipeline: Pipeline) -> None:
     """Raise ConfigError unless a single number of steps determines the time of the training."""
     stages = [stage for stage in pipeline.stages if isinstance(stage, Training)]
     if len(stages) != 1:

@@ -102,7 +102,7 @@ def make_video(
         photo_files = [view.image_path for view in used_scene.views] if used_scene else []
         files = write_pictures(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
     else:
-        side = _side(extras.side, plan, used_scene, background, opened_device, origin)
+        side = _make_side(extras.side, plan, used_scene, background, opened_device, origin)
         render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))
         files = list(videos.values())
     return {
@@ -137,7 +137,7 @@ def _scene(
     return source.scene(host_model).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
-def _side(
+def _make_side(
     name: str | None, plan: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
     """Return a function from a view to the image next to its frame: the nearest photo, or a render of another model."""

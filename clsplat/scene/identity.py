@@ -211,7 +211,7 @@ class Identity:
         for key in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(key) != new[name].get(key)]
             changes += [f"the {key} of {_list_views(names)}"] if names else []
-        moved_names = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
+        moved_names = [name for name in old if name in new and before._splits(name) != self._splits(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
         changes += [f"the split of {_list_views(moved_names)}"] if moved_names else []
         changes += [f"{_list_views(removed)}, removed"] if removed else []
@@ -224,7 +224,7 @@ class Identity:
     def _rows(self) -> dict[str, Row]:
         return self.train | self.test | self.validation
 
-    def _split_of(self, name: str) -> tuple[bool, bool]:
+    def _splits(self, name: str) -> tuple[bool, bool]:
         return name in self.train, name in self.validation
 
     def data(self) -> dict[str, Any]:

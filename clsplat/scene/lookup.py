@@ -56,10 +56,10 @@ def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError when some `files` of the dataset at `path` do not exist; the error names the first three."""
     paths = list(files)
     if missing := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
-        raise DataError(f"{path}: {_missing_text(missing, len(paths))}; put them back")
+        raise DataError(f"{path}: {_describe_missing(missing, len(paths))}; put them back")
 
 
-def _missing_text(missing: Sequence[str], count: int) -> str:
+def _describe_missing(missing: Sequence[str], count: int) -> str:
     names = ", ".join(map(shorten, missing[:3])) + (", ..." if len(missing) > 3 else "")
     return f"{len(missing)} of {count} image files are missing: {names}"
 
@@ -122,13 +122,13 @@ class FileLookup:
         self.matches: dict[int, int] = {}  # length of the common end of the path, by index, of each inexact match
         self.downscaled_files: set[Path] = set()  # photographs from a folder such as images_4
         self.choices: dict[int, list[Path]] = {}  # files that match a name equally well, by its index
-        unmatched = [i for i in range(len(names)) if not self._take_exact(i, spellings)]
+        unmatched = [i for i in range(len(names)) if not self._use_exact_match(i, spellings)]
         self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
         self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matches)
         if self.matches:
             logger.info("%s: %s", root, self.note)
 
-    def _take_exact(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
+    def _use_exact_match(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
         """Use the file that exactly matches the i-th name; return whether it exists."""
         for name in filter(_is_safe, dict.fromkeys((self.listing[i], PureWindowsPath(self.listing[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
@@ -216,7 +216,7 @@ class FileLookup:
         """
         rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
         if missing_indices := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
-            fault = f"{source}: {_missing_text([str(self.paths[i]) for i in missing_indices], len(self.paths))}"
+            fault = f"{source}: {_describe_missing([str(self.paths[i]) for i in missing_indices], len(self.paths))}"
             for name in [self.listing[i] for i in missing_indices if not _is_safe(self.listing[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:

@@ -53,8 +53,8 @@ def near_depth(scene: Scene) -> float | None:
     """
     views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file
-        in_front = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
-    return float(np.quantile(np.concatenate(in_front), NEAREST)) if any(map(len, in_front)) else None
+        visible_depths = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
+    return float(np.quantile(np.concatenate(visible_depths), NEAREST)) if any(map(len, visible_depths)) else None
 
 
 def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:

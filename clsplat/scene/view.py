@@ -94,10 +94,10 @@ class View:
 
         Raises ValueError when the target equals the position or is in the direction of `up` from it.
         """
-        center, point, up_vector = (np.asarray(vector, np.float64) for vector in (position, target, up))
-        if not center.shape == point.shape == up_vector.shape == (3,):
+        center, target_point, up_vector = (np.asarray(vector, np.float64) for vector in (position, target, up))
+        if not center.shape == target_point.shape == up_vector.shape == (3,):
             raise ValueError(f"{quote(name)}: expected a position, a target and `up` of 3 numbers each")
-        forward = point - center
+        forward = target_point - center
         right = np.cross(forward, up_vector)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up_vector):

@@ -157,7 +157,7 @@ class _NameIndex:
         paths = [PurePosixPath(name) for name in names]
         stems = [path.with_suffix("") for path in paths]
         self._indices = {name: i for i, name in reversed([*enumerate(names)])}
-        self._endings, self._stems = _group(_ends_of(paths)), _group(_ends_of(stems))
+        self._endings, self._stems = _group(_path_suffixes(paths)), _group(_path_suffixes(stems))
         self._full_stems = _group((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, name: str) -> list[int]:
@@ -165,9 +165,9 @@ class _NameIndex:
 
         If there are none, names with another suffix match too, since prepared images are PNG files.
         """
-        return [i for match in self._matches_of(name) for i in self._views[self._names[match]]]
+        return [i for match in self._find_matches(name) for i in self._views[self._names[match]]]
 
-    def _matches_of(self, name: str) -> list[int]:
+    def _find_matches(self, name: str) -> list[int]:
         if name in self._indices:
             return [self._indices[name]]
         parts = PurePosixPath(name.replace("\\", "/"))
@@ -175,7 +175,7 @@ class _NameIndex:
         return self._endings.get(parts.parts) or self._full_stems.get(stem) or self._stems.get(stem, [])
 
 
-def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
+def _path_suffixes(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
     """Yield every end of each path, as parts, with the index of the path."""
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
@@ -276,10 +276,10 @@ class Split:
                 if lines and key == "holdout":
                     excluded["holdout"] = [*lines]
                 if lines and key == "train":
-                    free = lines | self._held_out(names)
+                    free = lines | self._held_out_names(names)
                     excluded["train"] = [name for name in names if name not in free]
 
-    def _held_out(self, names: Sequence[str]) -> set[str]:
+    def _held_out_names(self, names: Sequence[str]) -> set[str]:
         """Return the names that every n-th as `holdout` selects for testing, if all photographs get poses."""
         every, offset = self.reader_holdout, 0
         if isinstance(self.holdout, ViewSelection):

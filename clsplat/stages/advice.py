@@ -110,11 +110,11 @@ def advise_on_fit(
 
 def find_limit(stages: Sequence[Mapping[str, Any]]) -> str | None:
     """Return the key for `--set` of the first limit of Gaussians per pixel in a pipeline.  None without a limit."""
-    entries = ((name, i, entry) for group in stages for name, stage in group.items() for i, entry in _during(stage))
+    entries = ((name, i, entry) for group in stages for name, stage in group.items() for i, entry in _inner(stage))
     return next((f"{name}.during.{i}.per_pixel" for name, i, entry in entries if _has_limit(entry)), None)
 
 
-def _during(stage: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any]]]:
+def _inner(stage: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any]]]:
     yield from enumerate(stage.get("during") or ())
 
 

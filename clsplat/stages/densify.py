@@ -129,7 +129,7 @@ class Densify(Scheduled):
         """Return the box in which Gaussians grow, in the run's coordinates."""
         return self.inside and self.inside.shifted(run.scene.origin)
 
-    def _outside(self, run: Run, edit: Edit) -> int:
+    def _count_outside(self, run: Run, edit: Edit) -> int:
         """Return the number of Gaussians outside the box in which Gaussians grow."""
         box = self._box(run)
         return int((~box.contains(edit.gaussians.get("means"))).sum()) if box else 0
@@ -139,11 +139,11 @@ class Densify(Scheduled):
         if self._has_growth_ended(run):
             yield 0
         if self.max_gaussians is not None:
-            yield int(edit.at(self.max_gaussians)) + self._outside(run, edit)
+            yield int(edit.at(self.max_gaussians)) + self._count_outside(run, edit)
         if self.per_pixel is not None:
             views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
             sizes = [view.camera.width * view.camera.height for view in views]
-            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(run, edit)
+            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._count_outside(run, edit)
         if self.budget and self.every and self.stop:
             edits = len(fire_steps(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, edits, run.image_downscale)

@@ -71,16 +71,16 @@ class ValidatedTraining(Training):
         """Return the evaluations that `keep: best` adds to `during`: training views, then validation views."""
         if self.keep == "last":
             return []
-        listed_stage = next((stage for stage in during if _validates(stage)), None)
+        validating_stage = next((stage for stage in during if _validates(stage)), None)
         count = max(
             1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL)
         )  # equal intervals, so that the last step is measured
-        every = listed_stage.every if listed_stage else self.steps // count
-        start, stop = (listed_stage.start, listed_stage.stop) if listed_stage else (0, None)
+        every = validating_stage.every if validating_stage else self.steps // count
+        start, stop = (validating_stage.start, validating_stage.stop) if validating_stage else (0, None)
         keys = {"metrics": [*PSNR_AND_SSIM], "every": every}
         train_keys = {"split": "train", "max_views": MAX_TRAINING_VIEWS, "start": start, "stop": stop}
         train = Evaluate.model_validate({**keys, **train_keys})
-        return [train] if listed_stage else [train, Evaluate.model_validate({**keys, "split": "validation"})]
+        return [train] if validating_stage else [train, Evaluate.model_validate({**keys, "split": "validation"})]
 
     @property
     def min_steps(self) -> int:

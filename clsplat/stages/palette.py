@@ -198,7 +198,7 @@ class VisibleError:
         points = self._points(products)
         for _ in range(ROUNDS):
             labels = nearest(points, _append_products(vectors))
-            vectors = self._minima(products, labels, vectors)
+            vectors = self._optimal_vectors(products, labels, vectors)
         return vectors, nearest(points, _append_products(vectors))
 
     def _points(self, products: Floats) -> NDArray[np.float32]:
@@ -213,7 +213,7 @@ class VisibleError:
             points[:, vector_size + index] = self.form[index] * factor * scale
         return points
 
-    def _minima(self, products: Floats, labels: NDArray[np.int64], vectors: Floats) -> Floats:
+    def _optimal_vectors(self, products: Floats, labels: NDArray[np.int64], vectors: Floats) -> Floats:
         """Return the optimal vector for the Gaussians of each label; sums are in the order of the Gaussians."""
         entries, size = len(vectors), self.mean.shape[1]
         i, j = np.triu_indices(size)

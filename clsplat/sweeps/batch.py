@@ -151,7 +151,7 @@ class Batch:
         return pending_cells
 
     def _dispatch(self, dispatcher: Dispatcher, pending_cells: Sequence[PendingCell]) -> None:
-        dispatcher.on_end, dispatcher.poll = self._note_end, self._report_progress
+        dispatcher.on_end, dispatcher.poll = self._record_end, self._report_progress
 
         def note_start(cell: CellRun) -> None:
             if dispatcher.is_same and not self._keys:  # so that `clsplat status` shows waiting cells
@@ -159,13 +159,13 @@ class Batch:
                     self._keys[pending.cell.name] = pending.in_class(cell.spec["bits"]).key
                     with suppress(ClsplatError):  # reported when that cell runs
                         self.store.add(pending.in_class(cell.spec["bits"]))
-            self._note_start(cell)
+            self._record_start(cell)
 
         dispatcher.on_start = note_start
         self.ready()
         dispatcher.run(pending_cells)
 
-    def _note_start(self, cell: CellRun) -> None:
+    def _record_start(self, cell: CellRun) -> None:
         if self._keys.get(cell.name) != cell.key or not self.running:
             self._keys[cell.name] = cell.key
             self.store.note_sweep(self.name, self._keys, self.text)
@@ -174,7 +174,7 @@ class Batch:
         number = len(self.outcomes) + len(self.running)
         LOG.info("cell %d of %d: %s", number, len(self.cells), cell.name)
 
-    def _note_end(self, cell: CellRun, outcome: Outcome) -> None:
+    def _record_end(self, cell: CellRun, outcome: Outcome) -> None:
         self.running.pop(cell.name, None)
         if outcome.state == "stopped" and self._stop.is_set():
             return

@@ -86,7 +86,7 @@ class Scenes:
         """prepared: the folder for the output of `prepare`."""
         self._prepared = prepared
         self._cache: dict[str, SceneFacts] = {}
-        self._digest_of = cache(_digest_of)
+        self._hash_file = cache(_hash_file)
 
     def facts(self, pipeline: Pipeline) -> SceneFacts:
         """Return the fingerprint and the size of a pipeline's scene.
@@ -105,12 +105,12 @@ class Scenes:
         settings = pipeline.settings.scene
         if steps := pipeline.settings.prepare:
             return SceneFacts(plan(steps, settings.folder, self._prepared)[-1].key, 0.0)
-        scene, identity = identify(settings, self._digest_of)
+        scene, identity = identify(settings, self._hash_file)
         pixels = sum(view.camera.width * view.camera.height for view in scene.split("train")) / settings.downscale**2
         return SceneFacts(identity.digest, float(pixels))
 
 
-def _digest_of(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     with suppress(DataError):  # the run will report the error
         return sha256(path)
     return ""

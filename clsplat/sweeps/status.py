@@ -59,7 +59,7 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
     if (failure := folder.failure()) and not live_attempts:
         return {**common, "state": "failed", "message": failure.get("message"), "exit_code": failure.get("exit_code")}
     latest = (live_attempts or attempts)[-1:]
-    return {**common, "attempts": len(attempts), **(_attempt(latest[0], now) if latest else {"state": "waiting"})}
+    return {**common, "attempts": len(attempts), **(_attempt_state(latest[0], now) if latest else {"state": "waiting"})}
 
 
 def _steps(pipeline: dict[str, Any]) -> int | None:
@@ -82,7 +82,7 @@ def _result_metrics(folder: CellFolder) -> dict[str, Any]:
     return {}
 
 
-def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
+def _attempt_state(attempt: CellAttempt, now: float) -> dict[str, Any]:
     """Return the state of a cell, from its last attempt."""
     status = read_status(attempt.path)
     silence = now - attempt.last_beat

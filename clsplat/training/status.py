@@ -133,11 +133,11 @@ class StatusFile:
         """require_lock: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
         self.lost: OutputError | None = None  # the error that `require_lock` raised
-        self._require_held = require_lock
+        self._require_lock = require_lock
         now = time.time()
-        old = read_status(out)
-        checkpoint = old.get("checkpoint")
-        self.was_done = old.get("state") == "done"  # whether an earlier run in the folder was done
+        old_status = read_status(out)
+        checkpoint = old_status.get("checkpoint")
+        self.was_done = old_status.get("state") == "done"  # whether an earlier run in the folder was done
         self.saved_at = time.monotonic()  # s, time of the newest checkpoint, or of the start
         self.has_run = False  # whether a stage has run
         self.now = Status(
@@ -151,7 +151,7 @@ class StatusFile:
             checkpoint=checkpoint if isinstance(checkpoint, str) else None,
             **values,
         )
-        self._changing, self._writing = threading.Lock(), threading.Lock()
+        self._state_lock, self._write_lock = threading.Lock(), threading.Lock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.seconds: dict[str, float] = {}  # by stage, without nested stages
@@ -167,7 +167,7 @@ class StatusFile:
     def require_lock(self) -> None:
         """Raise OutputError if the run no longer holds the lock of its folder; called before each write to it."""
         try:
-            self._require_held()
+            self._require_lock()
         except OutputError as error:
             self.lost = error
         if self.lost:
@@ -177,7 +177,7 @@ class StatusFile:
         """Set fields, which the next heartbeat writes.  Raises OutputError if another run has taken over the folder."""
         if self.lost:
             raise self.lost
-        with self._changing:
+        with self._state_lock:
             self.now = self.now.model_copy(update={"changed": time.time(), **values})
 
     def enter(self, state: Literal["preparing", "running"], **values: Any) -> None:
@@ -196,7 +196,7 @@ class StatusFile:
     def close(self) -> None:
         """Stop the thread."""
         self._ended.set()
-        with self._writing:  # wait for a write in progress
+        with self._write_lock:  # wait for a write in progress
             pass
 
     def count(self, unit: str, done: int, total: int, **values: Any) -> None:
@@ -232,7 +232,7 @@ class StatusFile:
 
     def refresh(self) -> None:
         """Write the status of a run in progress; failures are logged once."""
-        with self._writing:
+        with self._write_lock:
             try:
                 if not self._ended.is_set() and os.path.isdir(self.out):  # do not recreate a removed folder
                     self._write()
@@ -243,7 +243,7 @@ class StatusFile:
 
     def write(self) -> None:
         """Write the status now.  Raises OutputError."""
-        with self._writing:  # so that the newest status is written last
+        with self._write_lock:  # so that the newest status is written last
             self._write()
 
     def _write(self) -> None:

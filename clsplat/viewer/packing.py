@@ -80,7 +80,7 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
     logs = model.log_scales.astype(np.float64)
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - MAX_LOG_RATIO)
     scales, opacity, base = (_value_table(values) for values in (logs, model.opacities, model.sh_base))
-    rest = _even_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
+    rest = _quantization_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
     tables = np.stack([np.exp(np.minimum(scales, MAX_LOG)), opacity, base, rest]).astype("<f4")
     planes: list[NDArray[Any]] = [tables, *_positions(_logarithmic(model.means, *frame)), _quaternions(model.quats)]
     pairs = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
@@ -190,7 +190,7 @@ def _value_table(values: NDArray[np.floating]) -> Floats:
     return np.interp(np.linspace(0, 1, 256), position, ordered)
 
 
-def _even_table(largest: float) -> Floats:
+def _quantization_table(largest: float) -> Floats:
     """Return a table of 256 values around 0: even steps up to KNEE, then growing steps up to `largest`."""
     values = KNEE * np.sinh(np.linspace(-1, 1, 255) * np.arcsinh(max(MIN_RANGE, largest) / KNEE))
     values[127] = 0.0

@@ -297,7 +297,7 @@ def table(manifest: dict[str, Any]) -> str:
         str(manifest["views"]),
         "",
         "100 %",
-        _mib(manifest["memory"]),
+        _format_mib(manifest["memory"]),
     ]
     times = [block["seconds"] for block in manifest["blocks"] if "seconds" in block]
     if not times:
@@ -321,10 +321,10 @@ def status_table(status: dict[str, Any]) -> str:
 def _cells(block: dict[str, Any]) -> list[str]:
     cameras = sum(view["why"] == "inside" for view in block["views"])
     counts = [f"{block['gaussians']:,}", f"{block['start']:,}", str(len(block["views"])), str(cameras)]
-    return [block["name"], *counts, f"{100 * block['pairs']:.0f} %", _mib(block["memory"])]
+    return [block["name"], *counts, f"{100 * block['pairs']:.0f} %", _format_mib(block["memory"])]
 
 
-def _mib(size: int) -> str:
+def _format_mib(size: int) -> str:
     return f"{size / 2**20:,.0f}"
 
 

@@ -44,7 +44,7 @@ def blocks_status(out: Path) -> dict[str, Any]:
     The state is "done" when the merged model is finished, and "running", "failed", or "unfinished" before that.
     Raises DataError if the record is damaged.
     """
-    parts = [{"name": name, **_status(out / name)} for name in _parts(out)]
+    parts = [{"name": name, **_status(out / name)} for name in _run_names(out)]
     states = [part["state"] for part in parts]
     is_running = any(state not in (*END_STATES, "killed", "waiting", "unknown") for state in states)
     state = (
@@ -75,7 +75,7 @@ def verify_blocks(out: Path) -> dict[str, Any]:
     }
 
 
-def _parts(out: Path) -> list[str]:
+def _run_names(out: Path) -> list[str]:
     """Return the names of the run folders, in the order of training."""
     record = read_json(out / RECORD)
     if not (isinstance(record, dict) and type(record.get("blocks")) is int):
@@ -99,7 +99,7 @@ def _check_files(out: Path, is_done: bool) -> Iterator[dict[str, Any]]:
             raise DataError("has no list of blocks")
         return f"of {len(data['blocks'])} blocks"
 
-    parts = _parts(out)
+    parts = _run_names(out)
     readers: dict[str, Callable[[Path], str]] = {MANIFEST: describe_manifest}
     readers |= {f"{name}.ply": partial(verify.output, None) for name in parts if name != COARSE}
     for name, read in readers.items():

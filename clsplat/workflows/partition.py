@@ -87,10 +87,10 @@ def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[Par
         return [PartitionCell(box, size)]
     axis, count_below = int(size.argmax()), count // 2
     position = _round(quantile(means[:, axis], weights, count_below / count))
-    below = means[:, axis] < position
-    if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
+    is_below = means[:, axis] < position
+    if is_below.all() or not is_below.any() or not (weights[is_below].any() and weights[~is_below].any()):
         raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; give fewer --blocks")
-    halves = ((below, "high", count_below), (~below, "low", count - count_below))
+    halves = ((is_below, "high", count_below), (~is_below, "low", count - count_below))
     return [
         cell
         for half, side, cells_in_half in halves

@@ -190,10 +190,10 @@ def penalties(device: Device, rng: np.random.Generator) -> Results:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
         trace = CovarianceTrace(weight=3.0, above=0.02)
         yield from check_penalty(device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT))
-        in_pixels = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
+        pixel_trace = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
         bound = 3 * (4.0 * interval) ** 2
         yield from check_penalty(
-            device, rng, count, in_pixels, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
+            device, rng, count, pixel_trace, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
         )
         shape = Anisotropy(weight=3.0, above=8.0)
         yield from check_penalty(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))

@@ -22,17 +22,17 @@ def color_grid_backward(
     image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the gradients of sum(gradient * output) with respect to image and grid, zero through clamped values."""
-    passed = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
-    grad_image, grad_grid, with_one = passed.copy(), np.zeros(grid.shape), _append_one(image)
+    upstream = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
+    grad_image, grad_grid, with_one = upstream.copy(), np.zeros(grid.shape), _to_homogeneous(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
     levels, inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
     for (k, j, i), weight, slope in _corners(image, grid):
         node = grid[:, :, k, j, i]  # [3, 4, H, W]
-        grad_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], passed)
-        grad_luminance = np.einsum("abhw,ahw,bhw->hw", node, passed, with_one)
+        grad_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], upstream)
+        grad_luminance = np.einsum("abhw,ahw,bhw->hw", node, upstream, with_one)
         grad_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * grad_luminance, 0)
         for a, b in itertools.product(range(3), range(4)):
-            np.add.at(grad_grid[a, b], (k, j, i), weight * passed[a] * with_one[b])
+            np.add.at(grad_grid[a, b], (k, j, i), weight * upstream[a] * with_one[b])
     return grad_image, grad_grid
 
 
@@ -53,14 +53,14 @@ def center_grids(grids: NDArray[Any]) -> NDArray[Any]:
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
 
-def _append_one(image: NDArray[Any]) -> NDArray[Any]:
+def _to_homogeneous(image: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([image, np.ones((1, *image.shape[1:]))])
 
 
 def unclamped_grid_colors(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
     """Return c + A [c; 1] for every pixel, without the clamp."""
     matrix = sum(weight * grid[:, :, k, j, i] for (k, j, i), weight, _ in _corners(image, grid))
-    return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _append_one(image)))
+    return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _to_homogeneous(image)))
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
@@ -73,10 +73,10 @@ def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDA
     y, x = np.mgrid[:height, :width]
     luminance = np.clip(np.einsum("a,ahw->hw", WEIGHTS, image), 0, 1)
     positions = luminance * (nz - 1), (y + 0.5) / height * (ny - 1), (x + 0.5) / width * (nx - 1)
-    firsts = [np.clip(np.floor(p), 0, max(n - 2, 0)).astype(int) for p, n in zip(positions, (nz, ny, nx), strict=True)]
+    starts = [np.clip(np.floor(p), 0, max(n - 2, 0)).astype(int) for p, n in zip(positions, (nz, ny, nx), strict=True)]
     for corner in itertools.product((0, 1), repeat=3):
-        nodes = [np.minimum(f + step, n - 1) for f, step, n in zip(firsts, corner, (nz, ny, nx), strict=True)]
-        weights = [p - f if step else 1 - (p - f) for p, f, step in zip(positions, firsts, corner, strict=True)]
+        nodes = [np.minimum(f + step, n - 1) for f, step, n in zip(starts, corner, (nz, ny, nx), strict=True)]
+        weights = [p - f if step else 1 - (p - f) for p, f, step in zip(positions, starts, corner, strict=True)]
         slope = (1 if corner[0] else -1) * (nz > 1) * weights[1] * weights[2]
         yield tuple(nodes), np.prod(weights, axis=0), slope
 
@@ -93,10 +93,10 @@ def color_matrix_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the gradients of sum(gradient * output) with respect to image and matrix, zero through clamped values."""
-    passed = np.where(_transform(image, matrix) < 1, gradient, 0)
-    grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
+    upstream = np.where(_transform(image, matrix) < 1, gradient, 0)
+    grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], upstream)
     with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
-    return grad_image, np.einsum("ahw,bhw->ab", passed, with_one)
+    return grad_image, np.einsum("ahw,bhw->ab", upstream, with_one)
 
 
 def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
@@ -128,7 +128,7 @@ def apply_response_backward(
     light, grad_light, grad_row = image * falloff, np.zeros(image.shape), np.zeros(17)
     for i in range(3):
         slopes = _slopes(row, i)
-        begin, d = _piece(light[i])
+        begin, d = _locate_quarter(light[i])
         grad_light[i] = gradient[i] * (slopes[begin] + 4 * (slopes[begin + 1] - slopes[begin]) * d)
         grad_slope = np.array([(gradient[i] * _curve(light[i], unit)).sum() for unit in np.eye(5)])
         areas = np.array([_curve(np.ones(1), unit)[0] for unit in np.eye(5)])
@@ -162,7 +162,7 @@ def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
     return np.asarray(slopes / _curve(np.ones(1), slopes))
 
 
-def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def _locate_quarter(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Clamp values to [0, 1]; return the quarter of [0, 1] that contains each, and the offset in that quarter."""
     inside = np.clip(x, 0, 1)
     quarter = np.minimum((4 * inside).astype(int), 3)
@@ -171,7 +171,7 @@ def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
     """Return the integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
-    quarter, d = _piece(x)
+    quarter, d = _locate_quarter(x)
     at_start = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
     inside = at_start + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2
     return np.asarray(inside + slopes[0] * np.minimum(x, 0) + slopes[4] * np.maximum(x - 1, 0))

@@ -127,7 +127,7 @@ def cones(camera: PinholeCamera, pixels: NDArray[np.int64], unit: float = 1.0) -
 
 def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Floats:
     """Return random numbers in (0, 1] for the edges of a ray, [count]."""
-    words = [word for four in range(-(-count // 4)) for word in philox((ray, step, kind, four), (seed, 0))]
+    words = [word for block in range(-(-count // 4)) for word in philox((ray, step, kind, block), (seed, 0))]
     return (np.array(words[:count], np.float64) // 256 + 1) / 2**24
 
 

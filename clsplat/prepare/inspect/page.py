@@ -38,7 +38,7 @@ def inspection_page(inspection: Inspection) -> str:
         cameras=_draw_cameras(inspection),
         far=pluralize(len(inspection.facts.outlier_cameras), "camera") if inspection.facts.outlier_cameras else "",
         points_per_view=_draw_points_per_view(inspection),
-        lists=_list_names(inspection),
+        lists=_name_lists(inspection),
     )
 
 
@@ -65,7 +65,7 @@ def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tu
     return safe_charts([histogram("views by their number of points", list(counts.values()))]), lowest
 
 
-def _list_names(inspection: Inspection) -> list[tuple[str, list[str], int]]:
+def _name_lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
     """Return the lists of the page: the title, up to MAX_NAMES names, and the total number of names."""
     facts, photographs = inspection.facts, inspection.facts.photos
     lists = {

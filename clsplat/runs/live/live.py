@@ -61,11 +61,11 @@ class Live:
         try:
             deadline = time.monotonic() + FAREWELL
             while state.idle_seconds() < OPEN_TIMEOUT and not state.is_end_sent and time.monotonic() < deadline:
-                self._leave()  # a page that waits for a preview makes no other request
+                self._release()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
         finally:
             self._server.stop()
-            self._leave()
+            self._release()
 
     def follow(self, status: StatusFile) -> None:
         """Show the status of a run that is starting."""
@@ -74,12 +74,12 @@ class Live:
     @contextmanager
     def showing(self, run: Run) -> Iterator[None]:
         """Show the model and the progress reports of a run during the block."""
-        self._enter(run)
+        self._attach(run)
         try:
             yield
         finally:
             run.on_step = lambda: None
-            self._leave()
+            self._release()
 
     def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """Return a function that calls `show` with each progress report, and also shows the report on the page."""
@@ -91,7 +91,7 @@ class Live:
 
         return show_both
 
-    def _enter(self, run: Run) -> None:
+    def _attach(self, run: Run) -> None:
         state, scene = self.state, run.scene.downscaled(run.downscale)
         run_number = state.shown.number + 1 if state.shown else 1
         title, test_views = f"{run.name} · {run.scene_name}", scene.split("test")
@@ -109,7 +109,7 @@ class Live:
         run.on_step = lambda: self._on_step(run)
         state.budget.skip()
 
-    def _leave(self) -> None:
+    def _release(self) -> None:
         """Release the run, because its model may be large, and answer pending requests without an image."""
         self.state.step, self._preview = 0, None
         while request := self.state.requests.first():

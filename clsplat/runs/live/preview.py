@@ -271,17 +271,17 @@ class Curves:
 
     def __init__(self, points: list[Point]) -> None:
         self._points = points
-        self._thin()
+        self._thin_history()
 
     def add(self, progress: Progress) -> None:
         self._points.append((progress.step, round(progress.loss, 6), round(progress.psnr, 3), progress.gaussians))
-        self._thin()
+        self._thin_history()
 
     def after(self, step: int) -> list[Point]:
         """Return the points after a step."""
         return [point for point in list(self._points) if point[0] > step]
 
-    def _thin(self) -> None:
+    def _thin_history(self) -> None:
         while len(self._points) > MAX_POINTS:
             self._points = [*self._points[:-1:2], self._points[-1]]
 

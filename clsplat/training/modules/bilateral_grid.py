@@ -201,20 +201,20 @@ class GridState(ColorState):
         """Return the gradients of the input of `transform` and of the grid, [row].  gradient: that of the result."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         result = workspace.array("grad_colored", image.shape)
-        passed = workspace.array("grid passed", (3, *image.shape[1:]))
+        unclamped = workspace.array("grid passed", (3, *image.shape[1:]))
         sums, grad_grid = (
             workspace.array("grid row sums", (ENTRIES * nz * nx, camera.rows)),
             workspace.array("by grid", row),
         )
         program, arguments = workspace.device.program("color_grid.cl"), self._arguments(camera, image, view)
         program.color_grid_backward(
-            groups=(1, camera.rows), image=image, gradient=gradient, grad_image=result, passed=passed, **arguments
+            groups=(1, camera.rows), image=image, gradient=gradient, grad_image=result, passed=unclamped, **arguments
         )
         row_names = ("nx", "nz", "per_column", "width", "rows", "stride")
         program.color_grid_row_sums(
             groups=(nx, camera.rows),
             image=image,
-            passed=passed,
+            passed=unclamped,
             row_sums=sums,
             **{name: arguments[name] for name in row_names},
         )

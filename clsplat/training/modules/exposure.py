@@ -146,8 +146,8 @@ class Appearance(TrainingModule):
             raise DataError(
                 f"{path}: unknown type of colors {quote(name)}, expected {names}; train again, or remove the file"
             )
-        facts = {key: data[key] for key in ("model",) if key in data}
-        return classes[name].model_validate(facts).fit if classes[name] is cls else None
+        fields = {key: data[key] for key in ("model",) if key in data}
+        return classes[name].model_validate(fields).fit if classes[name] is cls else None
 
 
 class ColorModel(Settings):

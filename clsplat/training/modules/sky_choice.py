@@ -88,7 +88,7 @@ def _reason_unknown(run: Run) -> str:
 
 def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
     """Count the photographs with at least this fraction of sky in their upper third, and all photographs."""
-    evidence = _evidence(run, run.scene.merge_validation())
+    evidence = _detect_skies(run, run.scene.merge_validation())
     return sum(photo.sky_fraction >= min_fraction for photo in evidence), len(evidence)
 
 
@@ -110,7 +110,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
 
     If no photograph shows a sky, all texels are learned, starting from the mean color of the photographs' upper thirds.
     """
-    evidence = _evidence(run, run.scene)
+    evidence = _detect_skies(run, run.scene)
     if texels := panorama(evidence, side):
         return texels
     upper_colors = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
@@ -120,7 +120,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 
-def _evidence(run: Run, scene: Scene) -> list[SkyEvidence]:
+def _detect_skies(run: Run, scene: Scene) -> list[SkyEvidence]:
     """Detect the sky in each training photograph of a scene, at the first of its sizes."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     progress = run.status.counted(views, "photographs", len(views))

@@ -78,7 +78,7 @@ def check_encoder(path: Path) -> None:
     if suffix not in WRITERS:
         raise ConfigError(f"{path}: expected the name of a video that ends in {' or '.join(WRITERS)}")
     if suffix == ".mp4":
-        _av()
+        _require_av()
 
 
 @contextmanager
@@ -161,7 +161,7 @@ def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
 
 @contextmanager
 def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
-    av = _av()
+    av = _require_av()
     try:
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
             stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
@@ -187,7 +187,7 @@ def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
 WRITERS: dict[str, Callable[[Path, Size, float], AbstractContextManager[Write]]] = {".webm": _webm, ".mp4": _mp4}
 
 
-def _av() -> ModuleType:
+def _require_av() -> ModuleType:
     try:
         return import_module("av")
     except ImportError as error:

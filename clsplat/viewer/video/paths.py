@@ -289,21 +289,21 @@ def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
     The half axes are the 90th percentiles of the offsets along the principal axes of the horizontal plane, as in
     Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
     """
-    axes, offsets, height = _ring(rig)
+    axes, offsets, height = _ring_axes(rig)
     half_axes = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
     if min(half_axes) <= 1e-6 * max(half_axes):
         half_axes = np.maximum(half_axes, 0.05 * max(half_axes, default=0.0))
-    angles = _sweep(np.arctan2(offsets[:, 1] / half_axes[1], offsets[:, 0] / half_axes[0]), frames)
+    angles = _sweep_angles(np.arctan2(offsets[:, 1] / half_axes[1], offsets[:, 0] / half_axes[0]), frames)
     plane_offsets = np.stack([half_axes[0] * np.cos(angles), half_axes[1] * np.sin(angles)], axis=1)
     return _look_at(rig, rig.focus + plane_offsets @ axes + height.mean() * rig.up, rig.focus, size)
 
 
 def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
     """Circle the focus once at the cameras' median distance and height, like a turntable."""
-    axes, offsets, height = _ring(rig)
+    axes, offsets, height = _ring_axes(rig)
     radius = float(np.median(np.linalg.norm(offsets, axis=1)))
     camera_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
-    if (gap := _gap(camera_angles)[0]) > MAX_GAP:
+    if (gap := _widest_gap(camera_angles)[0]) > MAX_GAP:
         LOG.warning(
             "%.0f degrees of the orbit were not photographed; the path ellipse stays where photos were taken",
             math.degrees(gap),
@@ -387,7 +387,7 @@ def looking_views(positions: Floats, targets: Floats, ups: Floats, rig: Rig, siz
         raise DataError(f"this path is impossible with these cameras: {error}; use another --path") from error
 
 
-def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
+def _ring_axes(rig: Rig) -> tuple[Floats, Floats, Floats]:
     """Return two horizontal principal axes, [2, 3], and the cameras' offsets along them, [V, 2], and along up, [V]."""
     offsets = rig.positions - rig.focus
     heights = offsets @ rig.up
@@ -398,9 +398,9 @@ def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
     return axes, flat @ axes.T, heights
 
 
-def _sweep(angles: Floats, frames: int) -> Floats:
+def _sweep_angles(angles: Floats, frames: int) -> Floats:
     """Return the angle of each frame: a full turn, or back and forth if the cameras leave a gap.  angles: [V], rad."""
-    gap, start = _gap(angles)
+    gap, start = _widest_gap(angles)
     phase = 2 * np.pi * np.arange(frames) / frames
     if gap < MAX_GAP:
         return np.asarray(angles[0] + phase)
@@ -408,7 +408,7 @@ def _sweep(angles: Floats, frames: int) -> Floats:
     return np.asarray(start + half_arc + ARC_FRACTION * half_arc * np.sin(phase))
 
 
-def _gap(angles: Floats) -> tuple[float, float]:
+def _widest_gap(angles: Floats) -> tuple[float, float]:
     """Return the widest angle without a camera, and the angle of the camera after it, rad."""
     ring = np.sort(angles % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
