@@ -184,10 +184,10 @@ def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], Binary
                 if not info.is_dir() and (info.external_attr >> 28) != 0o12
             ]
     elif tarfile.is_tarfile(archive):
-        with tarfile.open(archive) as tarred:
+        with tarfile.open(archive) as tar_file:
             yield [
-                (info.name, info.size, lambda info=info: tarred.extractfile(info))  # type: ignore[misc]
-                for info in tarred.getmembers()
+                (info.name, info.size, lambda info=info: tar_file.extractfile(info))  # type: ignore[misc]
+                for info in tar_file.getmembers()
                 if info.isreg()
             ]
     else:

@@ -229,9 +229,9 @@ def _depth_planes(frame: Frame, alpha: Floats | None, depth: Floats | None) -> F
         planes[:, :, 1] = _check_shape("alpha", alpha, size)
     if depth is not None:
         weighted, weight = frame.image.get()[:2, : size[0], : size[1]]
-        covered = weight > 0
-        planes[covered, 0] = _check_shape("depth", depth, size)[covered] / weight[covered]
-        planes[covered, 1] -= planes[covered, 0] * weighted[covered] / weight[covered]
+        is_covered = weight > 0
+        planes[is_covered, 0] = _check_shape("depth", depth, size)[is_covered] / weight[is_covered]
+        planes[is_covered, 1] -= planes[is_covered, 0] * weighted[is_covered] / weight[is_covered]
     return planes
 
 

@@ -221,7 +221,7 @@ class Trainer:
         views = learned_scene(run).downscaled(run.downscale).split(split)
         if not views:
             return {"views": 0}
-        return mean(measure(run.painter(), views, run.photographs.empty_copy(), trained=run.scene.split("train")))
+        return mean(measure(run.painter(), views, run.photographs.empty_copy(), train_views=run.scene.split("train")))
 
     @serialized
     def checkpoint(self) -> Path:

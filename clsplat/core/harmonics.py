@@ -73,10 +73,10 @@ def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Flo
     directions = _directions()
     values = basis(np.concatenate([directions, -directions]))[:, : coefficients.shape[1] - 1]
     values = np.concatenate([np.full((len(values), 1), BAND_0), values], axis=1)
-    fit, result = np.linalg.pinv(values), np.empty(coefficients.shape)
+    pseudo_inverse, result = np.linalg.pinv(values), np.empty(coefficients.shape)
     for first in range(0, len(coefficients), ROWS):
         rows = slice(first, first + ROWS)
-        result[rows] = fit @ (curve(values @ coefficients[rows].astype(np.float64) + 0.5) - 0.5)
+        result[rows] = pseudo_inverse @ (curve(values @ coefficients[rows].astype(np.float64) + 0.5) - 0.5)
     return result
 
 

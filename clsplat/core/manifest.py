@@ -39,8 +39,8 @@ class Manifest:
         If so, remove it and its `companions`, which the caller writes before it, and record its new source.  A file
         that no tool wrote is never replaced.  Raises OutputError.
         """
-        name, exists = self._name(path), path.is_file()
-        if exists and self._sources.get(name, source) == source:
+        name, is_file = self._name(path), path.is_file()
+        if is_file and self._sources.get(name, source) == source:
             return False
         try:
             for file in (path, *companions):

@@ -147,8 +147,8 @@ class Survey:
         return result
 
 
-def normalize(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Scale values linearly so that those in the mask `counted` range from 0 to 1; return 0 if they are all equal."""
-    low = float(np.min(values[counted], initial=np.inf))
-    high = float(np.max(values[counted], initial=-np.inf))
+def normalize(values: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Scale values linearly so that those in the mask range from 0 to 1; return 0 if they are all equal."""
+    low = float(np.min(values[mask], initial=np.inf))
+    high = float(np.max(values[mask], initial=-np.inf))
     return (values - low) / (high - low) if high > low else np.zeros_like(values)

@@ -235,8 +235,8 @@ class Gaussians:
         self._up_to_date("sh_rest")
         if count > capacity:
             row_bytes = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
-            larger = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
-            capacity = _align(max(count, larger))
+            grown_capacity = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
+            capacity = _align(max(count, grown_capacity))
         host_tables = self.on_host.rearrange(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
         for table in (table for name, table in self.tables.items() if name not in host_tables):
             array = self.device.zeros((table.components, capacity))

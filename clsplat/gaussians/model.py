@@ -114,8 +114,8 @@ def run_output(folder: Path, stage: str, default: str) -> Path:
 
 def raw_model(file: Path) -> Path:
     """Return the PLY next to a run's model that stores the world filter separately, or the model if there is none."""
-    raw = file.with_name(f"{file.stem.removesuffix(WITHOUT_SKY)}_raw.ply")
-    return raw if raw.is_file() else file
+    raw_path = file.with_name(f"{file.stem.removesuffix(WITHOUT_SKY)}_raw.ply")
+    return raw_path if raw_path.is_file() else file
 
 
 Floats = NDArray[np.float32]
@@ -334,8 +334,8 @@ class Model:
         return SplatFile(self.tables(), {**self.rendering.comment(), **origin}, mode)
 
     def __repr__(self) -> str:
-        moving = ", moving" if self.motion is not None else ""
-        return f"Model({len(self):,} Gaussians{moving}, SH degree {self.sh_degree})"
+        suffix = ", moving" if self.motion is not None else ""
+        return f"Model({len(self):,} Gaussians{suffix}, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
         from clsplat.core.page import summary

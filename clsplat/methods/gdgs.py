@@ -54,11 +54,11 @@ class CloneDense(Rule):
         cell = grid_cells(means, self.cells)
         counts = np.bincount(cell[has_gradient & (cell >= 0)], minlength=self.cells**3)
         order = np.argsort(-counts, kind="stable")
-        fullest, emptiest = order[: self.extremes], order[-self.extremes :]
-        if counts[fullest].sum() < edit.at(self.ratio_above) * max(counts[emptiest].sum(), 1):
+        densest, sparsest = order[: self.extremes], order[-self.extremes :]
+        if counts[densest].sum() < edit.at(self.ratio_above) * max(counts[sparsest].sum(), 1):
             return
         is_small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
-        is_copied = has_gradient & is_small & np.isin(cell, fullest) & (edit.rows() == 1)
+        is_copied = has_gradient & is_small & np.isin(cell, densest) & (edit.rows() == 1)
         rows = np.flatnonzero(is_copied)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]

@@ -47,9 +47,9 @@ class Relocate(Rule):
         logits = np.log(opacities / (1 - opacities))[:, None]
         log_scales = log_scales[sources] + np.log(factors)[:, None]
         for number in np.unique(copies):  # set_children has no effect if a later rule or the limit undoes the growth
-            has_number = copies == number
+            group = copies == number
             for name, values in (("logit_opacity", logits), ("log_scales", log_scales)):
-                edit.set_children(name, sources[has_number], np.repeat(values[has_number, None], number, axis=1))
+                edit.set_children(name, sources[group], np.repeat(values[group, None], number, axis=1))
         edit.zero_moments(sources)
         edit.choose(is_faint | (draws > 0), copies=np.where(is_faint, 0, draws + 1), old_rows=1)
 

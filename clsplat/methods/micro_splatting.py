@@ -99,8 +99,8 @@ class SplitTextured(Subdivide):
     def mark(self, edit: Edit) -> None:
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
         threshold = edit.threshold(self.texture, self.texture_above)
-        is_seen = edit.gaussians.get(SEEN)[:, 0] > 0
-        candidates = is_seen & (texture >= threshold) & (gradient >= edit.at(self.gradient_above))
+        is_visible = edit.gaussians.get(SEEN)[:, 0] > 0
+        candidates = is_visible & (texture >= threshold) & (gradient >= edit.at(self.gradient_above))
         self.subdivide(edit, candidates, texture)
 
 

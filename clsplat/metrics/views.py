@@ -183,7 +183,7 @@ def mean_color_metrics(views: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def fit_colors(
-    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: ColorFit
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], mask: Mask, model: ColorFit
 ) -> NDArray[np.float64] | None:
     """Transform the left and right halves of an image by the color model fitted to the other half.
 
@@ -192,7 +192,7 @@ def fit_colors(
     are compared on the same views.  The fit also excludes pixels that are brighter than white in the image, if enough
     others remain.
     """
-    usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
+    usable = mask & ((photograph > 0) & (photograph < 255)).all(axis=2)
     half_width, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :half_width], np.s_[:, half_width:]
     min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
@@ -206,14 +206,14 @@ def fit_colors(
     return corrected
 
 
-def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask) -> NDArray[np.float64]:
+def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], mask: Mask) -> NDArray[np.float64]:
     """Return (image - b) / a for each channel, where a * truth + b is fitted to the image, as in gsplat.
 
     Noise makes the slope `a` too small, so this is not the least-squares correction of the image.
     """
     corrected = image.copy()
     for channel in range(3):
-        x, y = truth[..., channel][counted], image[..., channel][counted]
+        x, y = truth[..., channel][mask], image[..., channel][mask]
         variance = float(np.mean((x - x.mean()) ** 2))
         slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / variance if variance > 0 else 1.0
         if abs(slope) > MIN_SLOPE:
@@ -245,13 +245,13 @@ HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 
 
 def psnr_by_time(
-    psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]
+    psnr: Mapping[str, float], views: Sequence[View], train_views: Sequence[View]
 ) -> dict[str, dict[str, float]]:
     """Return the PSNR of each view in dB, by view name and key: HELD_OUT or, if training has its timestamp, OTHERS.
 
     The result is empty if all views have the same key, as in static scenes.
     """
-    training_times, times = set(distinct_times(trained)), {view.name: view.time for view in views}
+    training_times, times = set(distinct_times(train_views)), {view.name: view.time for view in views}
     keys = {name: OTHERS if time in training_times else HELD_OUT for name, time in times.items() if time is not None}
     if not training_times or {keys.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
         return {}
@@ -328,17 +328,17 @@ def measure(
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
     colors: ColorFit | None = None,
-    counted: Iterable[View] | None = None,
-    trained: Sequence[View] = (),
+    progress: Iterable[View] | None = None,
+    train_views: Sequence[View] = (),
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  finite: raise NumericError
-    for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
-    views wrapped by a progress counter; trained: the training views, for metrics by timestamp.
+    for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`;
+    progress: the views wrapped by a progress counter; train_views: the training views, for metrics by timestamp.
     """
     results, flicker_meter, empty_names = list[ViewMetrics](), FlickerMeter(views), list[str]()
-    for view in views if counted is None else counted:
+    for view in views if progress is None else progress:
         photograph = photographs.get(view)
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask excludes every pixel; check the mask", view.name)
@@ -365,7 +365,7 @@ def measure(
             *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}
-    moments = psnr_by_time(psnrs, views, trained)
+    moments = psnr_by_time(psnrs, views, train_views)
     return [
         replace(result, still={**result.still, **flicker.get(result.view, {})}, moments=moments.get(result.view, {}))
         for result in results

@@ -218,12 +218,12 @@ class Samples:
     edges: Array  # [rays, samples + 1]
 
     @property
-    def per_ray(self) -> int:
+    def samples_per_ray(self) -> int:
         return self.edges.shape[1] - 1
 
     @property
     def count(self) -> int:
-        return self.edges.shape[0] * self.per_ray
+        return self.edges.shape[0] * self.samples_per_ray
 
     @property
     def tiles(self) -> int:
@@ -250,7 +250,7 @@ class Encoding:
         shared: dict[str, Any] = {
             "items": samples.count // self._lanes,
             "cones": samples.cones,
-            "samples": samples.per_ray,
+            "samples": samples.samples_per_ray,
             "count": samples.count,
         }
         if shape.degrees:
@@ -331,7 +331,7 @@ class Encoding:
             corner_y=y,
             corner_z=z,
             side=grid.side,
-            samples=samples.per_ray,
+            samples=samples.samples_per_ray,
             count=samples.count,
         )
 

@@ -448,14 +448,14 @@ class Kernel:
 
     def _raise_argument_error(self, values: dict[str, Any]) -> NoReturn:
         expected = {a.name: a for a in self.arguments}
-        missing, surplus = expected.keys() - values.keys(), values.keys() - expected.keys()
+        missing, unexpected = expected.keys() - values.keys(), values.keys() - expected.keys()
         mismatches = [
             f"{name} is {getattr(value, 'dtype', type(value).__name__)}, expected {expected[name].dtype or 'a struct'}"
             for name, value in values.items()
             if name in expected and expected[name].pointer and getattr(value, "dtype", None) != expected[name].dtype
         ]
         faults = [f"missing arguments {', '.join(sorted(missing))}"] if missing else []
-        faults += [f"unknown arguments {', '.join(sorted(surplus))}"] if surplus else []
+        faults += [f"unknown arguments {', '.join(sorted(unexpected))}"] if unexpected else []
         raise KernelError(f"{self.label}: {'; '.join(faults + mismatches)}")
 
 

@@ -133,11 +133,11 @@ def _blur(values: NDArray[np.float32], unmasked: Mask) -> NDArray[np.float32]:
 
 def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
     """Return a mask, `shape`, of the pixels that are far from all points, [K, 2] px."""
-    free = np.ones(shape, np.uint8)
+    is_far = np.ones(shape, np.uint8)
     column, row = np.floor(points).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
-    free[row[inside], column[inside]] = 0
-    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > MIN_DISTANCE)
+    is_far[row[inside], column[inside]] = 0
+    return np.asarray(cv2.distanceTransform(is_far, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > MIN_DISTANCE)
 
 
 def _visible_points(scene: Scene, view: View) -> NDArray[np.float64]:

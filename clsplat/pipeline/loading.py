@@ -106,13 +106,13 @@ def check_document(path: Path, document: Document, overrides: Sequence[str] = ()
     """Return the pipeline in a document with overrides; the document stays unchanged.  Raises ConfigError as `load`."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    tagged = _tag_file(document, path)
+    tagged_data = _tag_file(document, path)
     try:
-        data = copy.deepcopy(without_decisions(tagged) if any(map(_changes_photos, overrides)) else tagged)
+        data = copy.deepcopy(without_decisions(tagged_data) if any(map(_changes_photos, overrides)) else tagged_data)
         key_paths = [apply(data, override, PipelineFile) for override in overrides]
         return _without_done_steps(Pipeline(path, _keep_overrides(_validate(data, path, document), key_paths)))
     except ConfigError:
-        _raise_cause(tagged, overrides, path, document)
+        _raise_cause(tagged_data, overrides, path, document)
         raise
 
 
@@ -294,9 +294,13 @@ def _explain_late_stage(stages: Sequence[Stage], need: str) -> str:
         for inner in training.during:
             if need in inner.makes and inner.every:
                 cadence = f"{inner.stage} makes every {inner.every} steps after step {inner.start}"
-                acts = any(fires_at(inner.every, later_step) for later_step in range(step + 1, step + training.steps))
-                remedies = [] if acts else [f"set {inner.stage}.every below {training.steps}"]
-                remedies += [f"set {inner.stage}.start earlier"] if acts or inner.start >= step + training.steps else []
+                can_run = any(
+                    fires_at(inner.every, later_step) for later_step in range(step + 1, step + training.steps)
+                )
+                remedies = [] if can_run else [f"set {inner.stage}.every below {training.steps}"]
+                remedies += (
+                    [f"set {inner.stage}.start earlier"] if can_run or inner.start >= step + training.steps else []
+                )
                 return f"{cadence}, but the training ends earlier; {' and '.join(remedies)}, or use --minutes"
         step += training.steps
     return ""

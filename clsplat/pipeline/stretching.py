@@ -88,9 +88,9 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
 
     def change(training: Training) -> Training:
         last = last_edit(training)
-        fixed = max(done, last) if last < min(steps, training.steps) else done
-        factor = (steps - fixed) / (training.steps - fixed)
-        during = [_stretch_rest(stage, fixed, factor) for stage in training.during]
+        fixed_steps = max(done, last) if last < min(steps, training.steps) else done
+        factor = (steps - fixed_steps) / (training.steps - fixed_steps)
+        during = [_stretch_rest(stage, fixed_steps, factor) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
     return map_trainings(settings, Training, change)

@@ -93,11 +93,11 @@ def diagnose(graph: MatchGraph) -> str:
 
 def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
     """Describe which photographs match each other, and which match no other."""
-    singles = [name for group in groups if len(group) == 1 for name in group]
-    count = len(groups) - len(singles)
+    single_names = [name for group in groups if len(group) == 1 for name in group]
+    count = len(groups) - len(single_names)
     if not count:
         return f"no two of them overlap enough: {max(graph.pairs.values())} matches at most"
-    suffix = f", and {len(singles)} without a good match ({first_few(singles)})" if singles else ""
+    suffix = f", and {len(single_names)} without a good match ({first_few(single_names)})" if single_names else ""
     largest = f"{len(groups[0])} ({first_few(groups[0])})"
     return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest of {largest}{suffix}"
 

@@ -204,10 +204,10 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed_names, new_counts, counted_names = _names(best), list[int](), set[str]()
+    placed_names, new_counts, known_names = _names(best), list[int](), set[str]()
     for model in models:
-        new_counts.append(len(_names(model) - counted_names))
-        counted_names |= _names(model)
+        new_counts.append(len(_names(model) - known_names))
+        known_names |= _names(model)
     return {
         "registered": len(placed_names),
         "not_registered": [name for name in names if name not in placed_names],

@@ -394,7 +394,7 @@ class ModelFile:
                         *(self.painter, views, photographs, perceptual),
                         finite=True,
                         colors=self.colors,
-                        trained=scene.split("train"),
+                        train_views=scene.split("train"),
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, **size_of(self.host_model), "device": self.device.text}

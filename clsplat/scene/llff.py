@@ -71,8 +71,8 @@ def image_files(path: Path) -> list[Path]:
 
     The first of these folders that contains images is used; the list is empty if there is none.
     """
-    smaller = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
-    for folder in (path / "images", path / "input", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
+    downscaled = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
+    for folder in (path / "images", path / "input", *sorted(downscaled, key=lambda folder: int(folder.name[7:])), path):
         files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
         if files:
             return files

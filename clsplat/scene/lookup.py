@@ -220,8 +220,8 @@ class FileLookup:
             for name in [self.listing[i] for i in missing_indices if not _is_safe(self.listing[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
-                skip = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
-                raise DataError(f"{fault}{self.hint}; put them back{skip}")
+                skip_advice = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
+                raise DataError(f"{fault}{self.hint}; put them back{skip_advice}")
             logger.warning("%s%s; the scene is read without them", fault, self.hint)
         return rows
 

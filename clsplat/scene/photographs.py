@@ -40,8 +40,8 @@ def load_photograph(
 def _key(view: View, background: tuple[float, float, float]) -> str:
     """Return a hash of everything that the cached photograph depends on: file, lens, size, mask and background."""
     state = view.image_path.stat() if view.image_path.exists() else None
-    file = state and (state.st_mtime_ns, state.st_size)
-    parts = view.lens, view.camera, view.mask_path, view.alpha, background, file
+    file_stamp = state and (state.st_mtime_ns, state.st_size)
+    parts = view.lens, view.camera, view.mask_path, view.alpha, background, file_stamp
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
 
 
@@ -97,14 +97,14 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
 
 
 def _without_hidden_faces(scene: Scene) -> Scene:
-    read = lru_cache(1)(read_image)
+    read_mask = lru_cache(1)(read_image)
     rows = [
         i
         for i, (mask, lens) in enumerate((view.mask_path, view.lens) for view in scene.views)
-        if mask is None or lens is None or not lens.face or lens.shows_white(read(mask))
+        if mask is None or lens is None or not lens.face or lens.shows_white(read_mask(mask))
     ]
-    new = {old: i for i, old in enumerate(rows)}
-    train, test, validation = (tuple(new[i] for i in old if i in new) for old in scene.indices.values())
+    new_indices = {old: i for i, old in enumerate(rows)}
+    train, test, validation = (tuple(new_indices[i] for i in old if i in new_indices) for old in scene.indices.values())
     views = tuple(scene.views[i] for i in rows)
     return replace(scene, views=views, train=train, test=test, validation=validation)
 

@@ -126,8 +126,8 @@ class ViewSelection(Settings):
         files = [folder / self.file for folder in folders]
         path = next((file for file in files if file.is_file()), files[-1])
         lines = (line.strip() for line in read_text(path, limit=LARGEST).splitlines())
-        if listed := [line for line in lines if line and not line.startswith("#")]:
-            return str(path), listed
+        if names := [line for line in lines if line and not line.startswith("#")]:
+            return str(path), names
         raise DataError(f"{path}: the file is empty; write one photo name per line")
 
 
@@ -276,8 +276,8 @@ class Split:
                 if lines and key == "holdout":
                     excluded["holdout"] = [*lines]
                 if lines and key == "train":
-                    free = lines | self._held_out_names(names)
-                    excluded["train"] = [name for name in names if name not in free]
+                    valid_names = lines | self._held_out_names(names)
+                    excluded["train"] = [name for name in names if name not in valid_names]
 
     def _held_out_names(self, names: Sequence[str]) -> set[str]:
         """Return the names that every n-th as `holdout` selects for testing, if all photographs get poses."""

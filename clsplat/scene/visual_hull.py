@@ -119,9 +119,9 @@ def _split(cells: Cells) -> Cells:
     return (2 * cells[:, None] + np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
 
 
-def _centers(cells: Cells, center: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
-    """Return the centers, [M, 3], and the side of cells in a box with `number` cells along each side."""
-    side = 2 * half_side / number
+def _centers(cells: Cells, center: Floats, half_side: float, resolution: int) -> tuple[NDArray[np.float32], float]:
+    """Return the centers, [M, 3], and the side of cells in a box with `resolution` cells along each side."""
+    side = 2 * half_side / resolution
     return (center - half_side + side * (cells + 0.5)).astype(np.float32), side
 
 
@@ -130,7 +130,7 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
 
     Only the views that see a ball count.  Balls that too few views see are in neither group.
     """
-    full, remaining, view_counts = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
+    is_full, remaining, view_counts = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:
         projection = silhouette.project(centers[remaining])
         if not len(projection.depth):
@@ -138,14 +138,14 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
         kernel = np.ones((2 * silhouette.radius(radius, projection.depth) + 1,) * 2, np.uint8)
         rows = remaining[projection.inside]
         view_counts[rows] += 1
-        full[rows[cv2.erode(silhouette.alpha, kernel)[projection.row, projection.column] <= HALF]] = False
+        is_full[rows[cv2.erode(silhouette.alpha, kernel)[projection.row, projection.column] <= HALF]] = False
         is_remaining = ~projection.inside
         is_remaining[projection.inside] = cv2.dilate(silhouette.alpha, kernel)[projection.row, projection.column] > HALF
         remaining = remaining[is_remaining]
     is_candidate = np.zeros(len(centers), bool)
     is_candidate[remaining] = True
     is_candidate &= view_counts >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
-    return is_candidate & full, is_candidate & ~full
+    return is_candidate & is_full, is_candidate & ~is_full
 
 
 def _colors(

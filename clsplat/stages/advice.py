@@ -39,7 +39,7 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
     views = learned_scene(run).downscaled(run.downscale).split("train")
     sample = sample_views(views, MAX_MEASURED)
     counted_views = run.status.counted(run.until_interrupted(sample), "views", len(sample))
-    metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), counted=counted_views)
+    metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), progress=counted_views)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test_psnr = {
         line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step
@@ -122,24 +122,24 @@ def _has_limit(entry: Mapping[str, Any]) -> bool:
     return (entry.get("densify") or {}).get("per_pixel") is not None
 
 
-def advise_on_test_views(psnr: Mapping[str, float], again: str) -> Iterator[str]:
+def advise_on_test_views(psnr: Mapping[str, float], rerun: str) -> Iterator[str]:
     """Yield advice from the PSNR of test views.  psnr: dB, by the name of the view."""
     if names := find_outliers(psnr):
         yield (
             f"{_join_names(names)}: much worse than the other test views; add photos of what is visible there, then "
-            f"`{again}`"
+            f"`{rerun}`"
         )
 
 
-def advise_on_capture(train: Sequence[View], views: Sequence[View], again: str) -> Iterator[str]:
+def advise_on_capture(train: Sequence[View], views: Sequence[View], rerun: str) -> Iterator[str]:
     """Yield advice from the number of training views and the positions of all views."""
     view_count = len({view.name for view in train})
     if view_count < FEW_PHOTOS:
         count = pluralize(view_count, "training photograph")
-        yield f"only {count}; show every part in at least five, from several sides, then `{again}`"
+        yield f"only {count}; show every part in at least five, from several sides, then `{rerun}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap
-        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there, then `{again}`"
+        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there, then `{rerun}`"
 
 
 def find_outliers(psnr: Mapping[str, float]) -> list[str]:

@@ -100,7 +100,9 @@ class Evaluate(Scheduled):
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.empty_copy()
             progress = run.status.counted(run.until_interrupted(views), "views", len(views))
             train, colors = run.scene.split("train"), color_model(run)
-            results = measure(painter, views, photographs, perceptual, colors=colors, counted=progress, trained=train)
+            results = measure(
+                painter, views, photographs, perceptual, colors=colors, progress=progress, train_views=train
+            )
             if not results:
                 continue
             for result in results:

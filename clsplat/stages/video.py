@@ -141,8 +141,8 @@ class Video(Stage):
         return VideoRequest.parse(self.path, self.frames, self.fps, self.size, self.times)
 
     def _plan(self, run: Run) -> VideoPlan:
-        moves = run.gaussians is not None and run.model.gaussians.is_moving
-        return plan_video(self._request(), run.scene.downscaled(run.downscale), _points(run), moves)
+        is_moving = run.gaussians is not None and run.model.gaussians.is_moving
+        return plan_video(self._request(), run.scene.downscaled(run.downscale), _points(run), is_moving)
 
     def check(self) -> None:
         self._request()

@@ -537,11 +537,11 @@ class Store:
 
     def stop(self, name: str) -> None:
         """Request that all running cells with a key or sweep name stop, or all cells for the name "all"."""
-        flag = without_links(self.root, CANCEL, name)
-        with raising_output_error(flag):
-            make_folder(flag.parent)
-            flag.touch()
-            os.utime(flag)
+        cancel_file = without_links(self.root, CANCEL, name)
+        with raising_output_error(cancel_file):
+            make_folder(cancel_file.parent)
+            cancel_file.touch()
+            os.utime(cancel_file)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
         """Return whether there is a request to stop cells under one of these names that started at `since`.

@@ -126,12 +126,12 @@ def require_steps(steps: int) -> None:
 
 def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
     """Return the stages with these names, in order, with start steps relative to the first of them."""
-    selected, remaining, earlier_steps = [], iter(stages), 0
+    selection, remaining, earlier_steps = [], iter(stages), 0
     for name in names:
         while not _has_name(stage := next(remaining), name):
             earlier_steps += stage[TRAINING]["steps"] if _has_name(stage, TRAINING) else 0
-        selected.append(_shift_start(stage, earlier_steps) if _has_name(stage, TRAINING) else stage)
-    return selected
+        selection.append(_shift_start(stage, earlier_steps) if _has_name(stage, TRAINING) else stage)
+    return selection
 
 
 def _shift_start(training: Any, steps: int) -> Any:

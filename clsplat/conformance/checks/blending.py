@@ -281,8 +281,8 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         comparison = make_comparison(device, x, x[:3])
         camera = comparison.camera
         comparison.gradient = device.zeros((4, camera.rows, camera.stride))
-        flat = rng.permutation(width * height)[:count]
-        rows, columns = positions = flat // width, flat % width
+        indices = rng.permutation(width * height)[:count]
+        rows, columns = positions = indices // width, indices % width
         targets, weights = rng.uniform(0, 1, (2, count)).astype(np.float32)
         targets[:1] = x[3][positions][:1]  # equal values have no gradient
         pixels = device.upload((rows * camera.stride + columns).astype(np.uint32))

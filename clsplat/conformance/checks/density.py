@@ -134,26 +134,26 @@ def edits(device: Device, rng: np.random.Generator) -> Results:
         yield Deviation("mark_rule", f"rows after {label}", abs(gaussians.count - len(source)), 0, counts=True)
         if gaussians.count != len(source):
             continue
-        final = {name: gaussians.get(name) for name in gaussians.tables}
-        yield match("list_rows", f"rows after {label}", final["sh_rest"], initial["sh_rest"][source])
+        result = {name: gaussians.get(name) for name in gaussians.tables}
+        yield match("list_rows", f"rows after {label}", result["sh_rest"], initial["sh_rest"][source])
         is_split = actions[source] == ref.SPLIT
         is_second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
         is_fresh = is_split | ((actions[source] == ref.CLONE) & is_second)
         moment = "adam/means/moment1"
         expected = np.where(is_fresh[:, None], 0, initial[moment][source])
-        yield match("list_rows", f"moments after {label}", final[moment], expected)
+        yield match("list_rows", f"moments after {label}", result[moment], expected)
         means, scales = initial["means"].astype(np.float64)[source], initial["log_scales"].astype(np.float64)[source]
         logits = initial["logit_opacity"].astype(np.float64)[source]
         is_cloned = actions[source] == ref.CLONE
         logits[is_cloned] = ref.shared_logit(logits[is_cloned], 2)
-        yield compare_max("share_opacity", f"opacities after {label}", final["logit_opacity"], logits, SUM, floor=1)
+        yield compare_max("share_opacity", f"opacities after {label}", result["logit_opacity"], logits, SUM, floor=1)
         for i in np.flatnonzero(is_split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
             rotation = ref.rotation_matrix(initial["quats"][source[i]].astype(np.float64))
             means[i] += rotation @ (np.exp(scales[i]) * noise)
         scales[is_split] -= np.log(1.6)
-        yield compare("spawn_children", f"means after {label}", final["means"], means, SUM)
-        yield compare_max("spawn_children", f"scales after {label}", final["log_scales"], scales, SUM, floor=1)
+        yield compare("spawn_children", f"means after {label}", result["means"], means, SUM)
+        yield compare_max("spawn_children", f"scales after {label}", result["log_scales"], scales, SUM, floor=1)
 
 
 @CHECKS.add("mark_chosen")

@@ -143,10 +143,10 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _check_edge(case: FieldCase, label: str) -> Results:
-    coarse, fine = (
+    coarse_edges, fine_edges = (
         (level.edges.get(), level.weights.get()) for level in case.levels.render(case.device_parameters, case.rays)
     )
-    shape, (edges, weights) = case.shape, coarse
+    shape, (edges, weights) = case.shape, coarse_edges
     coarse_units, fine_units = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
     is_drawn = case.rays.draw is not None
     expected = [
@@ -155,7 +155,7 @@ def _check_edge(case: FieldCase, label: str) -> Results:
     yield compare_max("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
     pairs = zip(edges.astype(np.float64), weights.astype(np.float64), fine_units, strict=True)
     expected = [ref.fine_edges(t, w, shape.fine_samples, row if is_drawn else None) for t, w, row in pairs]
-    yield compare_max("resample_edges", label, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
+    yield compare_max("resample_edges", label, fine_edges[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
 
 @CHECKS.add("encode_frustums", "encode_directions")
@@ -361,9 +361,9 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
     case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.device_parameters, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
-    *_, fine = case.levels.render(case.device_parameters, case.levels.cast(case.rays.camera, device.upload(pixels)))
+    *_, level = case.levels.render(case.device_parameters, case.levels.cast(case.rays.camera, device.upload(pixels)))
     expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
-    expected[:, :HEIGHT, :WIDTH] = fine.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
+    expected[:, :HEIGHT, :WIDTH] = level.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
     yield match("place_colors", f"an image of {WIDTH} x {HEIGHT} px", field.paint(case.rays.camera).get(), expected)
 
 

@@ -221,9 +221,9 @@ def projection(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("project_forward")
 def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Results:
     records, keys, radius = project_records(device, undrawable_case(rng))
-    culled = [0, 1, 2, 3, 4, 5, 7, 8]
-    yield match("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
-    yield match("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
+    culled_rows = [0, 1, 2, 3, 4, 5, 7, 8]
+    yield match("project_forward", "records of Gaussians behind, faint or not finite", records[culled_rows], 0.0)
+    yield match("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled_rows], CULLED)
     yield match("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
     yield count_true("project_forward", "records that are not numbers", np.isnan(records))
 

@@ -187,8 +187,8 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
     box = rasterizer.workspace.array("tile_box", gaussian_count, np.uint32)
     actual = frame.lists.tile_count.get()[:gaussian_count].astype(int)
     large = (box.get() >> 24 == 33) & (actual > 0)
-    for surplus in SURPLUS:
-        counts = np.where(large, np.maximum(1, actual + surplus), 0)
+    for extra in SURPLUS:
+        counts = np.where(large, np.maximum(1, actual + extra), 0)
         first = np.concatenate([[0], np.cumsum(counts)])
         arrays = [device.upload(np.full(first[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(
@@ -206,7 +206,7 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
             count=gaussian_count,
         )
         tile, splat = (array.get() for array in arrays)
-        label = f"large Gaussians counted with {surplus:+d} tiles"
+        label = f"large Gaussians counted with {extra:+d} tiles"
         owner = np.repeat(np.arange(gaussian_count), counts)
         yield match("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
         yield count_true("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)

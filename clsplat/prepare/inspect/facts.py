@@ -482,10 +482,10 @@ def read_parts(path: Path) -> Parts:
         _list_photographs(parts)
     elif parts.image_folder or not parts.expected:
         folder = parts.image_folder or path / "images"
-        parts.on_disk = list(image_files(folder if folder.is_dir() else path, deep=True))
+        parts.on_disk = list(image_files(folder if folder.is_dir() else path, recursive=True))
     else:
         folders = sorted({file.parent for file in parts.expected})
-        parts.on_disk = [file for folder in folders for file in image_files(folder, deep=False)]
+        parts.on_disk = [file for folder in folders for file in image_files(folder, recursive=False)]
     if parts.scene:  # list_parts may also list views that belong to no split
         parts.views = list({view.name: view for view in map(View.whole_photograph, parts.scene.views)}.values())
     return parts
@@ -493,7 +493,7 @@ def read_parts(path: Path) -> Parts:
 
 def _list_photographs(parts: Parts) -> None:
     """List the photographs in a folder without cameras, and the warnings that the preparation would log."""
-    parts.on_disk = list(image_files(parts.path, deep=True))
+    parts.on_disk = list(image_files(parts.path, recursive=True))
     with captured_log(logging.WARNING) as parts.left_out:
         try:
             list_photographs(parts.path)
@@ -502,8 +502,8 @@ def _list_photographs(parts: Parts) -> None:
                 parts.refusal = str(error)
 
 
-def image_files(folder: Path, deep: bool) -> Iterator[Path]:
-    """Yield the image files in a folder, sorted by name; with `deep`, also the files in its subfolders."""
+def image_files(folder: Path, recursive: bool) -> Iterator[Path]:
+    """Yield the image files in a folder, sorted by name; with `recursive`, also the files in its subfolders."""
     for parent, folders, names in os.walk(folder):
-        folders[:] = sorted(f for f in folders if not f.startswith(".")) if deep else []
+        folders[:] = sorted(f for f in folders if not f.startswith(".")) if recursive else []
         yield from (Path(parent) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))

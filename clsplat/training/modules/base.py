@@ -251,8 +251,8 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> li
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
     """Return the modules of a run's stages up to the current one: the last module of each type, by type."""
     stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
-    listed = (module for stage in stages for module in getattr(stage, "modules", ()))
-    return {module.type: module for module in (*listed, *implied_modules(run)) if module.is_active(run.scene)}
+    modules = (module for stage in stages for module in getattr(stage, "modules", ()))
+    return {module.type: module for module in (*modules, *implied_modules(run)) if module.is_active(run.scene)}
 
 
 def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:

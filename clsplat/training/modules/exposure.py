@@ -300,10 +300,10 @@ class ColorState(ModuleState):
         for name, array in report.arrays.items():
             with open_atomic(run.out / name) as file:
                 np.save(file, array, allow_pickle=False)
-        greens = [matrix[1, 1] for matrix in report.matrices.values()]
+        green_gains = [matrix[1, 1] for matrix in report.matrices.values()]
         LOG.info(
             "colors of %d photographs in %s: green is multiplied by %.2f to %.2f",
-            *(len(greens), VIEW_COLORS, min(greens), max(greens)),
+            *(len(green_gains), VIEW_COLORS, min(green_gains), max(green_gains)),
         )
 
 
@@ -387,11 +387,11 @@ def estimate_exposures(run: Run) -> Exposures:
 
 def transform_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
     """Return an image, [3 or 4, rows, stride], with its colors transformed by a matrix, [3, 4]."""
-    colored = workspace.array("colored", image.shape)
+    result = workspace.array("colored", image.shape)
     workspace.device.program("colors.cl").colors_forward(
-        groups=(1, camera.rows), image=image, colored=colored, **_arguments(camera, image, matrix)
+        groups=(1, camera.rows), image=image, colored=result, **_arguments(camera, image, matrix)
     )
-    return colored
+    return result
 
 
 def color_gradients(
