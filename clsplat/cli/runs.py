@@ -9,6 +9,7 @@ from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, shell_quote
+from clsplat.pipeline.files import ENDINGS
 
 OnOption = Annotated[
     Path | None,
@@ -22,6 +23,7 @@ OnOption = Annotated[
     "clsplat run splat_7k --scene my_scene --out runs/a --set optimize.steps=3000",
     "clsplat run splat_7k --scene my_scene --live",
     "clsplat run splat_7k --scene my_scene --minutes 5",
+    "clsplat run photos --scene my_photos --quality high",
 )
 def run(
     pipeline: PipelineArgument,
@@ -44,9 +46,15 @@ def run(
         float | None,
         typer.Option(metavar="M", help="Choose the number of steps to fit this time, within about 15 %."),
     ] = None,
+    quality: Annotated[
+        Literal["draft", "standard", "high"],
+        typer.Option(help="For `photos`: `draft` for a first look, `high` for the best result."),
+    ] = "standard",
     on: OnOption = None,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
+    if quality != "standard":
+        pipeline = str(Path(pipeline).with_stem(Path(pipeline).stem + ENDINGS[quality]))
     if minutes is not None and dry_run:
         raise ConfigError("--minutes trains some steps to time them, which --dry-run cannot; use only one of them")
     if resume and restart:

@@ -1,7 +1,8 @@
 """Find pipeline files by path, or by the name of a shipped pipeline.
 
-A file NAME.yaml with the key `short` defines two pipelines, NAME and NAME_7k.  The path of the second is NAME_7k.yaml,
-which does not exist on disk: `read_pipeline` creates its text from NAME.yaml.
+A file NAME.yaml with the key `short` defines two pipelines, NAME and NAME_7k.  The keys `draft` and `high` define
+NAME_draft and NAME_high.  The path of such a variant does not exist on disk: `read_pipeline` creates its text from
+NAME.yaml.
 """
 
 import difflib
@@ -12,21 +13,28 @@ from clsplat.core.errors import ConfigError, quote, shell_quote
 from clsplat.core.files import PIPELINE
 from clsplat.core.resources import resource_dir
 
-SHORT = "_7k"  # ending of the names of short pipelines
-HAS_SHORT = re.compile(rb"^short\s*:", re.MULTILINE)
+ENDINGS = {"short": "_7k", "draft": "_draft", "high": "_high"}  # of the names of variants, by their key in the file
+VARIANT_KEY = re.compile(rf"^({'|'.join(ENDINGS)})\s*:".encode(), re.MULTILINE)
 
 
 def shipped_pipelines() -> dict[str, Path]:
     """Return the paths of the shipped pipelines by name, sorted."""
     files = list(resource_dir("pipelines").glob("*.yaml"))
-    files += [file.with_stem(file.stem + SHORT) for file in files if HAS_SHORT.search(file.read_bytes())]
+    keys = {file: VARIANT_KEY.findall(file.read_bytes()) for file in files}
+    files += [file.with_stem(file.stem + ENDINGS[key.decode()]) for file in files for key in keys[file]]
     return {file.stem: file for file in sorted(files)}
 
 
 def origin(path: Path) -> Path:
     """Return the file on disk that defines a pipeline: NAME.yaml for NAME_7k.yaml if only the first exists."""
-    full = path.with_stem(path.stem.removesuffix(SHORT)) if path.stem != SHORT else path
+    key = variant_key(path)
+    full = path.with_stem(path.stem.removesuffix(ENDINGS[key])) if key else path
     return full if full != path and full.is_file() and not path.exists() else path
+
+
+def variant_key(path: Path) -> str | None:
+    """Return the key that defines a variant, such as `short` for NAME_7k.yaml; None for other names."""
+    return next((key for key, ending in ENDINGS.items() if path.stem.endswith(ending) and path.stem != ending), None)
 
 
 def find(name: str) -> Path:

@@ -18,7 +18,7 @@ from ruamel.yaml.reader import ReaderError
 
 from clsplat.core.errors import ConfigError, quote, shorten
 from clsplat.core.reading import read_text
-from clsplat.pipeline.files import origin
+from clsplat.pipeline.files import ENDINGS, origin, variant_key
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that nested aliases cannot fill the memory
@@ -83,32 +83,37 @@ def read_pipeline(path: Path) -> str:
 
     Raises ConfigError.
     """
-    file = origin(path)
+    file, key = origin(path), variant_key(path)
     text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
-    return text if file == path else _apply_short(text, path, file)
+    return text if file == path or key is None else _apply_variant(text, path, file, key)
 
 
 # The text of NAME_7k.yaml is that of NAME.yaml with the values of `short`, and with the comment above that key.
 
 
-def _apply_short(text: str, path: Path, file: Path) -> str:
+def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
     document = _parse(text, str(file))
-    if not isinstance(document.data, dict) or not isinstance(document.data.get("short"), dict):
-        raise ConfigError(f"{file}: expected a map 'short', with values of {path.name}; add one, or run {file.name}")
+    if not isinstance(document.data, dict) or not isinstance(document.data.get(name), dict):
+        raise ConfigError(f"{file}: expected a map '{name}', with values of {path.name}; add one, or run {file.name}")
     root = YAML(typ="safe", pure=True).compose(text)
-    key, short = next(pair for pair in root.value if pair[0].value == "short")
-    root.value.remove((key, short))  # the keys inside it cannot be set
-    comment = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
-    values = {key_path.value: text[value.start_mark.index : value.end_mark.index] for key_path, value in short.value}
-    edits = [(key.start_mark.index - len(comment), short.end_mark.index, "")]
-    for key_path, value in {"name": path.stem, **values}.items():
+    summary, settings, edits = "", {}, []
+    for key, variant in [pair for pair in root.value if pair[0].value in ENDINGS]:
+        root.value.remove((key, variant))  # the keys inside it cannot be set
+        comment = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
+        edits.append((key.start_mark.index - len(comment), variant.end_mark.index, ""))
+        if key.value == name:
+            summary = comment
+            settings = {k.value: text[v.start_mark.index : v.end_mark.index] for k, v in variant.value}
+    for key_path, value in {"name": path.stem, **settings}.items():
         if not (node := _node(root, key_path)):
-            line = f"{file}:{document.line(('short', key_path))}: short"
+            line = f"{file}:{document.line((name, key_path))}: {name}"
             raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
+    following = len(text)  # start of the next edit: the end mark of a map is behind the comments that follow it
     for start, stop, new_text in sorted(edits, reverse=True):
-        text = text[:start] + new_text + text[stop:]
-    return f"{comment}#\n{text}"
+        text = text[:start] + new_text + text[min(stop, following) :]
+        following = start
+    return f"{summary}#\n{text}"
 
 
 def _node(root: Node, key_path: str) -> Node | None:

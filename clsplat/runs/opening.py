@@ -22,6 +22,7 @@ from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, step_facts
 from clsplat.prepare.gather import list_photographs
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.estimate import estimate_time
 from clsplat.runs.run_folder import Start
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
@@ -114,6 +115,10 @@ def open_run(
     if status:
         status.enter("preparing", device=opened_device.text)
     status = status or StatusFile(out)
+    if any(step.why for step in planned):
+        names = photo_names(pipeline, planned, out)
+        for line in estimate_time(pipeline, planned, names, expected_measures(pipeline, names), opened, None)[:1]:
+            LOG.info("%s", line)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with listening(count_listener(status)):
         folder = prepare(planned_steps, folder, root, status.stage)

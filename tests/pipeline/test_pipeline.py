@@ -294,6 +294,15 @@ def test_short_pipeline_applies_the_short_values(write, tmp_path):
     assert edited.endswith("- export\n")
 
 
+def test_variants_before_other_keys_leave_those_as_they_are(write, tmp_path):
+    head, stages = SMALL.split("stages:")
+    variants = "# Fast.\ndraft:\n  optimize.steps: 4\n# Slow.\nhigh:\n  optimize.steps: 40\n# Stages.\nstages:"
+    (tmp_path / "small.yaml").write_text(head + variants + stages)
+    for name, steps in (("small_draft", 4), ("small_high", 40)):
+        expected = load(write(SMALL), [f"name={name}", f"optimize.steps={steps}"])
+        assert load(str(tmp_path / f"{name}.yaml")).resolved() == expected.resolved()
+
+
 @pytest.mark.parametrize(
     ("short", "words"),
     [
@@ -309,11 +318,13 @@ def test_invalid_short_value_is_refused_with_its_location(tmp_path, short, words
         load(str(tmp_path / "small_7k.yaml"))
 
 
-def test_short_keys_are_set_keys():
-    full = {name: read_yaml(path).data.get("short") for name, path in files.shipped_pipelines().items()}
-    for name, values in full.items():
-        given = [f"{place}={json.dumps(value)}" for place, value in (values or {}).items()]
-        assert not values or load(name, [f"name={name}_7k", *given]).resolved() == load(f"{name}_7k").resolved()
+def test_variant_keys_are_set_keys():
+    for name, path in files.shipped_pipelines().items():
+        data = read_yaml(path).data
+        for key in data.keys() & files.ENDINGS.keys():
+            variant = name + files.ENDINGS[key]
+            overrides = [f"{key_path}={json.dumps(value)}" for key_path, value in data[key].items()]
+            assert load(name, [f"name={variant}", *overrides]).resolved() == load(variant).resolved()
 
 
 def replaced(old: str, new: str) -> str:
