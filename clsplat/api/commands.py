@@ -155,6 +155,13 @@ def pipelines(name: PathLike | None = None) -> Any:
     return recipes.summaries() if name is None else recipes.manual(str(name))
 
 
+def find_variant(name: PathLike, key: Literal["short", "draft", "high"]) -> str:
+    """Return the name or path of a variant of a pipeline, such as `photos_high`.  Raises ConfigError if it has none."""
+    from clsplat.pipeline import files
+
+    return files.variant_of(str(name), key)
+
+
 def copy_pipeline(name: PathLike, file: PathLike) -> Path:
     """Copy a pipeline to a file or into a folder; return the path of the copy.  Existing files are never replaced."""
     from clsplat.pipeline import recipes

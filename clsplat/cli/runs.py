@@ -9,7 +9,6 @@ from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, shell_quote
-from clsplat.pipeline.files import ENDINGS
 
 OnOption = Annotated[
     Path | None,
@@ -54,7 +53,7 @@ def run(
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
     if quality != "standard":
-        pipeline = str(Path(pipeline).with_stem(Path(pipeline).stem + ENDINGS[quality]))
+        pipeline = commands.find_variant(pipeline, quality)
     if minutes is not None and dry_run:
         raise ConfigError("--minutes trains some steps to time them, which --dry-run cannot; use only one of them")
     if resume and restart:

@@ -37,6 +37,14 @@ def variant_key(path: Path) -> str | None:
     return next((key for key, ending in ENDINGS.items() if path.stem.endswith(ending) and path.stem != ending), None)
 
 
+def variant_of(name: str, key: str) -> str:
+    """Return the name or path of a variant, given those of its pipeline.  Raises ConfigError."""
+    path = find(name)
+    if key.encode() not in VARIANT_KEY.findall(origin(path).read_bytes()):
+        raise ConfigError(f"{name}: has no variant '{key}'; `photos` has one")
+    return str(Path(name).with_stem(path.stem + ENDINGS[key]))
+
+
 def find(name: str) -> Path:
     """Return the file of a pipeline, given its path or the name of a shipped pipeline.  Raises ConfigError."""
     path = Path(name)

@@ -115,10 +115,10 @@ def open_run(
     if status:
         status.enter("preparing", device=opened_device.text)
     status = status or StatusFile(out)
-    if any(step.why for step in planned):
-        names = photo_names(pipeline, planned, out)
-        for line in estimate_time(pipeline, planned, names, expected_measures(pipeline, names), opened, None)[:1]:
-            LOG.info("%s", line)
+    if any(step.reason for step in planned_steps):
+        names = photo_names(pipeline, planned_steps, out)
+        lines = estimate_time(pipeline, planned_steps, names, expected_measures(pipeline, names), opened_device, None)
+        LOG.info("%s", "".join(lines[:1]))
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with listening(count_listener(status)):
         folder = prepare(planned_steps, folder, root, status.stage)

@@ -44,6 +44,12 @@ def test_dry_run_touches_nothing(tiny_scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_quality_selects_the_variant_of_a_pipeline(tiny_scene, tmp_path):
+    arguments = ["--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run"]
+    assert "1200 steps" in clsplat("run", "photos", "--quality", "draft", *arguments).stdout
+    clsplat("run", "fast", "--quality", "high", *arguments, expect=2)
+
+
 def test_dry_run_prints_when_each_stage_acts(tiny_scene, tmp_path):
     done = clsplat("run", "splat_7k", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
     assert "reset_opacity every 500 (stop 501, when_background white)" in done.stdout
