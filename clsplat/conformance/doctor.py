@@ -316,7 +316,7 @@ def _facts(report: DeviceReport) -> dict[str, str]:
 
 def largest_error(result: CheckResult) -> str:
     """Return the largest deviation relative to its bound, as text."""
-    largest = max(result.deviations, key=_excess, default=None)
+    largest = max(result.deviations, key=_bound_ratio, default=None)
     if largest is None:
         return ""
     if largest.counts:
@@ -324,7 +324,7 @@ def largest_error(result: CheckResult) -> str:
     return f"{100 * largest.value / largest.bound:.0f} %"
 
 
-def _excess(deviation: Deviation) -> float:
+def _bound_ratio(deviation: Deviation) -> float:
     """Return a deviation divided by its bound; infinity if it exceeds the bound or is NaN."""
     if not deviation.passes:
         return float("inf")

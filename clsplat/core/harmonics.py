@@ -38,9 +38,9 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     values = basis(np.concatenate([directions, -directions]))[:, :count]
     pairs = np.triu_indices(count)
     products = values[:, pairs[0]] * values[:, pairs[1]]
-    from_products = np.linalg.lstsq(products, values, rcond=1e-9)[0]
+    product_coefficients = np.linalg.lstsq(products, values, rcond=1e-9)[0]
     moments = form * (count / (4 * np.pi) / np.trace(form))  # |Y|² = K / 4 pi in every direction
-    mean = moments[pairs] @ from_products
+    mean = moments[pairs] @ product_coefficients
     norm2 = mean @ np.linalg.solve(moments, mean)  # at most 1 for a distribution; noise in `form` can exceed it
     return np.asarray(np.round(mean / np.sqrt(max(norm2, 1.0)), DIGITS))
 

@@ -174,7 +174,7 @@ def counts_on_terminal() -> Iterator[None]:
     if not CONSOLE.is_terminal:
         yield
         return
-    bar = _new_bar()
+    bar = _create_bar()
     task = bar.add_task("", total=None, visible=False)
 
     def update(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -189,7 +189,7 @@ class _RunBar:
     """The progress bar of a run, computed from its status when drawn, so that training never waits for it."""
 
     def __init__(self, status: StatusSource) -> None:
-        self.status, self.bar = status, _new_bar()
+        self.status, self.bar = status, _create_bar()
         self.task = self.bar.add_task("", total=None)
         self.last: tuple[float, TrainingProgress] | None = None  # time, report
         self.first: tuple[float, int, int] | None = None  # time, step, and number of steps when first drawn
@@ -223,7 +223,7 @@ class _RunBar:
         return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
 
 
-def _new_bar() -> Progress:
+def _create_bar() -> Progress:
     return Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
 
 

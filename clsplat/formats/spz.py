@@ -337,8 +337,8 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
 
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
     """Decode the bytes of an SPZ file, and return the splats and the declared axes, or ''.  Raises like `read_spz`."""
-    is_new = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
-    header, parameters, axes = (_decode_4 if is_new else _decode_gzip)(path, data)
+    is_version_4 = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
+    header, parameters, axes = (_decode_version_4 if is_version_4 else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)
     name = axes or DEFAULT_AXES
     if name[1] in "BF":  # z is vertical
@@ -382,7 +382,7 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     header = SpzHeader.parse(path, start)
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
-    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded(data)))
+    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded_size(data)))
 
     def read(size: int) -> bytes:
         if len(part := stream.read(size)) < size:
@@ -438,7 +438,7 @@ class _Gzip:
             raise DataError(f"{self.path}: has {trailing_bytes} bytes after its gzip data; copy or export it again")
 
 
-def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
+def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     """Decode the header, parameters, and declared axes of version 4."""
     header = SpzHeader.parse(path, data)
     if len(data) < HEADER4:
@@ -450,7 +450,7 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
             f"{path}: has {stream_count} streams and their table at byte {table_start}; expected {len(sizes)} streams "
             f"within {len(data)} bytes; copy or export it again"
         )
-    _check_size(path, header, _max_decoded(data))
+    _check_size(path, header, _max_decoded_size(data))
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table_start]).read) if header.flags & EXTENSIONS else ""
     start, frames = table_start + 16 * stream_count, []
     for index, size in enumerate(sizes):
@@ -467,7 +467,7 @@ def _decode_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     return header, decode(header, [frame.read for frame in frames]), axes
 
 
-def _max_decoded(data: bytes) -> int:
+def _max_decoded_size(data: bytes) -> int:
     """Return the largest accepted number of plane bytes that a compressed file decodes to."""
     return max(len(data) * RATIO, MIN_LIMIT)
 

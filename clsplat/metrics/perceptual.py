@@ -43,7 +43,7 @@ class Lpips:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
             raise DataError(
-                f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_short(error)})"
+                f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_last_line(error)})"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
             raise ConfigError(f"{path}: is not LPIPS; the distance of equal images is {distance:g}, expected 0")
@@ -58,7 +58,7 @@ class Lpips:
         except cv2.error as error:
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise ConfigError(
-                f"{self.path}: cannot compare images of {size} ({_short(error)}); expected the inputs "
+                f"{self.path}: cannot compare images of {size} ({_last_line(error)}); expected the inputs "
                 f"{' and '.join(INPUTS)} of [1, 3, height, width], with dynamic height and width"
             ) from error
         if output.size != 1 or output.dtype.kind != "f" or not np.isfinite(output).all():
@@ -87,7 +87,7 @@ class Lpips:
         return np.ascontiguousarray(values if self.inputs == "0..1" else 2 * values - 1)
 
 
-def _short(error: cv2.error) -> str:
+def _last_line(error: cv2.error) -> str:
     """Return the last line of OpenCV's message."""
     return (error.err or str(error)).strip().splitlines()[-1][:120]
 

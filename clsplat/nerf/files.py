@@ -103,7 +103,7 @@ def is_field(path: Path) -> bool:
     return path.suffix.lower() == ENDING
 
 
-def field_of_run(folder: Path) -> Path:
+def find_field(folder: Path) -> Path:
     """Return the path of the last file that `export_field` wrote in a run folder."""
     return run_output(folder, "export_field", FILE)
 
@@ -113,7 +113,7 @@ def load_field(path: str | Path) -> FieldModel:
 
     Raises DataError if the file is missing or damaged, or contains something else.
     """
-    path = field_of_run(Path(path)) if Path(path).is_dir() else Path(path)
+    path = find_field(Path(path)) if Path(path).is_dir() else Path(path)
     if not path_exists(path):
         raise DataError(f"{path}: not found; expected a file of the stage export_field")
     try:

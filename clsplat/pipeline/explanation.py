@@ -45,7 +45,7 @@ def is_union(annotation: Any) -> bool:
     return len([member for member in members if member is not types.NoneType]) > 1
 
 
-def annotation_of(field: FieldInfo) -> Any:
+def field_annotation(field: FieldInfo) -> Any:
     """Return a field's annotation with its metadata, as it was written."""
     return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
 
@@ -53,7 +53,7 @@ def annotation_of(field: FieldInfo) -> Any:
 @lru_cache(maxsize=1024)
 def annotations(model: type[BaseModel]) -> dict[str, Any]:
     """Return the annotations of a model's fields, with their metadata, by name."""
-    return {name: annotation_of(field) for name, field in model.model_fields.items()}
+    return {name: field_annotation(field) for name, field in model.model_fields.items()}
 
 
 @lru_cache(maxsize=1024)
@@ -70,7 +70,7 @@ def item_annotation(annotation: Any) -> Any:
     return next(iter(typing.get_args(annotation)), None)
 
 
-def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
+def find_model(data: Any, annotation: Any) -> type[BaseModel] | None:
     """Return the model that the tag in plain data selects, or None if the tag is unknown."""
     candidates = models(annotation)
     if len(candidates) > 1 and isinstance(data, dict):
@@ -92,7 +92,7 @@ def with_tags(data: Any, annotation: Any) -> Any:
             name, fields = next(iter(data.items()))
             if name != "stage" and isinstance(fields, dict | None):
                 data = {"stage": name, **(fields or {})}
-    if isinstance(data, dict) and (model := model_of(data, annotation)):
+    if isinstance(data, dict) and (model := find_model(data, annotation)):
         by_key = annotations(model)
         return {key: with_tags(value, by_key.get(key)) for key, value in data.items()}
     return data
@@ -210,5 +210,5 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Key
             key_path.append(part)
             model = members[0] if len(members) == 1 else model
             field = model.model_fields.get(part) if model else None
-            annotation = annotation_of(field) if field else None
+            annotation = field_annotation(field) if field else None
     return tuple(key_path), model, annotation

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.settings import TAGS, Variants, descriptions, variants
-from clsplat.pipeline.explanation import annotations, bases, item_annotation, model_of, with_tags
+from clsplat.pipeline.explanation import annotations, bases, find_model, item_annotation, with_tags
 from clsplat.pipeline.yaml_file import KeyPath, parse_value
 
 MAX_SUGGESTIONS = 3
@@ -81,7 +81,7 @@ class _Node:
     def __init__(self, data: Any, annotation: Any, key_path: KeyPath) -> None:
         self.data = data
         self.key_path = key_path
-        self.model = model_of(data, annotation)
+        self.model = find_model(data, annotation)
         self.items = item_annotation(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":

@@ -90,7 +90,7 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
         last = last_edit(training)
         fixed_steps = max(done, last) if last < min(steps, training.steps) else done
         factor = (steps - fixed_steps) / (training.steps - fixed_steps)
-        during = [_stretch_rest(stage, fixed_steps, factor) for stage in training.during]
+        during = [_stretch_stage(stage, fixed_steps, factor) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
     return map_trainings(settings, Training, change)
@@ -125,7 +125,7 @@ def stretch_to_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     return stretch(settings, Fraction(steps, settings.training.steps))
 
 
-def _stretch_rest(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
+def _stretch_stage(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
     """Return a stage with the steps after `fixed` multiplied by `factor`, if it starts after `fixed`."""
     if stage.start <= fixed:
         return stage

@@ -65,12 +65,12 @@ class MatchGraph:
 
 def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
     """Return the groups of names connected by pairs, each sorted, the largest first."""
-    group_of = {name: {name} for name in names}
+    group_by_name = {name: {name} for name in names}
     for a, b in pairs:
-        if group_of[a] is not group_of[b]:
-            group_of[a] |= group_of[b]
-            group_of.update(dict.fromkeys(group_of[b], group_of[a]))
-    groups = {id(group): sorted(group) for group in group_of.values()}
+        if group_by_name[a] is not group_by_name[b]:
+            group_by_name[a] |= group_by_name[b]
+            group_by_name.update(dict.fromkeys(group_by_name[b], group_by_name[a]))
+    groups = {id(group): sorted(group) for group in group_by_name.values()}
     return sorted(groups.values(), key=lambda group: (-len(group), group))
 
 

@@ -152,11 +152,11 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
         ]
         if len(candidates) > max_pairs:
             similarities = similarity(_descriptors(db, images))
-            candidates = _closest(candidates, similarities, targets, max(1, max_pairs // sum(targets)))
+            candidates = _closest_pairs(candidates, similarities, targets, max(1, max_pairs // sum(targets)))
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 
-def _closest(
+def _closest_pairs(
     pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], is_unplaced: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
     """Return the pairs of each unplaced photograph with the `count` most similar photographs."""

@@ -24,7 +24,7 @@ from clsplat.formats.table import model_file
 from clsplat.gaussians.model import MODEL, Model, load, model_path, run_model
 from clsplat.metrics.perceptual import Perceptual
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
-from clsplat.nerf.files import FieldModel, field_of_run, is_field, load_field
+from clsplat.nerf.files import FieldModel, find_field, is_field, load_field
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
@@ -64,7 +64,7 @@ def make_painter(host_model: AnyModel, device: Device, background: Background) -
     return SplatPainter(Rasterizer(device), host_model.upload(device), Photographs(device, background).background)
 
 
-def points_of(host_model: AnyModel, scene: Scene | None) -> NDArray[np.float32]:
+def content_points(host_model: AnyModel, scene: Scene | None) -> NDArray[np.float32]:
     """Return points of the visible content, (M, 3): the means of Gaussians, or for a field the points of the scene.
 
     M is 0 for a field without scene points.
@@ -80,7 +80,7 @@ def is_moving(host_model: AnyModel) -> bool:
     return isinstance(host_model, Model) and host_model.motion is not None
 
 
-def size_of(host_model: AnyModel) -> dict[str, int | None]:
+def _count_parameters(host_model: AnyModel) -> dict[str, int | None]:
     """Return the number of Gaussians or of network parameters, under the keys that metrics.json uses."""
     if isinstance(host_model, Model):
         return {"gaussians": len(host_model)}
@@ -168,7 +168,7 @@ def field_error(path: Path) -> DataError:
 def trained_file(run: Path) -> Path:
     """Return the model file that a run trained: Gaussians, or a field."""
     file = run_model(run)
-    return file if file.is_file() or not _has_field(run) else field_of_run(run)
+    return file if file.is_file() or not _has_field(run) else find_field(run)
 
 
 def _has_field(run: Path) -> bool:
@@ -397,7 +397,7 @@ class ModelFile:
                         train_views=scene.split("train"),
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
-        return {**metrics, **size_of(self.host_model), "device": self.device.text}
+        return {**metrics, **_count_parameters(self.host_model), "device": self.device.text}
 
 
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:

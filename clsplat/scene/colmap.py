@@ -125,11 +125,11 @@ def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the IDs of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
     fields = line.split()
     indices = [i for i in range(2, len(fields), 3) if fields[i].isdecimal()]
-    pixels = [(_coordinate(fields[i - 2]), _coordinate(fields[i - 1])) for i in indices]
-    return np.array([_point_id(fields[i]) for i in indices], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+    pixels = [(_parse_coordinate(fields[i - 2]), _parse_coordinate(fields[i - 1])) for i in indices]
+    return np.array([_parse_id(fields[i]) for i in indices], np.int64), np.array(pixels, np.float64).reshape(-1, 2)
 
 
-def _coordinate(text: str) -> float:
+def _parse_coordinate(text: str) -> float:
     """Parse a coordinate of a 2D point; NaN if it is not a number, since only reprojection errors need it."""
     try:
         return float(text)
@@ -139,7 +139,7 @@ def _coordinate(text: str) -> float:
 
 def points_text(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
-    types = (_point_id, float, float, float, _byte, _byte, _byte, float)
+    types = (_parse_id, float, float, float, _parse_byte, _parse_byte, _parse_byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
     rows = [_convert(source, line.split(maxsplit=8)[:8], types, layout) for source, line in _lines(path) if line]
     table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
@@ -166,12 +166,12 @@ def _convert(source: str, fields: list[str], types: Sequence[Callable[[str], Any
         raise DataError(f"{source}: {shorten(str(error))}; expected {layout}: remove that entry or {REMEDY}") from error
 
 
-def _point_id(text: str) -> int:
+def _parse_id(text: str) -> int:
     """Parse the ID of a point, clamped to the range that COLMAP uses; -1: no point."""
     return min(max(int(text), -1), LARGEST_ID)
 
 
-def _byte(text: str) -> int:
+def _parse_byte(text: str) -> int:
     if not 0 <= int(text) <= 255:
         raise ValueError(f"color {text} is not in 0..255")
     return int(text)
@@ -379,16 +379,16 @@ def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequenc
     is_finite = table.is_finite()
     positions, ids = table.positions[is_finite], table.ids[is_finite]
     order = np.argsort(ids, kind="stable")
-    rows_of, residuals, by_name = {}, {}, {view.name: view for view in views}
+    track_rows, residuals, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
         image_ids, first = np.unique(image.points, return_index=True)
         nearest = np.minimum(np.searchsorted(ids[order], image_ids), max(len(ids) - 1, 0))
         is_match = ids[order][nearest] == image_ids if len(ids) else np.zeros(len(image_ids), bool)
-        rows = rows_of[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
+        rows = track_rows[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
         view = by_name.get(image.name)
         if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
             residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[is_match]])
-    return Tracks(positions, rows_of, residuals) if any(map(len, rows_of.values())) else None
+    return Tracks(positions, track_rows, residuals) if any(map(len, track_rows.values())) else None
 
 
 def find_models(path: Path) -> list[Path]:

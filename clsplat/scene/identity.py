@@ -73,11 +73,11 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
 
 def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
     """Raise DataError if some image files of the scene at `path` cannot be used for training."""
-    damaged = {file: result.fault.removeprefix(f"{file}: ") for file, result in files.items() if result.fault}
-    if damaged:
-        examples = "; ".join(f"{file} ({fault})" for file, fault in list(damaged.items())[:MAX_NAMES])
-        more = "; …" if len(damaged) > MAX_NAMES else ""
-        raise DataError(f"{path}: {len(damaged)} of {len(files)} image files cannot be trained on: {examples}{more}")
+    faults = {file: result.fault.removeprefix(f"{file}: ") for file, result in files.items() if result.fault}
+    if faults:
+        examples = "; ".join(f"{file} ({fault})" for file, fault in list(faults.items())[:MAX_NAMES])
+        more = "; …" if len(faults) > MAX_NAMES else ""
+        raise DataError(f"{path}: {len(faults)} of {len(files)} image files cannot be trained on: {examples}{more}")
 
 
 def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:

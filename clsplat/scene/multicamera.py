@@ -52,7 +52,7 @@ class MulticameraReader(Reader):
         return make_scene(path, views, held_out, points)
 
 
-def names_of(image: str) -> tuple[str, str]:
+def _candidate_names(image: str) -> tuple[str, str]:
     """Return the possible camera names of an image: its name without the suffix, and the name of its folder."""
     name = PureWindowsPath(image)
     return name.stem, name.parent.name
@@ -74,7 +74,7 @@ def _camera_names(path: Path) -> set[str]:
             images = [image.name for model in find_models(path) for image in read_images(model)]
     except DataError:
         return set()
-    return {name for image in images for name in names_of(image)}
+    return {name for image in images for name in _candidate_names(image)}
 
 
 def _frames(path: Path) -> dict[str, list[Path]]:
@@ -128,7 +128,7 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
         views, points = camera_views(path)
     cameras: dict[str, View] = {}
     for view in views:
-        name = next((name for name in names_of(view.name) if name in frames), None)
+        name = next((name for name in _candidate_names(view.name) if name in frames), None)
         if name is None:
             continue
         if name in cameras:

@@ -79,8 +79,8 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     photographs = [view.name if view.lens is None else photograph_name(view.name) for view in scene.views]
     masks = find_masks(folder, photographs)
     views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
-    mask_of = dict(zip(photographs, masks, strict=True))
-    count, missing = len(mask_of), [name for name, mask in mask_of.items() if mask is None]
+    masks_by_name = dict(zip(photographs, masks, strict=True))
+    count, missing = len(masks_by_name), [name for name, mask in masks_by_name.items() if mask is None]
     if len(missing) == count:
         fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
         names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))

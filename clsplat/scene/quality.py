@@ -166,11 +166,11 @@ def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
 
     Raises DataError when a file cannot be read.
     """
-    transparency, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    masks = [mask for mask in (None if transparency is None else transparency == 0, unmasked) if mask is not None]
+    transparency, is_unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    masks = [mask for mask in (None if transparency is None else transparency == 0, is_unmasked) if mask is not None]
     return np.logical_and.reduce(masks) if masks else None
 
 
 def _is_transparent(view: View) -> bool:
-    transparency, unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
-    return transparency is not None and bool((transparency if unmasked is None else transparency[unmasked]).any())
+    transparency, is_unmasked = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    return transparency is not None and bool((transparency if is_unmasked is None else transparency[is_unmasked]).any())

@@ -212,7 +212,7 @@ def make_view(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: 
     size: (width, height) of the image, for a frame without a size.  clock: the clock of a dynamic scene.  Raises
     DataError for invalid values.
     """
-    lens = intern_lens(make_lens(frame, camera_of(frame, size)))
+    lens = intern_lens(make_lens(frame, _frame_camera(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
     moment = frame.number("time")
     time = None if clock is None or moment is None else float(clock(moment))
@@ -220,7 +220,7 @@ def make_view(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: 
     return View(name, camera, np.linalg.inv(matrix)[:3], lens=distortion, time=time, camera_to_world=matrix)
 
 
-def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
+def _frame_camera(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
     width, height = (int(frame.number(key) or side) for key, side in zip("wh", size or (0, 0), strict=True))
     if frame.value("camera_model") == "EQUIRECTANGULAR" and 0 < min(width, height) <= max(width, height) <= MAX_SIDE:

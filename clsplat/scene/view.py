@@ -389,8 +389,8 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
             f"the focal length of the {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
             "run `clsplat data undistort` first"
         )
-    degrees = *[1] * MODELS[lens.model][0], 0, 0, *DEGREES[lens.model]  # of focal lengths, principal point, distortion
-    params = tuple(value * factor**degree for value, degree in zip(lens.params, degrees, strict=True))
+    powers = *[1] * MODELS[lens.model][0], 0, 0, *DEGREES[lens.model]  # of focal lengths, principal point, distortion
+    params = tuple(value * factor**degree for value, degree in zip(lens.params, powers, strict=True))
     return replace(lens, params=params)
 
 

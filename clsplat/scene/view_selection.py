@@ -91,9 +91,9 @@ class ViewSelection(Settings):
             return every_nth(names, self.every, self.offset)
         source, lines = self._read_names(folders)
         index, indexes = _NameIndex(names), {key: _NameIndex(group) for key, group in excluded.items()}
-        matches_of = {name: index.indices_of(name) for name in lines}
+        matches_of = {name: index.find_indices(name) for name in lines}
         for name in [name for name, matches in matches_of.items() if not matches]:
-            for key in (key for key, group in indexes.items() if group.indices_of(name)):
+            for key in (key for key, group in indexes.items() if group.find_indices(name)):
                 if key != "missing":
                     raise _excluded_error(source, name, key)
                 del matches_of[name]
@@ -111,7 +111,7 @@ class ViewSelection(Settings):
             return []
         source, lines = self._read_names(folders)
         index, groups = _NameIndex(names), {key: {*group} for key, group in excluded.items()}
-        matches = {name: index.indices_of(name) for name in lines}
+        matches = {name: index.find_indices(name) for name in lines}
         for name, indices in matches.items():
             if not indices:
                 raise _unknown_name_error(name, names, source)
@@ -160,7 +160,7 @@ class _NameIndex:
         self._endings, self._stems = _group(_path_suffixes(paths)), _group(_path_suffixes(stems))
         self._full_stems = _group((stem.parts, i) for i, stem in enumerate(stems))
 
-    def indices_of(self, name: str) -> list[int]:
+    def find_indices(self, name: str) -> list[int]:
         """Return the indices of the views whose names end with a listed name, with or without its suffix.
 
         If there are none, names with another suffix match too, since prepared images are PNG files.

@@ -156,17 +156,17 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         behind = device.upload(planes[3] * np.abs(frame.transmittance.get()))
         sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), behind=behind)
         splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
-        from_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
+        image_gradients = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
         black, channel = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
-        from_transmittance = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
+        alpha_gradients = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
         mean2d, conic = sums_to_gradients(splats, sums.get()[:, :count].T.astype(np.float64))
         yield compare(
-            "blend_backward", f"splat means, {label}", mean2d, from_image.mean2d + from_transmittance.mean2d, GRADIENT
+            "blend_backward", f"splat means, {label}", mean2d, image_gradients.mean2d + alpha_gradients.mean2d, GRADIENT
         )
         yield compare(
-            "blend_backward", f"conics, {label}", conic, from_image.conic + from_transmittance.conic, GRADIENT
+            "blend_backward", f"conics, {label}", conic, image_gradients.conic + alpha_gradients.conic, GRADIENT
         )
-        opacity = (from_image.opacity + from_transmittance.opacity) * splats.opacity
+        opacity = (image_gradients.opacity + alpha_gradients.opacity) * splats.opacity
         yield compare("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
 
 
@@ -239,20 +239,20 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     image, pixel_sums, depth_sums, grad_means = differentiate(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
     yield from check_image("blend_forward", f"inverse depth, {label}", image[3:], expected[None])
-    from_image = ref.blend_backward(splats, width, height, background, weights[:3])
-    from_depth, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
-    mean2d, conic = (getattr(from_image, name) + getattr(from_depth, name) for name in ("mean2d", "conic"))
-    opacity = from_image.opacity + from_depth.opacity
+    image_gradients = ref.blend_backward(splats, width, height, background, weights[:3])
+    depth_gradients, grad_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
+    mean2d, conic = (getattr(image_gradients, name) + getattr(depth_gradients, name) for name in ("mean2d", "conic"))
+    opacity = image_gradients.opacity + depth_gradients.opacity
     actual = sums_to_gradients(splats, pixel_sums)
     yield compare("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
     yield compare("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
     yield compare(
         "blend_backward", f"opacities with depths, {label}", pixel_sums[:, 0], opacity * splats.opacity, GRADIENT
     )
-    yield compare("blend_backward", f"colors with depths, {label}", pixel_sums[:, 6:9], from_image.color, GRADIENT)
+    yield compare("blend_backward", f"colors with depths, {label}", pixel_sums[:, 6:9], image_gradients.color, GRADIENT)
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
     yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depth_sums, sums, GRADIENT)
-    upstream = mean2d, conic, opacity, from_image.color
+    upstream = mean2d, conic, opacity, image_gradients.color
     settings = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *settings, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]

@@ -50,25 +50,25 @@ def check_photo_folder(facts: Facts) -> Iterator[Finding]:
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
     contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
-    readable, warnings = count - len(read_errors), facts.left_out
+    readable_count, warnings = count - len(read_errors), facts.left_out
     if facts.unplaced:
-        yield from _check_capture(facts, readable)
+        yield from _check_capture(facts, readable_count)
     else:
-        remedy = f"only {readable} of {count} photographs can be read; {remedy_for(read_errors)}"
+        remedy = f"only {readable_count} of {count} photographs can be read; {remedy_for(read_errors)}"
         if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
             remedy, warnings = facts.refusal.removeprefix(f"{facts.path}: "), []
         yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
-    for warning in warnings + warnings_for({"damaged": read_errors, "photographs": readable}):
+    for warning in warnings + warnings_for({"damaged": read_errors, "photographs": readable_count}):
         yield Finding("warning", warning.removeprefix(f"{facts.path}: "))
 
 
-def _check_capture(facts: Facts, readable: int) -> Iterator[Finding]:
-    """Yield findings about photographs without cameras.  readable: the number of readable photographs."""
-    if readable < MIN_VIEWS:
-        fault = f"there {_are(readable, 'photograph', 'only ')}, from which cameras are often not found"
+def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
+    """Yield findings about photographs without cameras.  readable_count: the number of readable photographs."""
+    if readable_count < MIN_VIEWS:
+        fault = f"there {_are(readable_count, 'photograph', 'only ')}, from which cameras are often not found"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
-        is_all_blank = len(blank) == readable
+        is_all_blank = len(blank) == readable_count
         blank_text = f"{_are(len(blank), 'photograph')} black or of a single color"
         fault = "no photograph shows anything" if is_all_blank else blank_text
         yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")

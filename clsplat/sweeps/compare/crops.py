@@ -35,12 +35,12 @@ class ImageCrop:
     @property
     def photograph(self) -> Image:
         """The crop from the photo."""
-        return self._cut(self.full_photograph)
+        return self._cut_out(self.full_photograph)
 
     @property
     def renders(self) -> list[Image]:
         """The crop from each run's render."""
-        return [self._cut(image) for image in self.full_renders]
+        return [self._cut_out(image) for image in self.full_renders]
 
     @property
     def psnrs(self) -> list[float]:
@@ -66,7 +66,7 @@ class ImageCrop:
         size = (OVERVIEW_WIDTH, max(1, round(OVERVIEW_WIDTH * height / width)))
         return cv2.resize(self.full_photograph, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
-    def _cut(self, image: Image) -> Image:
+    def _cut_out(self, image: Image) -> Image:
         return np.ascontiguousarray(image[self.y : self.y + self.side, self.x : self.x + self.side])
 
 

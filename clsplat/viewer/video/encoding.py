@@ -31,12 +31,12 @@ def fix_track_ids(path: Path) -> None:
     """Set the UID of every track of a WebM file to 1, in place, so that equal images give equal files."""
     with path.open("rb+") as file:
         head = file.read(HEAD)
-        for start, size in _uids(head, 0, len(head)):
+        for start, size in _find_uids(head, 0, len(head)):
             file.seek(start)
             file.write((1).to_bytes(size, "big"))
 
 
-def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
+def _find_uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
     """Yield the offset and size of each UID in EBML data."""
     while start + 2 <= end:
         kind, start = _read_integer(data, start, keep_marker=True)
@@ -46,7 +46,7 @@ def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
         if kind in UIDS and start + size <= end:
             yield start, size
         elif kind in PARENTS:
-            yield from _uids(data, start, min(start + size, end))
+            yield from _find_uids(data, start, min(start + size, end))
         start += size
 
 
