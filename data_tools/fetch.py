@@ -105,7 +105,7 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
         except (urllib.error.URLError, TimeoutError, ConnectionError, _IncompleteError) as error:
             if attempt == MAX_TRIES:
                 raise DataError(
-                    f"{source.url}: the connection broke {MAX_TRIES} times ({error}); run it again to continue from "
+                    f"{source.url}: the connection failed {MAX_TRIES} times ({error}); run it again to continue from "
                     f"{part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)

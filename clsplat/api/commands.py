@@ -399,7 +399,7 @@ def run_worker(
     tls: tuple[str | None, str | None, str | None] = (None, None, None),
     insecure: bool = False,
 ) -> None:
-    """Run cells from a scheduler on the devices of this machine until the scheduler ends.
+    """Run cells from a scheduler on the devices of this machine until the scheduler exits.
 
     scheduler: its address, dask://HOST:PORT or tls://HOST:PORT
     devices: names of devices; default: all working devices

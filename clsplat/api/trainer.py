@@ -142,8 +142,8 @@ class Trainer:
     def step(self) -> Report:
         """Train for one step.  Raises StopIteration when the training is finished.
 
-        After an error in a step, the trainer cannot continue.  The state in status.json becomes "failed" after an
-        error, and "done" after the last step.
+        After an error in a step, the trainer cannot continue, and the state in status.json becomes "failed".  After the
+        last step, the state becomes "done".
         """
         interrupts: list[bool] = []
 

@@ -94,7 +94,7 @@ def _expand_live(arguments: list[str]) -> list[str]:
 
 
 def _move_options_first(arguments: list[str]) -> list[str]:
-    """Move `--debug` and `--plugin FILE` in front of the command."""
+    """Move `--debug` and `--plugin FILE` before the command."""
     others = [argument for argument in arguments if argument != DEBUG]
     first = [DEBUG] if len(others) < len(arguments) else []
     remaining: list[str] = []

@@ -120,7 +120,7 @@ def status(
         Path | None,
         typer.Argument(
             metavar="RUN|STORE",
-            help="The folder of a run, a matrix or blocks, or a store of cells.",
+            help="The folder of a run, a matrix, or blocks, or a store of cells.",
             show_default=False,
         ),
     ] = None,
@@ -328,7 +328,7 @@ def cell(
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Run one cell of a matrix, unless its result is in the store; for the job arrays of any scheduler."""
+    """Run one cell of a matrix, unless its result is in the store.  Use it in the job arrays of any scheduler."""
     commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 

@@ -64,7 +64,7 @@ def compare_max(
 
 
 def match(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
-    """Count the values that differ from `expected`; none may."""
+    """Count the values that differ from `expected`; the check passes if there are none."""
     return count_true(kernel, label, value != expected)
 
 

@@ -229,9 +229,9 @@ def examine(device: str | Device | None = None) -> DeviceReport:
 
 
 def _is_due(schedule: str, report: DeviceReport) -> bool:
-    """Return whether to check a schedule: always simt, and wide if it is the default or if a CPU fails with simt.
+    """Return whether to check a schedule: `simt` always, `wide` if it is the default or if a CPU fails with `simt`.
 
-    Other devices do not benefit from wide, and some compilers need many minutes for its vectors.
+    Other devices do not benefit from `wide`, and some compilers need many minutes for its vectors.
     """
     if schedule == "simt" or report.default == "wide":
         return True

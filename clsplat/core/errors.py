@@ -1,6 +1,6 @@
 """Define the error classes and their exit codes.
 
-A message is one line: where, what is wrong, and what to do.  The command line prints it without a traceback unless
+A message is one line: the location, the fault, and the remedy.  The command line prints it without a traceback unless
 `--debug` is given.
 """
 

@@ -88,7 +88,7 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
 
 
 def _heartbeat(path: Path) -> float | None:
-    """Return the time of a run's last status, in seconds since 1970; None without a status, or if the run has ended.
+    """Return the time of a run's last status, in seconds since 1970.  None if it has no status, or has ended.
 
     The status is in the same folder as `path`, the lock file.
     """

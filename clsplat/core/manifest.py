@@ -1,4 +1,4 @@
-"""Record which files in a folder a tool wrote, and from which sources, to resume calls and to keep users' files."""
+"""Record which files in a folder a tool wrote and from which sources, to resume calls and to protect users' files."""
 
 import hashlib
 import json
@@ -34,10 +34,10 @@ class Manifest:
         return self._name(path) in self._sources
 
     def needs_writing(self, path: Path, source: str, *companions: Path) -> bool:
-        """Return whether a file must be written: it is missing, or was made from other sources.
+        """Return whether a file must be written because it is missing or was made from other sources.
 
-        If so, remove it and its `companions`, which the caller writes before it, and record its new source.  A file
-        that no tool wrote is never replaced.  Raises OutputError.
+        If so, remove the file and its `companions`, and record the new source.  The caller must write the companions
+        before the file.  A file that no tool wrote is never replaced.  Raises OutputError.
         """
         name, is_file = self._name(path), path.is_file()
         if is_file and self._sources.get(name, source) == source:

@@ -90,7 +90,7 @@ class Count:
     """A counter of finished items; `label` describes them, such as 'photographs decoded'."""
 
     def __init__(self, label: str, total: int, is_even: bool = True) -> None:
-        """is_even: whether all items take about the same time, so that the time left can be estimated."""
+        """is_even: whether all items take about the same time, so that the remaining time can be estimated."""
         self.label, self.total, self.done, self.is_even = label, total, 0, is_even
         self._start: tuple[float, int] | None = None  # time of the first report, and number of items then done
         self._logged = time.monotonic()

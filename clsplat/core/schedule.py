@@ -142,7 +142,7 @@ NOTATIONS = (
 
 
 def explain_schedule(more: str = "") -> WrapValidator:
-    """Return a validator that reports errors in any notation as one sentence; `more` names other accepted values."""
+    """Return a validator that reports each error as one sentence, for any notation.  more: other accepted values."""
     return in_one_sentence(NOTATIONS + more)
 
 

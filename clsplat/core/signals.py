@@ -224,7 +224,7 @@ def _redirect_to_null(stream: Any) -> None:
 
 
 def take_stdin() -> int:
-    """Return a private descriptor of stdin, and replace stdin by an empty one for OpenCL runtimes.
+    """Return a private descriptor of stdin, and replace stdin with an empty file for OpenCL runtimes.
 
     On Windows, querying a pipe can block.
     """

@@ -145,7 +145,7 @@ def progress_line(progress: TrainingProgress) -> str:
 
 
 def device_text(device: dict[str, Any]) -> str:
-    """Format a device from `clsplat.devices`, and whether it works, as lines of text."""
+    """Format a device from `clsplat.devices` as lines of text, including whether it works."""
     sizes = f"{device['memory'] / 2**30:.1f} GiB of memory, buffers up to {device['allocation'] / 2**30:.1f} GiB"
     limits = f"groups up to {device['group']}, {device['local_memory'] >> 10} KiB local, {device['float_width']} lanes"
     return (

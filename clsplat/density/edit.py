@@ -93,7 +93,7 @@ class Edit:
 
     @property
     def survey(self) -> Survey:
-        """The survey of the training views, with the Gaussians before the edit.  Raises ConfigError without views."""
+        """The survey of the training views with the Gaussians before the edit.  Raises ConfigError without views."""
         if self._survey is None:
             raise ConfigError("a rule needs training photographs, and there are none; remove the rule")
         return self._survey
@@ -186,9 +186,9 @@ class Edit:
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Set values of a table, [n, copies, components], for the rows that distinct Gaussians, [n], become.
+        """Set the values of a table, [n, copies, components], for the new rows of distinct Gaussians, [n].
 
-        They have no effect on Gaussians that become another number of rows in the end, because their growth was undone.
+        copies: number of rows that replace each Gaussian.  If its growth is undone later, its values do not change.
         Raises ValueError for invalid rows (see `check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components

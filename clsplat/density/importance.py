@@ -117,7 +117,7 @@ class SampledPruning(Rule):
         """Return the odds of removing each Gaussian, [N], from 0 to infinity."""
 
     def mark(self, edit: Edit) -> None:
-        """Mark a sample of the Gaussians for removal; the size of a split Gaussian is the size of its children."""
+        """Mark a sample of Gaussians for removal.  The size of a split Gaussian is that of its children."""
         gaussians = edit.gaussians
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         size = np.exp(gaussians.get("log_scales").max(axis=1)) * edit.shrink.get()

@@ -129,7 +129,7 @@ class SplatStats:
     def __init__(
         self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",), training_views: int = 1
     ) -> None:
-        """Add the tables of `names` and their divisors, and delete all others; existing tables keep their sums."""
+        """Add the tables of `names` and their divisors, and delete all other tables.  Existing tables keep their sums."""
         self.gaussians, self.training_views = gaussians, training_views
         classes = variants(Statistic)
         all_names = {*names, *(classes[name].divisor for name in names)}

@@ -126,7 +126,8 @@ class Gltf:
     def _read_spz(self, view: Any, names: dict[str, Any]) -> Parameters:
         """Return the Gaussians of an SPZ file in a buffer view, in the axes of glTF.
 
-        Unpacked axes should be x left, y up, z front, but some programs keep those of SPZ; the declared bounds decide.
+        The data should use the axes x left, y up, z front, but some programs keep the axes of SPZ.  The axes that fit
+        the declared bounds best are assumed.
         """
         data, start, length, _ = self._view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])

@@ -290,7 +290,7 @@ def rendering_comments(rendering: dict[str, Any]) -> list[str]:
 
 
 def render_mode(header: PlyHeader) -> str:
-    """Return `mip` if a comment, as any known program writes it, marks a mip model, else `default`."""
+    """Return `mip` if a comment of a known program marks the model as mip, else `default`."""
     return "mip" if any(MIP.match(text) for text in header.comments) else "default"
 
 

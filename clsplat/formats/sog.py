@@ -174,7 +174,7 @@ def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> Non
 
 
 class _Sog:
-    """A SOG: its meta.json and the files that it names."""
+    """The meta.json of a SOG, and the files that it lists."""
 
     def __init__(self, path: Path, meta: Any, files: Files) -> None:
         self.path, self.meta, self.files = path, meta, files
@@ -432,9 +432,9 @@ class Harmonics:
         refine: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Fit a small palette to SH [N, c], for training; a model with its `values` is written without loss.
+        """Fit a small palette to SH coefficients, [N, c].  After training with its `values`, saving loses nothing.
 
-        weights: weights of errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
+        weights: of the squared errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
         step: multiple to which codebook values are rounded if at most 256 of them remain.
         """
         vectors, labels = palette(rest, _training_entries(len(rest), quality), weights)

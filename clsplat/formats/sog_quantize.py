@@ -45,7 +45,7 @@ def round_means(
 
 
 def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in SOG levels, [N, 3], and the smallest logarithm and the size of a level per axis, [3] each."""
+    """Quantize positions: return levels, [N, 3], and for each axis the smallest logarithm and the level's size, [3]."""
     positions = means.astype(np.float64)
     logarithms = np.sign(positions) * np.log1p(np.abs(positions))
     low, span = logarithms.min(axis=0), np.ptp(logarithms, axis=0)
@@ -175,8 +175,8 @@ def tree_palette(
 ) -> tuple[NDArray[np.float64], Labels]:
     """Return a palette of at most `entries` vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].
 
-    log_weights: [N], from `log_weights`.  median_step: median rounding step of vectors, in levels of 1 / SH_LEVELS, for
-    SH of typical size.
+    log_weights: [N], from `log_weights`.  median_step: median rounding step of the vectors, in levels of
+    1 / SH_LEVELS, for coefficients of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _split_clusters(_to_euclidean(rest, form), weights, entries)

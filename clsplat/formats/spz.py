@@ -374,7 +374,7 @@ def _gzip(data: bytes) -> bytes:
 
 
 def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
-    """Decode the header, parameters, and declared axes of versions 1 to 3, with or without gzip."""
+    """Decode the header, parameters, and declared axes of a file of version 1 to 3, compressed with gzip or not."""
     stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
     start = stream.read(HEADER)
     if start[:3] == b"ply":

@@ -85,7 +85,7 @@ def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
 
 
 def lod_files(path: Path) -> list[Path]:
-    """Return a lod-meta.json and all files of its levels."""
+    """Return the paths of a lod-meta.json and of all files of its levels."""
     meta = _meta(path)
     names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
     metas = [path.parent / _check_name(path, name) for name in names]

@@ -202,7 +202,7 @@ def detect(path: Path) -> Codec | None:
 
 
 def format_of_name(path: Path) -> Codec | None:
-    """Return the format of a file name, or None; the longest matching ending wins."""
+    """Return the format with the longest ending that matches a file name, or None."""
     name = path.name.lower()
     pairs = [(end, codec) for codec in CODECS for end in codec.endings]
     matching = [(end, codec) for end, codec in pairs if name == end or (end.startswith(".") and name.endswith(end))]

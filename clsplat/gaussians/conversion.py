@@ -92,7 +92,7 @@ class Changes:
     world: bool = False  # write world coordinates instead of an origin
 
     def apply(self, model: Model) -> Model:
-        """Return the changed model.  Raises DataError if no Gaussian is left, ConfigError for an extreme transform."""
+        """Return the converted model.  Raises DataError if no Gaussian remains, ConfigError for extreme transforms."""
         model = model if self.time is None else _extract_frame(model, self.time)
         result = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:

@@ -128,7 +128,7 @@ class Gaussians:
         self.tables[name] = Table(array, components, zero_fresh)
 
     def move_to_host(self) -> None:
-        """Move the SH bands above 0 and their moments to host memory; the device stores only those that a view sees."""
+        """Move the SH bands above 0 and their moments to the host; the device stores only those visible in a view."""
         if self.on_host:
             return
         harmonics = {name: self.get(name) for name in HARMONICS if name in self.tables}

@@ -41,7 +41,7 @@ class Struct(Protocol):
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The names of the tables that training changes."""
+        """The names of the trained tables."""
 
     @property
     def on_host(self) -> Any:

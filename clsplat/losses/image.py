@@ -91,7 +91,7 @@ def psnr(comparison: Comparison) -> float:
 
 
 def view_error(comparison: Comparison) -> Array:
-    """Return the sum over pixels of |gradient (x - y)|, [1]: the error of the image, weighted like the losses."""
+    """Return the sum over pixels of |gradient * (x - y)|, [1]: the image error, weighted like the losses."""
     camera, workspace = comparison.camera, comparison.workspace
     rows, error = workspace.array("row_errors", (3, camera.rows)), workspace.array("view_error", 1)
     program = workspace.device.program("loss.cl")

@@ -63,7 +63,7 @@ class Clone(Grow):
 
 
 class SplitLarge(Grow):
-    """Replace large Gaussians whose statistic is large by smaller ones at positions sampled from the Gaussian."""
+    """Replace each large Gaussian that has a large statistic with smaller ones at positions sampled from it."""
 
     type: Literal["split"] = "split"
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})

@@ -19,7 +19,7 @@ class CloneDense(Rule):
 
     A grid of `cells`³ covers the central 98 % of the means.  The rule acts only in the `extremes` fullest cells, if
     they have at least `ratio_above` times as many Gaussians with large gradients as the `extremes` emptiest cells.
-    List it before `clone`, which then copies the other Gaussians.
+    List this rule before `clone`, which then copies the other Gaussians.
     """
 
     type: Literal["clone_dense"] = "clone_dense"

@@ -31,7 +31,7 @@ def edge_map(render: RenderedView) -> Floats:
 
 
 def edge_scores(survey: Survey, views: int) -> Floats:
-    """Return blend weights of Gaussians times the edges of the photographs, summed over pixels and views, [N]."""
+    """Return each Gaussian's blend weight times the photograph's edges, summed over pixels and views, [N]."""
     sampled_views, total = survey.sample_views(views), np.zeros(survey.count)
     for render in survey.render(sampled_views):
         total += render.sum(TEXTURE, edge_map(render))

@@ -143,7 +143,7 @@ Floats = NDArray[np.float64]
 
 
 class PruneUnimportant(Rule):
-    """Remove the fraction of Gaussians with the smallest opacity times geometric mean scale."""
+    """Remove the fraction of Gaussians with the smallest product of opacity and geometric mean scale."""
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
     grows: ClassVar[bool] = False

@@ -10,9 +10,9 @@ from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
 
 
 class OpacityPressure(Penalty):
-    """Mean of max(l - `floor`, 0) over the logits l of the opacities, which pulls all of them down equally.
+    """Mean of max(l - `floor`, 0) over the opacity logits l, which lowers all of them equally.
 
-    Only Gaussians that the images need stay opaque; `prune_faint` removes the others.
+    Only Gaussians that the image loss needs stay opaque; `prune_faint` removes the others.
     """
 
     type: Literal["opacity_pressure"] = "opacity_pressure"

@@ -79,7 +79,7 @@ class Lpips:
         _tested_networks.add((self.digest, height, width))
 
     def origin(self) -> dict[str, str]:
-        """Return the input range and the network, by key of metrics.json.  Values are only comparable if both agree."""
+        """Return the input range and the network, by key of metrics.json.  Compare values only if both are equal."""
         return {"lpips_input": self.inputs, "lpips_model": f"{self.path.name} sha256:{self.digest[:16]}"}
 
     def _planes(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -45,7 +45,7 @@ class ImageSums:
         self.total, self.squares = self.total + values, self.squares + values * values
 
     def deviation(self) -> NDArray[np.float64]:
-        """Return the standard deviation over timestamps, [H, W, 3], in 8-bit levels."""
+        """Return the standard deviation of each pixel over the timestamps, [H, W, 3], in 8-bit levels."""
         mean = self.total / self.count
         return np.asarray(np.sqrt(np.maximum(self.squares / self.count - mean * mean, 0)))
 

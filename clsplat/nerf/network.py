@@ -53,7 +53,7 @@ class Network:
         return self._table("direction", tiles, rows), self.shape.width
 
     def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
-        """Return raw colors and raw densities for the encodings in the tables, each [tiles, COLOR_ROWS, SAMPLES].
+        """Return raw colors and raw densities, each [tiles, COLOR_ROWS, SAMPLES], for the encodings in the tables.
 
         They are valid until the next call.
         """
@@ -318,7 +318,7 @@ class Encoding:
         )
 
     def _locate(self, samples: Samples) -> None:
-        """Write the positions of samples in the grid's cube."""
+        """Write the positions of samples relative to the grid's cube."""
         grid = self.shape.grid
         assert grid is not None
         x, y, z = grid.corner

@@ -189,7 +189,7 @@ class FieldShape(Settings):
 
     @property
     def direction_rows(self) -> int:
-        """Number of rows of the encoded direction."""
+        """The number of rows of the encoded direction."""
         return round_to_blocks(3 + 6 * self.direction_degrees)
 
     @property

@@ -40,7 +40,7 @@ class RayPhotograph:
 
 @dataclass(frozen=True)
 class AdamStep:
-    """The settings of an update by Adam."""
+    """The settings of an Adam update."""
 
     rate: float
     epsilon: float = 1e-8  # added to the root of the second moment; the default of Adam's paper, also in Mip-NeRF
@@ -94,7 +94,7 @@ class LearnedField(TrainedField):
 
     @property
     def painter(self) -> Field:
-        """The field, which renders its views."""
+        """The renderer, which is the field itself."""
         return self.field
 
     @property

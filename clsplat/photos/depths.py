@@ -39,7 +39,7 @@ def _png_names(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """A folder of depth maps.  The map of the photograph `b/a.jpg` is `b/a.png`, with 8 or 16 bits and of any size."""
+    """A folder of depth maps.  The map of the photograph `b/a.jpg` is `b/a.png`, with 8 or 16 bits and any size."""
 
     folder: Path
     _files: dict[str, Path] = field(default_factory=dict, compare=False)

@@ -55,9 +55,10 @@ class Spectrum:
 
 
 def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
-    """Return the knots of a schedule: steps, and downscale factors that fall from at most `largest` to 1 at `until`.
+    """Return the steps and the downscale factors of a schedule, which fall from at most `largest` to 1 at `until`.
 
-    Equal increments of the amplitudes take fewer and fewer steps.  If there is no detail to gain, the factor is 1.
+    Each increment of the amplitudes takes fewer steps than the previous one.  If there is no detail to gain, the
+    factor is always 1.
     """
     first = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
     mean = Spectrum(np.mean([spectrum.cumulative for spectrum in spectra], axis=0))

@@ -41,7 +41,7 @@ class SkyEvidence:
 
     @property
     def sky_fraction(self) -> float:
-        """The fraction of sky among the unmasked pixels of the upper third; 0 if too much is below the horizon."""
+        """The fraction of sky pixels in the unmasked upper third; 0 if too many sky pixels look below the horizon."""
         if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < MIN_SKYWARD:
             return 0.0
         rows = slice(max(1, round(len(self.mask) * UPPER)))

@@ -15,7 +15,7 @@ from clsplat.stages.optimize import Optimize
 
 
 class Decision(Settings):
-    """A setting that follows from the photos."""
+    """A setting that was chosen from the photos."""
 
     key: str
     """Key of the setting, as in `--set`, in the model or a stage."""

@@ -81,7 +81,7 @@ class LocalExecution(Settings):
         return self
 
     def _unused_keys(self) -> dict[str, str]:
-        """Return the keys that have no effect, each with the reason."""
+        """Return the keys that have no effect, each with a reason."""
         unused = {} if self.has_store else dict.fromkeys(STORE_KEYS, "it needs a store")
         return unused if self.engine == "local" else unused | {"packing": "it applies only to engine local"}
 

@@ -86,7 +86,7 @@ class SceneSettings(Settings):
 
     @property
     def split(self) -> Split:
-        """The views for training, validation, and testing."""
+        """The rules that assign views to training, validation, and testing."""
         lists = None if self.path is None else Path(self.path)
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
@@ -189,7 +189,7 @@ class PipelineFile(Settings):
     def harmonics(self) -> Harmonics:
         """Where spherical harmonics are stored.
 
-        `auto` becomes `device` if a stage needs them there, or at degree 0.
+        `auto` becomes `device` at degree 0, or if a stage needs them on the device.
         """
         harmonics = self.rasterizer.harmonics
         is_needed = any(ON_HOST in settings.active_conflicts() for _, settings in iter_settings(self.stages))

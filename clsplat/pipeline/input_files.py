@@ -86,7 +86,7 @@ def _cached_sha256(file: Path, inode: int, size: int, time: int) -> str:
 
 
 def _map_paths(pipeline: Pipeline, change: Change, scene: str | None) -> Pipeline:
-    """Return the pipeline with its input paths mapped by `change`, and with `scene` as its scene folder."""
+    """Return the pipeline with `change` applied to its input paths, and with `scene` as its scene folder."""
     settings = pipeline.settings
     without_scene = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
     new_settings = _map_value(without_scene, settings.scene.path, change)

@@ -48,7 +48,7 @@ class Pipeline:
 
     @property
     def decisions(self) -> list[Decision]:
-        """The decisions that follow from the photos."""
+        """The settings that were chosen from the photos."""
         return (self.settings.adapt and self.settings.adapt.decisions) or []
 
     @property
@@ -58,7 +58,7 @@ class Pipeline:
 
     @property
     def undecided(self) -> list[str]:
-        """The keys whose values will be decided from the photos."""
+        """The keys whose values will be chosen from the photos."""
         if (adapt := self.settings.adapt) is None or adapt.decisions is not None:
             return []
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]

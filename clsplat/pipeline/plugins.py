@@ -79,10 +79,10 @@ def loaded_plugins() -> list[Plugin]:
 
 
 def used_by(kinds: Collection[type]) -> dict[str, str]:
-    """Return the names and content hashes of the plug-ins that a run with settings of these classes uses.
+    """Return the names and content hashes of the plug-ins that a run may use, given the classes of its settings.
 
-    These are all plug-ins from files, and the installed plug-ins that define one of the classes, one of their bases, or
-    a reader, because a run may be checked before its scene is known.
+    These are all plug-ins from files, and the installed plug-ins that define one of the classes or of their bases.
+    Plug-ins with a reader are included, because a run may be checked before its scene is known.
     """
     bases = {base for kind in kinds for base in kind.__mro__}
     return {

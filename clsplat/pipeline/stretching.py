@@ -54,7 +54,7 @@ class Axis:
         return int(interval) if interval.denominator == 1 else float(interval)
 
     def scale_start(self, start: int, every: float) -> int:
-        """Return the stretched `start`, which excludes and includes the same actions as before."""
+        """Return the stretched `start`.  It excludes the same actions as before."""
         number = count_fired(every, start)
         return max(
             0, min(max(self.scale(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
@@ -168,7 +168,7 @@ def _stretch(value: Any, axis: Axis) -> Any:
 
 
 def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
-    """Return a stretched step; the start or stop of actions with interval `every` stays between the same actions."""
+    """Stretch the step number of a setting.  A start or stop stays between the same two multiples of `every`."""
     if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":

@@ -56,7 +56,7 @@ class PlannedStep:
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
-    """Plan the steps for the photographs in `source`: the folder of each result below `root`, and the reason to run it.
+    """Plan the steps for the photographs in `source`: each step's folder below `root`, and any reason to run it.
 
     Raises DataError when the photographs cannot be read.
     """

@@ -57,7 +57,7 @@ class MatchGraph:
         return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
 
     def measure_sharpness(self, name: str) -> NDArray[np.float64]:
-        """Return both sharpness values of a photograph, [2], which are measured once and cached."""
+        """Return both sharpness values of a photograph, [2], from the cache if possible."""
         if name not in self.sharpness:
             self.sharpness[name] = measure_sharpness(self.images / name)
         return self.sharpness[name]

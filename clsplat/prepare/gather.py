@@ -87,7 +87,7 @@ def require_photographs(folder: Path, excluded_folder: Path | None = None) -> No
 
 
 def _conversion_hints(unreadable_names: list[str]) -> list[str]:
-    """Return a sentence for each format that cannot be read, with a command to convert its files."""
+    """For each format that cannot be read, return a sentence with a command that converts its files."""
     hints = []
     for kind, (suffixes, command) in CONVERTERS.items():
         if names := [name for name in unreadable_names if Path(name).suffix.lower() in suffixes]:
@@ -114,8 +114,8 @@ def _photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str],
 def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str], dict[str, str]]:
     """Link photographs into the folder `images`, or copy them upright; keep files that an interrupted call left there.
 
-    Returns the names of the readable photographs, and the others by name, with the reason why they cannot be read.
-    Raises DataError when too few can be read, or when all are blank.
+    Returns the names of the readable photographs, and a dict from the names of the others to the reasons.  Raises
+    DataError when too few can be read, or when all are blank.
     """
     readable_names, read_errors, count = [], dict[str, str](), Count("photographs read", len(names))
     blank_count = 0
@@ -215,7 +215,7 @@ def _is_gathered(source: Path, target: Path) -> bool:
 
 
 def log_warnings(figures: Mapping[str, Any]) -> None:
-    """Log the warnings about photographs that a step left out.  figures: the result of the step."""
+    """Log a warning for photographs that a step omitted.  figures: the result of the step."""
     for warning in warnings_for(figures):
         LOG.warning("%s", warning)
 

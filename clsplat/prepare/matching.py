@@ -122,7 +122,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         matched_count = db.num_matched_image_pairs()
     if not new_pairs:
         return
-    LOG.info("matching %s of photographs that are not placed yet", pluralize(len(new_pairs), "more pair"))
+    LOG.info("matching %s of photographs without a camera", pluralize(len(new_pairs), "more pair"))
     with raising_data_error(database, "match photographs"), _count_pairs(database, matched_count + len(new_pairs)):
         _match_pairs(database, new_pairs, _options(pycolmap, threads))
 

@@ -94,7 +94,7 @@ def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
 
 
 def _homography(first: Floats, second: Floats, pixel: float) -> Floats | None:
-    """Return the homography, [3, 3], that explains nearly all matches of a pair.  None if there is none."""
+    """Return the homography, [3, 3], that explains nearly all matches of a pair, or None if there is none."""
     matrix, inliers = cv2.findHomography(first, second, cv2.RANSAC, MAX_RESIDUAL * pixel)
     if matrix is None or inliers.mean() < MIN_EXPLAINED:
         return None

@@ -56,7 +56,7 @@ class Step(Settings):
         """
 
     def summary(self, figures: dict[str, Any]) -> str:
-        """Return a log line about the figures that `make` returned."""
+        """Return a log line that summarizes the figures returned by `make`."""
         return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:

@@ -76,7 +76,7 @@ def resolve_sort(device: Device, sort: Sort) -> Sort:
 
 
 class Tiler:
-    """Builds tile lists.  sort: `auto` is radix on CPUs, and on GPUs the sort that is faster in the first frame."""
+    """Builds tile lists.  sort: `auto` is `radix` on CPUs; on GPUs, the first frame measures which sort is faster."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace

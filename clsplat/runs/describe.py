@@ -92,13 +92,13 @@ def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures
 
 
 def check_unused(out: Path) -> None:
-    """Raise OutputError if a run is using `out`.  Log if a new run would first have to wait for a heartbeat."""
+    """Raise OutputError if a run is using `out`.  Log a line if a new run would have to wait for a heartbeat."""
     if not lock.check_free(out):
         LOG.info("%s: was in use on another machine; the run would wait up to a minute for its heartbeat", out)
 
 
 def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
-    """Return the memory plan in a list of one line; empty unless the spherical harmonics are offloaded to the host."""
+    """Return the memory plan as a list of one line; empty unless the spherical harmonics are offloaded to the host."""
     init_stage = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
     if init_stage is None:
         return []

@@ -148,7 +148,7 @@ def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, 
 
 
 def minutes_text(seconds: Sequence[float]) -> str:
-    """Format a minimum and a maximum time, s, as a range of minutes."""
+    """Format a minimum and a maximum time in seconds as a range of minutes."""
     minutes = [max(0.1, end / 60) for end in seconds]
     return _range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
 

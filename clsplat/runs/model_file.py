@@ -127,7 +127,7 @@ class ModelSource:
         return cls(file, folder, settings, name, settings.alpha)
 
     def scene(self, model: Model | FieldModel) -> Scene:
-        """Read the scene with the masks and alpha mode of the model's training, at full image size."""
+        """Read the scene at full image size, with the masks and alpha mode that the model was trained with."""
         masked = self.settings.apply_masks(read_scene(self.folder, self.settings.split))
         return masked.with_alpha(self.alpha or model.rendering.alpha)
 

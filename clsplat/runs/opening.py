@@ -211,10 +211,10 @@ def _placeholder_scene(pipeline: Pipeline, names: Sequence[str]) -> Scene:
 
 
 def undistorted_folder(out: Path) -> Path:
-    """Return the folder of undistorted photos: a subfolder of the run folder, or of the target of a link next to it.
+    """Return the folder of undistorted photos, in the run folder or in the target of a link next to the run folder.
 
-    A store creates the link so that its cells share the photos.  Each host uses a separate subfolder of its target,
-    because the names of temporary files are unique only within a host.
+    A sweep store creates the link so that its cells share the photos.  Each host uses a separate subfolder of the
+    target, because the names of temporary files are unique only within a host.
     """
     link = out.absolute().parent / UNDISTORTED
     store_folder = Path(*link.parts[:-4]) / UNDISTORTED  # a link to another folder is not from the store

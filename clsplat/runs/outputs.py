@@ -125,7 +125,7 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
 
 
 def _is_in_photo_folder(out: Path, scene: Path) -> bool:
-    """Return whether `out`, or a folder between it and the scene folder that contains it, has photos."""
+    """Return whether `out`, or a folder between `out` and the scene folder, contains photos."""
     folders_between = [path for path in (out, *out.parents) if scene.resolve() in path.parents and path.is_dir()]
     return any(is_image(file) for path in folders_between for file in path.iterdir())
 

@@ -136,7 +136,7 @@ class RunFolder:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the content of a run's pipeline.yaml, not validated.  Raises ConfigError if it is not a pipeline."""
+    """Return the unvalidated content of a run's pipeline.yaml.  Raises ConfigError if it is not a pipeline."""
     data = read_yaml(path / PIPELINE).data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
         raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")

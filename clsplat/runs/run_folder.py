@@ -170,7 +170,7 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunSta
 
 
 def choose_start(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:
-    """Return how a run starts in a folder; None if it is complete.  A finished run with missing files is resumed."""
+    """Return how a run starts in a folder, or None if it is complete.  A finished run with missing files resumes."""
     if start == "new" and is_up_to_date(pipeline, state):
         start = "resume"
     return None if start == "resume" and state.is_complete(pipeline) else start

@@ -212,8 +212,8 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
 def run_stages(pipeline: Pipeline, run: Run) -> None:
     """Run the stages from the current one to the last, and all of them again if a refit is due.
 
-    The index of the current stage advances only at stages that change the model, by training or editing it.  The
-    stages between two of them use the same model, so a resumed run repeats all of them.
+    The index of the current stage advances only at stages that train or edit the model.  The stages between two of
+    these use the same model, so a resumed run repeats all of them.
     """
     start_refit_if_due(run)
     for index, stage in enumerate(with_refit_steps(pipeline, run).stages):

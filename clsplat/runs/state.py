@@ -121,7 +121,7 @@ class RunState:
 
     @property
     def restart(self) -> str:
-        """The command that starts the run over, for messages."""
+        """The command that starts the run from the beginning, for messages."""
         pipeline = "…"
         with suppress(ConfigError):  # the pipeline is missing or damaged
             pipeline = shell_quote(self.pipeline.path)

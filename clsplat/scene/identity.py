@@ -147,7 +147,7 @@ class DecodedSizes:
         return self._entries[key][:2]
 
     def contents(self, digest: str) -> tuple[bool, bool, bool]:
-        """Return three flags of a cached image: it is blank, excludes every pixel as a mask, and is transparent."""
+        """Return three flags of a cached image: blank, excluding all pixels as a mask, and transparent."""
         bits = self._entries[digest][2]
         return bool(bits & 1), bool(bits & 2), bool(bits & 4)
 
@@ -199,7 +199,7 @@ class Identity:
 
     @property
     def digest(self) -> str:
-        """One hash of everything that affects the bits of a run, which the order of the test views does not."""
+        """The hash of everything that affects the bits of a run.  The order of the test views has no effect on it."""
         values = [list(self.train.items()), sorted(self.test.items()), self.points]
         values += [list(self.validation.items())] if self.validation else []
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -85,8 +85,8 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
         fault = f"contains no mask for the photographs of {scene.path}" if folder.is_dir() else "no such folder"
         names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))
         raise DataError(
-            f"{folder}: {fault}; expected {names} for the first of {count}, white in pixels "
-            "to use: rename the files, or set scene.masks to another folder"
+            f"{folder}: {fault}; expected {names} for the first of {count}, with usable pixels "
+            "white: rename the files, or set scene.masks to another folder"
         )
     if missing:
         masked = f"{count - len(missing)} of {pluralize(count, 'photograph')}"

@@ -104,7 +104,7 @@ def _neighbors(i: int, views: Sequence[View]) -> list[int]:
 def _best_planes(
     i: int, views: Sequence[View], images: Sequence[Floats], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
-    """Return the index of the best plane of each pixel, [H, W], by its difference to half of the adjacent views.
+    """Return the index of each pixel's best plane, [H, W], judged by the better half of the adjacent views.
 
     The index is 0 where no plane is clearly the best: in uniform areas, and where no adjacent view shows the surface.
     """

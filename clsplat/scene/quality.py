@@ -162,7 +162,7 @@ def has_visible_background(scene: Scene) -> bool:
 
 
 def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of a photograph are opaque and not masked, [H, W], or None when all are.
+    """Return a mask, [H, W], of the opaque, unmasked pixels of a photograph, or None if these are all pixels.
 
     Raises DataError when a file cannot be read.
     """

@@ -1,4 +1,4 @@
-"""Measure reprojection errors: how far points project from where photographs observe them."""
+"""Measure reprojection errors: distances between projected points and their observations in photographs."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

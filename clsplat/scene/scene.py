@@ -1,6 +1,6 @@
 """Represent a dataset on the host: cameras, views, points, and the split into training and test views.
 
-Conventions of the whole project
+Conventions of the project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
     pixels      pixel (0, 0) has its center at (0.5, 0.5)
     quaternions (w, x, y, z)
@@ -82,7 +82,7 @@ class PointCloud:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points followed by those of another cloud, with times if both clouds have them."""
+        """Return the points of this cloud and of another cloud, in this order, with times if both have them."""
         pairs = [(self.positions, other.positions), (self.colors, other.colors)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
         return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
@@ -317,9 +317,9 @@ def share_center(centers: Floats) -> bool:
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which cameras, [N], are outliers: more than MAX_DISTANCE times the median distance from the median center.
+    """Return a mask, [N], of the cameras farther than MAX_DISTANCE times the median distance from the median center.
 
-    If more than a fraction of MAX_OUTLIERS is so far away, the scene has several groups of cameras and no outliers.
+    If their fraction exceeds MAX_OUTLIERS, they are a separate group of cameras instead of outliers: the mask is empty.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

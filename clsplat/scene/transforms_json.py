@@ -374,7 +374,7 @@ class NerfstudioReader(Reader):
 
 
 def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
-    """Return the view names in the list `key` of a file, or None without that list.  Raises DataError.
+    """Return the view names in the list `key` of a file, or None if there is no such list.  Raises DataError.
 
     renamed: maps names in the file to the names of the views.
     """

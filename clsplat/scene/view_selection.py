@@ -181,7 +181,7 @@ def _path_suffixes(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, 
 
 
 def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
-    """Return the indices of each key."""
+    """Return a dict from each path suffix to the indices of the paths that end with it."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for parts, i in indexed:
         groups.setdefault(parts, []).append(i)
@@ -223,7 +223,7 @@ class Split:
 
     @property
     def reader_holdout(self) -> int:
-        """The `holdout` to pass to a reader, which uses it if the dataset has no split."""
+        """The `holdout` for a reader, which uses it only if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def apply(self, scene: Scene) -> Scene:
@@ -280,7 +280,7 @@ class Split:
                     excluded["train"] = [name for name in names if name not in valid_names]
 
     def _held_out_names(self, names: Sequence[str]) -> set[str]:
-        """Return the names that every n-th as `holdout` selects for testing, if all photographs get poses."""
+        """Return the names that `holdout` would select for testing if all photographs got poses."""
         every, offset = self.reader_holdout, 0
         if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset

@@ -175,7 +175,7 @@ def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
 def _cylindrical(
     offsets: NDArray[np.floating], up: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the angles of offsets, [V, 3], around the upward axis in radians, and distances from it, [V] each."""
+    """Return the angles of offsets, [V, 3], around the upward axis, [V] radians, and their distances from it, [V]."""
     forward = perpendicular(up)
     x, y = offsets @ forward, offsets @ np.cross(up, forward)
     return np.arctan2(y, x), np.hypot(x, y)

@@ -88,7 +88,7 @@ class Export(Scheduled):
 
 
 def sky_gaussians(run: Run) -> int:
-    """Return the number of Gaussians that show the sky in files that a run exports, in addition to the model's."""
+    """Return the number of Gaussians for the sky that exported files contain in addition to the model's Gaussians."""
     stages = run.pipeline["stages"]
     has_splats = any("export" in stage and stage["export"].get("sky") == "splats" for stage in stages)
     return COUNT if has_splats and run.gaussians is not None and run.model.sky else 0

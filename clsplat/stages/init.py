@@ -76,7 +76,7 @@ def sample_hull(run: Run, count: int) -> PointCloud | None:
     points = hull_points(_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
         remedy = "silhouettes need transparency around the object, and no masks; or use init: {source: sweep}"
-        LOG.warning("the visual hull gives only %d points; starting from random ones; %s", len(points), remedy)
+        LOG.warning("the visual hull has only %d points; starting from random ones; %s", len(points), remedy)
         return None
     return points
 
@@ -225,6 +225,6 @@ class Init(Stage):
         run.memory_plan(tables, offload_target(run.harmonics, run.device.info)).check(count, offload_advice(run))
 
     def _random(self, run: Run) -> PointCloud:
-        """Return random points.  Raises MemoryLimitError, before making any, if they would not fit."""
+        """Return random points.  Raises MemoryLimitError, before allocating any, if they would not fit."""
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)

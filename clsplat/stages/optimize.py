@@ -382,7 +382,7 @@ class Optimize(ValidatedTraining):
             run.edited = True
 
     def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewGradients:
-        """Do one step; a failure before its update leaves the run at the previous step."""
+        """Run one step.  A failure before its update leaves the run at the previous step."""
         run.step += 1
         run.stage_step += 1
         try:

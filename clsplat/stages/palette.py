@@ -136,7 +136,7 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
 
 @dataclass(frozen=True)
 class VisibleError:
-    """The visibility of errors of the harmonics in the training views; N Gaussians with K coefficients above band 0.
+    """How visible errors of the SH coefficients are in the training views; N Gaussians, K coefficients above band 0.
 
     A Gaussian is visible only from some directions.  With Y(d) the harmonics above band 0 in direction d, an error e of
     its coefficients changes its color there by Y(d) . e, and band 0 can absorb the mean m . e.  Summed over the views
@@ -151,7 +151,7 @@ class VisibleError:
     def from_views(
         cls, views: Iterable[tuple[RenderedView, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
     ) -> "VisibleError":
-        """Return the sums over views, each with the center of its camera, [3].  means: [N, 3] scene units."""
+        """Accumulate A over `views`, pairs of a render and a camera center, [3].  means: [N, 3] scene units."""
         i, j = np.triu_indices(coefficients)
         weights, first = np.zeros(len(means)), np.zeros((coefficients, len(means)))
         second = np.zeros((len(i), len(means)))
@@ -237,7 +237,7 @@ def _append_products(vectors: Floats) -> NDArray[np.float32]:
 
 
 def visible_error(run: Run) -> VisibleError:
-    """Measure the visibility of errors of the harmonics in the training views."""
+    """Measure how visible errors of the SH coefficients are in the training views."""
     views, gaussians = run.scene.split("train"), run.model.gaussians
     renders = run.survey().render(run.status.counted(views, "views", len(views)))
     positions = (view.position for view in views)

@@ -138,7 +138,7 @@ class ReduceSh(Scheduled):
 
 
 def compute_band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the mean square over the sphere of each band above 0, [N, degree], of coefficients [N, (K-1)*3].
+    """Return the mean square of each band above 0 over the sphere, [N, degree].  Coefficients are [N, (K-1)*3].
 
     The basis is orthonormal: the mean square of a function is the sum of its squared coefficients divided by 4 pi.
     """
@@ -153,6 +153,6 @@ def expand_bands(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _bands(columns: int) -> list[tuple[int, int]]:
-    """Return the first column and the end column of each band above 0.  columns: the number of columns."""
+    """Return the column range, (first, end), of each band above 0 in a table of SH with `columns` columns."""
     ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
     return [(first, end) for first, end in pairwise(ends) if end <= columns]

@@ -1,4 +1,4 @@
-"""Change the model at a cadence: SH degree, opacities, the filter, and averages of the parameters."""
+"""Change the model periodically: SH degree, opacities, the filter, and averages of the parameters."""
 
 import logging
 from collections.abc import Collection

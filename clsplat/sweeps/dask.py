@@ -190,7 +190,7 @@ class Cluster:
     def slots(self) -> list[DeviceSlot]:
         """Return the devices of live workers.
 
-        Raises DeviceError if the scheduler has ended, or if there has been no worker of this version for a minute.
+        Raises DeviceError if the scheduler has exited, or if there has been no worker of this version for a minute.
         """
         now = time.monotonic()
         if now - self._last_check >= WORKERS_INTERVAL_S or (not self._slots and now - self._last_check >= 0.5):

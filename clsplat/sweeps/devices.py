@@ -1,4 +1,4 @@
-"""Find devices and their bits classes: a class is the hash of the result of a fixed run.
+"""Find devices and their bits classes.  A class is the hash of the results of a fixed run.
 
 The name of a device is not enough, because different runtimes may compute the same bits, and the same runtime may
 compute different bits on another processor.  Devices of the same class can continue each other's cells.

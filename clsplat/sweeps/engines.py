@@ -78,13 +78,13 @@ class PendingCell:
     too_small: int = 0  # memory of the largest device whose memory was insufficient, bytes
 
     def in_class(self, bits: str) -> CellRun:
-        """Return the cell with a bits class."""
+        """Return a copy of the cell for devices of a bits class."""
         return replace(self.cell, spec={**self.cell.spec, "bits": bits})
 
 
 @dataclass
 class Dispatcher:
-    """A loop that assigns cells to devices until all cells have ended."""
+    """A loop that assigns cells to devices until all cells have finished."""
 
     store: Store
     engine: Engine
@@ -162,7 +162,8 @@ class Dispatcher:
     def _fits(self, pending: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
         """Return whether a cell may run on a device.
 
-        The device must be in its bits class, and if possible larger than devices whose memory was insufficient.
+        The device must be in the cell's bits class.  If possible, it has more memory than devices on which the cell
+        ran out of memory.
         """
         allowed = self._allowed_slots(pending, slots)
         return slot in ([candidate for candidate in allowed if candidate.memory > pending.too_small] or allowed)

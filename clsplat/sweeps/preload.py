@@ -1,4 +1,4 @@
-"""Make worker processes ignore Ctrl-C, because the driver handles it: it lets the cells save their state and stop."""
+"""Make worker processes ignore Ctrl-C: the driver handles it, and lets the cells save their state before they stop."""
 
 import signal
 

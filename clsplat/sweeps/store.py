@@ -291,7 +291,7 @@ class CellFolder:
         return self.path.name
 
     def write_spec(self, spec: Mapping[str, Any]) -> None:
-        """Write spec.json, the values whose hash is the key, if it is missing or damaged.
+        """Write spec.json, whose hash is the cell's key, if it is missing or damaged.
 
         Raises OutputError if the file has other values.
         """

@@ -73,7 +73,7 @@ class Rates(Settings):
         return self.model_copy(update={**scaled, "motion": self.motion.times(factor)})
 
     def resolve(self, full_size: int) -> "Rates":
-        """Return rates that depend only on the step.  full_size: first global step with full-size photographs."""
+        """Return rates that depend only on the step.  full_size: the first global step with full-size photographs."""
         if not isinstance(self.means, FullSizeDecay):
             return self
         return self.model_copy(update={"means": self.means.from_step(full_size)})
@@ -223,7 +223,7 @@ class Adam:
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
     def _record_sh(self, deferred: DeferredUpdates | None, frame: Frame, rate: float, correction2: float) -> None:
-        """Record that the visible rows have received this update of `sh_rest`."""
+        """Record this update of `sh_rest`, and start the download of offloaded harmonics."""
         if deferred:
             deferred.record(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:

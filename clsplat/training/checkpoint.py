@@ -380,7 +380,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
 
 
 def rename_damaged(out: Path, restored: Path | None) -> None:
-    """Rename the damaged checkpoints that follow the restored one, so that `save` does not count them."""
+    """Rename damaged checkpoints that are newer than the restored one, so that `save` does not count them."""
     files = list_files(out)
     for damaged_file in files[files.index(restored) + 1 :] if restored else ():
         try:

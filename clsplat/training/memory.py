@@ -108,7 +108,7 @@ def module_bytes(stages: Iterable[Any], views: Sequence[View], tile: int) -> int
 
 
 def table_widths(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the number of components of each parameter and moment.  motion: number of its columns."""
+    """Return the number of components of each parameter and moment.  motion: number of columns of the motion."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}

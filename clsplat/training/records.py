@@ -196,7 +196,7 @@ def moving_average(psnrs: Sequence[float]) -> list[float]:
 
 
 class Forecast:
-    """Estimator of the remaining training time.  Training ends at step `last_step`, and growth at `growth_end`."""
+    """Estimates the remaining training time.  Training ends at step `last_step`, growth at `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end
@@ -221,7 +221,7 @@ class Forecast:
 
     @property
     def growth_known(self) -> bool:
-        """Whether the rate of growth is known; if not, the remaining time is a lower bound."""
+        """Whether the growth rate is known.  If not, the remaining time is a lower bound."""
         step, count, _ = self._reports[-1]
         return step >= self.growth_end or count > self._reports[0][1]
 

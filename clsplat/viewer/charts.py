@@ -34,7 +34,7 @@ def curve(
 ) -> str:
     """Return a line chart as SVG, or "" if all points have the same x or the same y.
 
-    logarithmic: use a logarithmic y axis, without values that are not positive.  ticks: labels by x; default: numbers.
+    logarithmic: use a logarithmic y axis, and omit values that are not positive.  ticks: labels by x; default: numbers.
     """
     axis_lines = [_to_axes(line, logarithmic) for line in lines]
     axis_lines = [line for line in axis_lines if line.points]

@@ -21,7 +21,7 @@ from clsplat.viewer.packing import Packed
 
 
 def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
-    """Return the initial viewpoint of a page, as main.js reads it."""
+    """Return the initial viewpoint of a page in the format of main.js."""
     return {
         "pivot": float32_digits(viewpoint.pivot),
         "up": float32_digits(viewpoint.up),
@@ -32,7 +32,7 @@ def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
 
 
 def camera_data(view: View) -> dict[str, Any]:
-    """Return a view's pose, row-major, and its intrinsics, as camera.js reads them."""
+    """Return a view's row-major pose and its intrinsics in the format of camera.js."""
     c = view.camera
     time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
@@ -40,7 +40,7 @@ def camera_data(view: View) -> dict[str, Any]:
 
 
 def float32_digits(values: NDArray[np.floating]) -> list[float]:
-    """Return values rounded to nine significant digits, which identify a float32."""
+    """Round values to nine significant digits, which are enough to identify a float32."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
 
@@ -154,7 +154,7 @@ def script() -> str:
 
 
 def join_scripts(names: Sequence[str], sources: Sequence[str] = ()) -> str:
-    """Join scripts of this folder, by name, and the sources of other scripts into one JavaScript function."""
+    """Join named scripts of this folder and the sources of other scripts into one JavaScript function."""
     parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *sources]
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
 
@@ -201,6 +201,6 @@ def view_entries(
 
 
 def omitted_indices(sizes: list[int], budget: int) -> set[int]:
-    """Return the indices to omit: every n-th stays, for the smallest n that keeps the sum of sizes within `budget`."""
+    """Return the indices to omit.  Every n-th item stays, with the smallest n whose total size is within `budget`."""
     interval = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
     return {i for i in range(len(sizes)) if interval > len(sizes) or i % interval}

@@ -17,7 +17,7 @@ RECORD, COARSE, MERGED, MANIFEST = "blocks.json", "coarse", "merged", "partition
 
 
 def block_name(number: int) -> str:
-    """Return the name of a block's folder and of its initial model."""
+    """Return the name that a block's folder and its initial model have."""
     return f"block_{number:02d}"
 
 

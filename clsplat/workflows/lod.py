@@ -129,7 +129,7 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
 
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
-    """Return disjoint pairs of rows, cheapest first; at least one pair if there are two rows."""
+    """Return disjoint pairs of rows, the cheapest first.  There is at least one pair if there are two rows."""
     first, second = _neighbors(tables["means"])
     cost = pair_cost(tables, first, second)
     order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
@@ -254,7 +254,7 @@ def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> 
         if plan.steps != 0:
             raise DataError(f"{photo_error} (give --scene DIR, or --steps 0 to merge without photos)") from error
         gaussians = _without_photos(model, plan, device, "its photos cannot be read")
-        LOG.warning("%s; levels are merged without training and not measured", photo_error)
+        LOG.warning("%s; levels are merged without training, and are not measured", photo_error)
         return None, gaussians
     return photo_model, photo_model.gaussians.baked()
 

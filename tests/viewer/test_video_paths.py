@@ -94,7 +94,7 @@ def test_outward_facing_cameras_have_no_orbit(rng):
         View.looking_at(view.position, 3 * view.position * (1, 1, 0.2), UP, CAMERA, view.name)
         for view in ring(np.linspace(0, 2 * np.pi, 12, endpoint=False), radius=0.5)
     ]
-    with pytest.raises(DataError, match="use the path through"):
+    with pytest.raises(DataError, match="use the path `through`"):
         PATHS["ellipse"](rig_of(views), 4, SIZE)
     assert len(PATHS["through"](rig_of(views, rng), 7, SIZE)) == 7
 

@@ -141,7 +141,7 @@ def test_zero_steps_need_no_photographs(there, moved, tmp_path, caplog):
         (tmp_path / "gone").mkdir()
     result = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
     assert (len(result["levels"]), result["split"]) == (2, None)
-    assert "levels are merged without training and not measured" in caplog.text
+    assert "levels are merged without training, and are not measured" in caplog.text
 
 
 def test_device_is_refused_if_the_photographs_have_moved(moved, tmp_path):

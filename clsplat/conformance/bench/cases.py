@@ -213,7 +213,7 @@ class BenchCase:
         self.densify_times.append(1e3 * (time.perf_counter() - start))
 
     def result(self, peaks: Peaks) -> BenchResult:
-        """Return the medians of all times, with the floors for `peaks`."""
+        """Return the medians of all times, and the shortest possible times at the peak rates `peaks`."""
         work = self._measure_work()
         stages = {name: statistics.median(times) for name, times in self.stages.items()}
         step = statistics.median(self.step_times)
@@ -305,6 +305,6 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
 
 
 def with_near(settings: PipelineFile, near: float) -> PipelineFile:
-    """Return the settings with `near`, in scene units, as the near plane if theirs is `auto`."""
+    """Return the settings with `auto` for the near plane replaced by `near`, in scene units."""
     model = settings.model.model_copy(update={"near": near})
     return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

@@ -1,4 +1,4 @@
-"""Check bilateral grids, color matrices and camera responses: images, their gradients, and updates of tables."""
+"""Check bilateral grids, color matrices and camera responses: images, gradients, and updates of the tables."""
 
 from dataclasses import replace
 from typing import Any

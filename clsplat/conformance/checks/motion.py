@@ -23,7 +23,7 @@ EXTENT = 2.0
 
 
 def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
-    """Return a case of moving Gaussians, of which a tenth is absent at TIME, and a tenth is always present."""
+    """Return a case of moving Gaussians: a tenth is absent at TIME, and another tenth is always present."""
     case, fields = random_case(rng, count), motion_fields(width)
     motion = rng.normal(0, 0.3, (count, width))
     center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)

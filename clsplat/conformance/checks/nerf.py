@@ -1,4 +1,4 @@
-"""Check NeRF fields: cones of pixels, samples, encodings, the network, composited colors, and updates."""
+"""Check NeRF fields: pixel cones, samples, encodings, the network, composited colors, and updates."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -132,7 +132,7 @@ def read_rows(table: Array, first: int, count: int) -> NDArray[Any]:
 
 @CHECKS.add("draw_pixels", "cast_rays", "spread_edges", "resample_edges")
 def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
-    """Compare pixels, rays, and the edges of samples, random and evenly spaced."""
+    """Compare pixels, rays, and the edges of samples, both random and evenly spaced."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, Draw(7, 11, 5))
         pixels = ref.draw_pixels(WIDTH * HEIGHT, count, 5, 7, 11)

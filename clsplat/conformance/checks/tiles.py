@@ -39,7 +39,7 @@ def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
 
 
 def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
-    """Compare a sort of the pairs in tiles, by depth key and then by index.
+    """Compare a sort of each tile's pairs, by depth key and then by index.
 
     lengths: number of pairs in each tile; max_key: bound on the depth keys, exclusive.
     """
@@ -154,7 +154,7 @@ UNTOUCHED = 0xDEADBEEF
 
 
 def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Return a case of Gaussians as large as half of the image's longer side, every third only a tenth of it.
+    """Return a case of Gaussians half as large as the image's longer side; every third is ten times smaller.
 
     columns, rows: size of the image, in tiles.
     """
@@ -180,7 +180,7 @@ def check_large(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_wrong_counts(device: Device, case: Case) -> Results:
-    """Check that each splat lists as many tiles as its count says, each at most once, even if the count is wrong."""
+    """Check that each splat lists `count` distinct tiles, even if its count is wrong."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     gaussian_count, camera = len(case.parameters["means"]), frame.camera

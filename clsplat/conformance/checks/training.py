@@ -351,7 +351,7 @@ def check_dropout(device: Device, case: Case, rng: np.random.Generator, label: s
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Results:
-    """Hide some Gaussians in a view, and drop others; check that neither have records."""
+    """Hide some Gaussians in a view, and drop others; check that none of them has records."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     hidden_masks = rng.random((2, count)) < 0.5
     hide(model.gaussians, hidden_masks)

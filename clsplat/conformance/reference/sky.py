@@ -64,7 +64,7 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
 def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
     """Return a mask, [H, W], of pixels with at least 6 pixels of sky in their 3 x 3 neighborhood.
 
-    sky, photograph: [3, H, W]; difference: largest mean absolute color difference of a pixel of sky.
+    sky, photograph: [3, H, W]; difference: the largest mean absolute difference, over channels, of a sky pixel.
     """
     matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
     height, width = photograph.shape[1:]

@@ -135,8 +135,8 @@ def adc_actions(
 ) -> NDArray[Any]:
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
-    Pruning is last, and applies to the new rows: copies and children have the opacity of their parent, and children its
-    scale / 1.6.  split_gradient: the statistic for splits if it is another, such as the absolute gradient.
+    Pruning is last, and applies to the new rows: copies and children have their parent's opacity, and children its
+    scale / 1.6.  split_gradient: the statistic for splits, if it differs, such as the absolute gradient.
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []

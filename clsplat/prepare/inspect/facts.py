@@ -86,7 +86,7 @@ def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
 def compare_photos(
     files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None
 ) -> ComparisonFacts:
-    """Compare photographs in order of their names.  exposures: by name, or None to read them from EXIF."""
+    """Compare consecutive photographs, sorted by name.  exposures: by name, or None to read them from EXIF."""
     names = sorted(files)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "comparing") as pool:
         results = counted(pool.map(_measure_photo, (files[name] for name in names)), "photographs compared", len(names))
@@ -255,7 +255,7 @@ class PhotographFacts:
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """Facts from the headers of photographs without cameras.  Values are numbers of photographs."""
+    """Facts from the headers of photographs without cameras.  Each value is a number of photographs."""
 
     sizes: dict[str, int]  # by size as stored
     cameras: dict[str, int]  # by make, model and focal length in EXIF
@@ -383,7 +383,7 @@ def _pose(view: View, extent: float | None) -> tuple[float, ...]:
 
 
 def _equal_groups(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
-    """Return groups of two or more names with equal keys."""
+    """Return the groups of two or more names that have the same key."""
     groups = defaultdict(list)
     for name, key in zip(names, keys, strict=True):
         groups[key].append(name)

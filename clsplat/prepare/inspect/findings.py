@@ -380,7 +380,7 @@ def summarize(facts: Facts) -> dict[str, str]:
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """Return keys as text, each with its count if there are several keys."""
+    """Format the keys as a list, each followed by its count if there are several keys."""
     return _join([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
 
 

@@ -82,7 +82,7 @@ class Live:
             self._release()
 
     def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """Return a function that calls `show` with each progress report, and also shows the report on the page."""
+        """Return a function that shows each progress report on the page and passes it to `show`."""
 
         def show_both(progress: Progress) -> None:
             show(progress)

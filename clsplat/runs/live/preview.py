@@ -160,7 +160,7 @@ class Preview:
         return next((side for side in SIDES if self._estimate(side) <= TARGET_TIMES[pace]), SIDES[-1])
 
     def _estimate(self, side: int) -> float:
-        """Return the time of the last preview with this image side, s.
+        """Return the time in seconds of the last preview with this image side.
 
         If there was none, estimate the time from previews of other sizes, in proportion to their area.
         """
@@ -190,7 +190,7 @@ class Credit:
 
     @property
     def credit(self) -> float:
-        """The time that may be spent now, s; negative after an overrun."""
+        """The time in seconds that previews may use now; negative after an overrun."""
         with self._lock:
             return self._update()
 

@@ -1,1 +1,1 @@
-"""Runs side by side on one page that opens offline."""
+"""Compare runs side by side on one page that opens offline."""

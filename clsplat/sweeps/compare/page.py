@@ -59,7 +59,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Group:
-    """A group of columns with a common title."""
+    """A group of columns under a common title."""
 
     title: str
     columns: list[Column]

@@ -244,7 +244,7 @@ class CameraState(ModuleState):
         return change.apply_to(pose) if change.rotation.any() or change.translation.any() else pose
 
     def factor(self, view: str) -> float:
-        """Return the learned factor on the focal lengths of a view."""
+        """Return the learned factor by which a view's focal lengths are multiplied."""
         return math.exp(self.scalars.get(self._key(view), 0.0))
 
     def _key(self, view: str) -> str:

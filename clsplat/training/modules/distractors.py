@@ -39,8 +39,8 @@ RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_bas
 class Distractors(TrainingModule):
     """Give each photograph its own Gaussians just in front of its camera (DeSplat, Wang et al. 2024).
 
-    They absorb objects that are not part of the scene, and are not in any other image, metric, or file.  Their number
-    is fixed.  A loss on the area that they cover fades out Gaussians that explain little.
+    They absorb objects that are not part of the scene.  No other image, metric, or file contains them.  Their number
+    is fixed.  A loss on the covered area fades out Gaussians that explain little.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
@@ -157,7 +157,7 @@ def _spread_gaussians(count: int, view: View, pixels: NDArray[np.uint8]) -> dict
 
 
 def _restore_adam(device: Device, tables: Tables, number: int) -> Adam:
-    """Return the Adam of one photograph's Gaussians, with their moments.  number: index of the photograph."""
+    """Return the optimizer of one photograph's Gaussians, with its moments.  number: index of the photograph."""
     count = len(tables["means"]) // len(tables[UPDATES])
     rows = slice(number * count, (number + 1) * count)
     parameters = {name: tables[name][rows] for name in WIDTHS}

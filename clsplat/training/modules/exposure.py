@@ -173,7 +173,7 @@ class ColorModel(Settings):
 
     @abstractmethod
     def from_gains(self, log_gains: Floats) -> Floats:
-        """Return the parameters, [columns], that best match gains.  log_gains: of red, green, and blue, [3]."""
+        """Return the parameters, [columns], that best match gains.  log_gains: logarithms for R, G, and B, [3]."""
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
         """Return a regularization loss on the parameters, and its gradient."""
@@ -209,8 +209,8 @@ class Gain(Gains, ColorModel):
 class Affine(ColorModel):
     """An affine color transform of each photograph with twelve parameters (Kerbl et al. 2024).
 
-    It can represent white balance, contrast, and haze, but also absorbs view-dependent color that belongs to the
-    Gaussians; `weight` limits this.  `gain` generalizes better.
+    It can represent white balance, contrast, and haze, but it also absorbs view-dependent color that the Gaussians
+    should represent; `weight` limits this.  `gain` generalizes better.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})

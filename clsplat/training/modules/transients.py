@@ -30,7 +30,7 @@ class Transients(TrainingModule):
     all views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
     `quantile` are masked if most of the box around them is above it too.  The box excludes details that the model has
     not learned yet, which are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are
-    ours.
+    not from a paper.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset(

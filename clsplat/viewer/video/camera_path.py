@@ -150,7 +150,7 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
 
 
 def _rows(values: Any) -> Any:
-    """Return 16 values as four rows; anything else is returned unchanged and rejected later."""
+    """Reshape 16 values to four rows.  Return any other value unchanged; the caller rejects it."""
     if not isinstance(values, list) or len(values) != 16:
         return values
     return [values[i : i + 4] for i in range(0, 16, 4)]

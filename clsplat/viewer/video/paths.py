@@ -69,7 +69,7 @@ class Rig:
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3]; if those are almost parallel, the middle of the visible depths.
+        """The point nearest to the optical axes, [3], or in the middle of the depth range if they are almost parallel.
 
         Raises DataError if most cameras look away from it.
         """
@@ -81,7 +81,7 @@ class Rig:
             focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
         if (self._point_depths(focus) > 0).mean() < MIN_FACING:
             raise DataError(
-                "the cameras look away from each other, so there is no center to orbit; use the path through"
+                "the cameras look away from each other, so there is no center to orbit; use the path `through`"
             )
         return focus
 
