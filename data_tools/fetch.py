@@ -175,7 +175,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 
 @contextmanager
 def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
-    """Yield the name, the size, and a function that opens it, for each regular file.  Links and devices are skipped."""
+    """Yield the name, the size, and an open function for each regular file.  Links and devices are skipped."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as zip_file:
             yield [

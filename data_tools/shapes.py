@@ -26,7 +26,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def rotate(matrix: Array, v: Array) -> Array:
-    """Multiply columns [3, R] by a [3, 3] matrix, without BLAS, whose rounding may depend on the number of threads."""
+    """Multiply columns [3, R] by a [3, 3] matrix.  BLAS is not used, because its rounding may depend on threads."""
     return np.asarray(matrix[:, :1] * v[0] + matrix[:, 1:2] * v[1] + matrix[:, 2:] * v[2])
 
 
@@ -64,7 +64,7 @@ def spiral(count: int, low: float, high: float, phase: float = 0.0) -> Array:
 
 
 def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[Array, Array]:
-    """Return the distances (enter, leave) of rays and a sphere or an infinite cylinder at the origin; inf for a miss.
+    """Return the distances at which rays enter and leave a sphere or infinite cylinder at the origin; inf for a miss.
 
     origins, directions: [3, R] for a sphere, [2, R] for a cylinder
     """

@@ -195,7 +195,7 @@ def compress(
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Training steps after each pruning; a fifth of them follow each palette; default: 1000."
+            min=1, metavar="N", help="Training steps after each pruning (a fifth after each palette); default: 1000."
         ),
     ] = None,
     device: DeviceOption = None,

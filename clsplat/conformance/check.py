@@ -74,7 +74,7 @@ def count_true(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) 
 
 
 def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
-    """Compare images, [C, H, W].  A few pixels may differ more, where a splat is on the other side of a threshold.
+    """Compare images, [C, H, W].  A few pixels may differ more, where a splat crosses a threshold.
 
     Such a splat changes a pixel by up to 1/255 of its color, and colors are at most 3.
     """
@@ -105,7 +105,7 @@ class Check:
     run: Run
 
     def deviations(self, device: Device) -> Results:
-        """Run the check on a device and yield its results.  Random numbers depend only on the check's name."""
+        """Run the check on a device and yield its results.  The random numbers depend only on the check's name."""
         return self.run(device, np.random.default_rng(list(self.name.encode())))
 
 

@@ -74,7 +74,7 @@ class MemoryLimitError(ClsplatError):
 
 
 class NumericError(ClsplatError):
-    """Values in training or in a render are not finite, or no Gaussians are left."""
+    """Values in training or in a render are not finite, or no Gaussians remain."""
 
     exit_code = 6
 

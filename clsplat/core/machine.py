@@ -31,9 +31,9 @@ MIN_SPACE = 16 << 20  # bytes; the built kernels of a device take a few MB
 def cache_folder() -> Path:
     """Return the cache folder of clsplat, which exists, is writable, and belongs to the user.
 
-    If the user's cache folders are not writable, as in a container without a home, or have little free space, all
-    caches, including those of the libraries, move to the temporary folder, with a warning: compilers abort the process
-    when a built kernel does not fit.  Raises OutputError if the temporary folder is not writable either.
+    The user's cache folders may not be writable, as in a container without a home, or may have little free space.  All
+    caches, including those of the libraries, then move to the temporary folder, with a warning, because compilers abort
+    the process when a built kernel does not fit.  Raises OutputError if the temporary folder is not writable either.
     """
     try:
         folders = [Path(platformdirs.user_cache_dir(name, name)) for name in ("clsplat", *LIBRARIES)]

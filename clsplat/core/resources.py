@@ -47,7 +47,7 @@ def list_sources() -> list[str]:
 
 
 def _list_code_files() -> list[str]:
-    """Return names and hashes of all files of the program, including pipelines, page templates, and data tools."""
+    """Return the names and hashes of all files of the program, including pipelines, page templates, and data tools."""
     folders = [PACKAGE if name == "clsplat" else resource_dir(name) for name in CODE]
     return [
         f"{folder.name}/{path.relative_to(folder).as_posix()} {sha256(path)}"

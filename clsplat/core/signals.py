@@ -129,7 +129,7 @@ def _resend_signal(number: int) -> None:
 
 
 class Stream:
-    """A wrapper of stdout or stderr (`name` in `sys`); after a failure it keeps the error and drops all output."""
+    """A wrapper of stdout or stderr (`name` in `sys`).  After a failure, it stores the error and drops all output."""
 
     def __init__(self, name: str) -> None:
         self.name = name

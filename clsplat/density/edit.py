@@ -268,4 +268,4 @@ class Rule(Settings):
 
     @abstractmethod
     def mark(self, edit: Edit) -> None:
-        """Set outcomes with `edit.mark` or `edit.choose`, and change rows of tables with `edit.set_rows`."""
+        """Apply the rule: set outcomes with `edit.mark` or `edit.choose`, and table rows with `edit.set_rows`."""

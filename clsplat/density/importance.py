@@ -114,7 +114,7 @@ class SampledPruning(Rule):
 
     @abstractmethod
     def weights(self, edit: Edit) -> NDArray[np.float64]:
-        """Return the odds of removing each Gaussian, [N], from 0 to infinity."""
+        """Return the sampling weight for the removal of each Gaussian, [N], from 0 to infinity."""
 
     def mark(self, edit: Edit) -> None:
         """Mark a sample of Gaussians for removal.  The size of a split Gaussian is that of its children."""

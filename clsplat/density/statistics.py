@@ -59,7 +59,7 @@ class ScreenGrad(Statistic):
 
 
 class ScreenGradAbs(Statistic):
-    """`screen_grad` from sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
+    """`screen_grad` with absolute values summed over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
 
     type: Literal["screen_grad_abs"] = "screen_grad_abs"
     pixel_sums = ABS_X + 2
@@ -129,7 +129,7 @@ class SplatStats:
     def __init__(
         self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",), training_views: int = 1
     ) -> None:
-        """Add the tables of `names` and their divisors, and delete all other tables.  Existing tables keep their sums."""
+        """Add the tables of `names` and their divisors, and delete all other tables.  Existing sums are kept."""
         self.gaussians, self.training_views = gaussians, training_views
         classes = variants(Statistic)
         all_names = {*names, *(classes[name].divisor for name in names)}
@@ -165,7 +165,7 @@ class SplatStats:
 
     @property
     def seen(self) -> Array:
-        """Number of views in which each Gaussian is visible, [S]."""
+        """The number of views in which each Gaussian is visible, [S]."""
         return self.gaussians[SEEN]
 
     def add(self, view: ViewGradients, grad_mean2d: Array) -> None:

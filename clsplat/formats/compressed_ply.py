@@ -102,7 +102,7 @@ def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np
 
 
 def _unpack(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
-    """Unpack bit fields, the most significant first, as fractions in [0, 1], [N, fields].  bits: of each field."""
+    """Unpack bit fields, the most significant first, as fractions in [0, 1], [N, fields].  bits: field widths."""
     columns, shift = [], 32
     for width in bits:
         shift -= width

@@ -238,7 +238,7 @@ class Gltf:
         return data
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the index of each mesh in the scene, with the world matrix of its node, [4, 4]."""
+        """Return the index of each mesh in the scene and the world matrix, [4, 4], of its node."""
         nodes = self.tree["nodes"]
         meshes: list[tuple[int, NDArray[np.float64]]] = []
         visited: set[int] = set()

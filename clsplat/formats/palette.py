@@ -146,7 +146,7 @@ def _nearest_vectors(
 
 
 def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return ascending rows for training a palette, evenly spaced in total weight, or in number without one."""
+    """Return ascending rows for training a palette, evenly spaced in total weight, or in number without weights."""
     max_rows = min(count, max_rows)
     if not weights.any():
         return np.linspace(0, count - 1, max_rows).astype(np.int64)

@@ -457,7 +457,7 @@ class Harmonics:
 
 
 def _training_entries(count: int, quality: Quality) -> int:
-    """Return the number of palette entries in training for `count` splats."""
+    """Return the number of palette entries that training uses for `count` splats."""
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 

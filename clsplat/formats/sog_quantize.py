@@ -54,7 +54,7 @@ def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
 
 def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
-    """Return the geometric mean of each Gaussian's scales, in the logarithmic space of positions, [N, 3]."""
+    """Return the geometric mean of each Gaussian's scales, converted to the logarithmic space of positions, [N, 3]."""
     size = np.exp(np.minimum(log_scales.astype(np.float64).mean(axis=1, keepdims=True), MAX_LOG))
     return np.asarray(size / (1 + np.abs(means.astype(np.float64))))
 
@@ -81,7 +81,7 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
 
 
 def _axes(rotations: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the axis onto which each rotation, [24, 4], maps each axis, [24, 3]."""
+    """Return the index of the axis onto which each rotation, [24, 4], maps each axis, [24, 3]."""
     inverse = rotations * [1, -1, -1, -1]
     axes = [multiply(multiply(rotations, np.eye(4)[1 + axis]), inverse) for axis in range(3)]
     return np.stack([np.abs(quats[:, 1:]).argmax(axis=1) for quats in axes], axis=1)

@@ -285,7 +285,7 @@ def _row_exceeds_limit(table: Floats) -> NDArray[np.bool_]:
 
 
 def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Replace infinite logits and logarithms, of opacities 0 and 1 and of scales 0, by finite values; warn."""
+    """Replace infinite logits (opacities 0 and 1) and log scales (zero scales) with finite values, and warn."""
     logit, log_scales = (splats.parameters[name] for name in ("logit_opacity", "log_scales"))
     is_infinite, is_flat = np.isinf(logit), np.isneginf(log_scales)
     if not (count := int((is_infinite.any(axis=1) | is_flat.any(axis=1)).sum())):

@@ -74,7 +74,7 @@ def find_level_faults(path: Path) -> list[str]:
 
 
 def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
-    """Return an error message for each missing or damaged file.  runs: of its leaves, by file number."""
+    """Return an error message for each missing or damaged file.  runs: the row ranges of its leaves, by file number."""
     faults = []
     for file, leaves in sorted(runs.items()):
         try:

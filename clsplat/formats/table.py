@@ -188,7 +188,7 @@ def endings(reads: bool = False) -> list[str]:
 
 
 def detect(path: Path) -> Codec | None:
-    """Return the format of a file by its content, or None; without a magic number, the name must fit, too.
+    """Return the format of a file by its content, or None.  If a format has no magic number, the name must match, too.
 
     Raises DataError if the file cannot be read, is empty, or is a failed download.
     """

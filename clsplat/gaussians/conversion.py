@@ -301,7 +301,7 @@ def convert_frames(
 
 @contextmanager
 def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
-    """Restore files in one folder if the block fails, such as on a full disk, and remove the folder if it is new.
+    """If the block fails, for example on a full disk, restore files in one folder, and remove the folder if it is new.
 
     Raises OutputError.
     """

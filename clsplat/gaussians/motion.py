@@ -33,7 +33,7 @@ def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) ->
 
 
 def evaluate_at(parameters: Parameters, time: float) -> Parameters:
-    """Return the Gaussians that are visible at a time as static Gaussians."""
+    """Return the Gaussians that are visible at a time, as static Gaussians."""
     motion = parameters[MOTION].astype(np.float64)
     fields, factor = motion_fields(motion.shape[1]), presence(motion, time)
     is_visible = factor >= MIN_PRESENCE

@@ -1,4 +1,4 @@
-"""Prune by the increase of the error in training views, and estimate the error that a Gaussian can remove (ours)."""
+"""Prune by the increase of the error in training views, and estimate the error that a Gaussian can remove."""
 
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal

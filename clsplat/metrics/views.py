@@ -147,7 +147,7 @@ class Gains:
     parameters_per_channel: ClassVar[int] = 1
 
     def fit_matrix(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares."""
+        """Fit gains to an image and a photograph by least squares; return them as a matrix, [3, 4]."""
         squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
         gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
         return np.column_stack([np.diag(gains), np.zeros(3)])

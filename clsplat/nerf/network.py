@@ -110,7 +110,7 @@ class Network:
         return grad_grid
 
     def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, add: int) -> Array:
-        """Compute the gradient of the grid's features, which a layer reads starting at a row."""
+        """Compute the gradient of the grid's features, which are inputs of a layer from a row on."""
         tiles = grad_outputs.shape[0]
         position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
         self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, add, row)
@@ -125,7 +125,7 @@ class Network:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
 
     def _partials(self, tiles: int) -> Array:
-        """Return the array of partial sums, [chunks, network_parameters], in which padding is zero."""
+        """Return the array of partial sums, [chunks, network_parameters].  The padding is zero."""
         return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_parameters))
 
     def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:

@@ -71,7 +71,7 @@ class GridShape(Settings):
 
     @property
     def parameter_count(self) -> int:
-        """Number of trained features in all levels."""
+        """The number of trained features in all levels."""
         return FEATURES * int(self.table[:, 2].sum())
 
 
@@ -174,7 +174,7 @@ class FieldShape(Settings):
 
     @property
     def position_parts(self) -> list[int]:
-        """Numbers of features of the encoded position: of the grid and of the sines, each padded to full blocks."""
+        """The numbers of features of the encoded position, from the grid and from sines, each padded to full blocks."""
         return [self.grid_rows, 6 * self.degrees]
 
     @property
@@ -184,7 +184,7 @@ class FieldShape(Settings):
 
     @property
     def position_rows(self) -> int:
-        """Number of rows of the encoded position."""
+        """The number of rows of the encoded position."""
         return sum(map(round_to_blocks, self.position_parts))
 
     @property

@@ -71,7 +71,7 @@ class LearnedField(TrainedField):
     def from_tables(
         cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array
     ) -> Self:
-        """Return the field of a checkpoint.  tables: as the method `tables` returns them."""
+        """Return the field of a checkpoint.  tables: the result of the method `tables`."""
         parsed_shape = _parse_shape(shape)
         field = cls(Field(parsed_shape, background.device.zeros(parsed_shape.parameters), background))
         for name, array in field._arrays.items():
@@ -250,7 +250,7 @@ CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners
 def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
     """Raise ConfigError if no training view shows the cube of a field's grid, or if all scene points are outside it.
 
-    Views show the cube at depths between `near` and `far` of the shape.
+    A view shows the cube only at depths between the shape's `near` and `far`.
     """
     cube, views, points = shape.grid, scene.split("train"), scene.points
     if cube is None or not views:
@@ -290,7 +290,7 @@ def _corners(view: View, near: float, far: float, unit: float) -> Floats:
 def _intersect(cube: Floats, frustum: Floats) -> bool:
     """Return whether a cube and a frustum intersect: no axis separates them (Gottschalk, Lin and Manocha 1996).
 
-    Both are [8, 3], corners in the order of CORNERS.
+    Both are arrays of corners, [8, 3], in the order of CORNERS.
     """
     axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
     faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])

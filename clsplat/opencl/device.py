@@ -123,7 +123,7 @@ class Array:
         return wait
 
     def get_item(self, index: int) -> Any:
-        """Copy one value of a one-dimensional array to the host.  Waits and raises as `get` does."""
+        """Copy one value of a one-dimensional array to the host.  Waits, and raises the errors of `get`."""
         host = np.empty(1, self.dtype)
         with self.device.raising_errors("a copy to the host"):
             cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
@@ -280,9 +280,10 @@ def create_context(device: Any) -> Any:
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
-    """Open a device given by part of its name, or by default the one that `choose` selects; return an open device.
+    """Open the device whose name contains `device`, by default the one that `choose` selects.
 
-    Raises DeviceError if there is none, and ConfigError for an open device with another schedule.
+    A Device that is already open is returned.  Raises DeviceError if no device matches, and ConfigError for an open
+    device with another schedule.
     """
     if device is None or isinstance(device, str):
         return Device(device, schedule)

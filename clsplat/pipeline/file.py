@@ -33,7 +33,7 @@ from clsplat.training.stage import ON_HOST, Stage, Training
 
 
 class SceneSettings(Settings):
-    """The photos, and how they are read."""
+    """The dataset and how its photos are read."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"image_budget"})
 
@@ -197,7 +197,7 @@ class PipelineFile(Settings):
 
     @property
     def training(self) -> Training:
-        """The first stage that trains.  Raises ConfigError if none does."""
+        """The first stage that trains.  Raises ConfigError if there is none."""
         for stage in self.stages:
             if isinstance(stage, Training):
                 return stage
@@ -205,7 +205,7 @@ class PipelineFile(Settings):
 
     @property
     def optimize(self) -> Optimize:
-        """The first stage that trains Gaussians.  Raises ConfigError if none does."""
+        """The first stage that trains Gaussians.  Raises ConfigError if there is none."""
         for stage in self.stages:
             if isinstance(stage, Optimize):
                 return stage

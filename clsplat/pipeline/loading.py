@@ -243,7 +243,7 @@ def without_auto(data: Any) -> Any:
 
 
 def _changes_photos(override: str) -> bool:
-    """Return whether an override changes the training photos, on which decisions depend."""
+    """Return whether an override changes the training photos, which affect the decisions."""
     names, _ = split(override)
     return names[0] == "scene" and names[1:2] != ["validation"]
 

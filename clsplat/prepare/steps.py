@@ -51,7 +51,7 @@ class Step(Settings):
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         """Write the result for `source` into the folder `out`, and return figures for the log.
 
-        `out` is empty, or, if the step `resumes`, has the files that an interrupted call with the same inputs left.
+        `out` is empty.  If the step `resumes`, it may contain the files of an interrupted call with the same inputs.
         Files in `excluded_folder` are not read.
         """
 

@@ -190,7 +190,7 @@ class Skies:
     def update(
         self, sky: DeviceSky, camera: DeviceCamera, grad_texels: Array, moments: Mapping[str, Array], rate: float
     ) -> None:
-        """Update the texels in the view with Adam.
+        """Update the texels of a view with Adam.
 
         grad_texels: [3, texels]; moments: `moment1`, `moment2`, [3, side * side], `biases`, [2, side * side],
         and `free`, [1, side * side], 1 for trained texels, otherwise 0.

@@ -131,7 +131,7 @@ def open_run(
 def count_listener(status: StatusFile) -> Listener:
     """Return a listener that writes the progress of the preparation to `status`.
 
-    The remaining time is written only in the last stage, because earlier the time of the following steps is unknown.
+    The remaining time is written only while the scene is read, because earlier the time of the next steps is unknown.
     """
 
     def note_count(unit: str, done: int, total: int, /, *, seconds_left: float | None) -> None:

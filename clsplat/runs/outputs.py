@@ -64,10 +64,10 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
 
 
 def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
-    """Return the SHA-256, by path in the folder, of files of the finished run that no remaining stage rewrites.
+    """Return the SHA-256, by path in the folder, of the files of a finished run that no remaining stage rewrites.
 
-    Until the run ends again, a change of these files counts as damage.  The records, and the files of a training stage
-    that continues, are included only if they are damaged.
+    Until the run ends again, a change to these files is damage.  The records, and the files of a training stage that
+    continues, are included only if they are damaged.
     """
     sums = read_sums(run.out)  # read again: with --minutes this process may have changed them
     if sums is None:

@@ -90,7 +90,7 @@ def status_text(status: dict[str, Any]) -> str:
 
 
 def _advice(state: RunState) -> str:
-    """Return how to continue a run that stopped before its end; "" if the message of the run already says it."""
+    """Return how to continue a run that stopped before its end, or "" if the message of the run contains it."""
     out, status = state.out, state.status
     message, resume_command = str(status.get("message")), f"clsplat resume {shell_quote(out)}"
     if PIPELINE not in state.names or resume_command in message or "--restart" in message:

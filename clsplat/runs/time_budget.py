@@ -71,7 +71,7 @@ class _RehearsalOver(Exception):
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
     """Execute the pipeline with the number of steps that fits into `minutes`, including the rehearsal.
 
-    Raises ConfigError unless exactly one stage trains, and its minimum number of steps fits.  Also raises the errors of
+    Raises ConfigError unless exactly one stage trains and its minimum number of steps fits.  Also raises the errors of
     `execute`.
     """
     deadline = time.perf_counter() + 60 * minutes

@@ -259,7 +259,7 @@ class Lens:
         return np.asarray(inside & (angle < min(fold_angle, circle_angle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
-        """Return whether a white pixel of the photograph's mask, [H, W, C], is visible in this face."""
+        """Return whether any white pixel of the photograph's mask, [H, W, C], is visible in this face."""
         u, v = np.stack(_face_grid())[:, self._visible_grid]
         x, y = self.distort(*self._directions(u, v))
         height, width = mask.shape[:2]
@@ -409,7 +409,7 @@ def _face_grid() -> tuple[Floats, Floats]:
 
 
 def panorama_lens(width: int, height: int) -> Lens:
-    """Return the lens of a panorama of the full sphere; the center of the image is forward, its top is up."""
+    """Return the lens of a panorama of the full sphere.  The center of the image is forward, and its top is up."""
     return Lens(width, height, "EQUIRECTANGULAR", (width / math.tau, height / math.pi, width / 2, height / 2))
 
 

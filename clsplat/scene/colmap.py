@@ -122,7 +122,7 @@ def _is_points2d(line: str) -> bool:
 
 
 def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the IDs of the 3D points in a line of 2D points, [K], and their positions, [K, 2] px."""
+    """Parse a line of 2D points: return the IDs of their 3D points, [K], and their positions, [K, 2] px."""
     fields = line.split()
     indices = [i for i in range(2, len(fields), 3) if fields[i].isdecimal()]
     pixels = [(_parse_coordinate(fields[i - 2]), _parse_coordinate(fields[i - 1])) for i in indices]
@@ -392,7 +392,7 @@ def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequenc
 
 
 def find_models(path: Path) -> list[Path]:
-    """Return `path` and folders below it that contain a COLMAP model, sorted by name."""
+    """Return the folders at and below `path` that contain a COLMAP model, sorted by name."""
     sparse = path / "sparse"
     folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
     counts = {folder: sum(find_file(folder, stem) is not None for stem in ("cameras", "images")) for folder in folders}

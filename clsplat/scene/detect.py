@@ -109,7 +109,7 @@ def is_scene(path: Path) -> bool:
 def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
     """Read the dataset in a folder; every `holdout`-th view is a test view if the dataset has no split.
 
-    A Split can also name the test views, hold out a validation fold, and leave out training views.
+    A Split can also name the test views, hold out a validation fold, and omit training views.
     Raises DataError if the format is unknown or files are damaged.
     """
     path = Path(path)

@@ -83,7 +83,7 @@ def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
 def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:
     """Return the names of the views with blank photographs.
 
-    Raises DataError, as training would, if all photographs are blank or a mask excludes every pixel of one.
+    Raises DataError, as training would, if all photographs are blank or if a mask excludes an entire photograph.
     """
     masked = [view for view in views if _is_excluded(view, files)]
     if masked:

@@ -357,7 +357,7 @@ def _read_tags(path: Path) -> dict[int, Value]:
 
 
 def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """Return the values of an image file directory (IFD) by tag; of an array, the first element."""
+    """Return the values of an image file directory (IFD) by tag.  The value of an array is its first element."""
     values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for entry in range(start + 2, start + 2 + 12 * entries, 12):

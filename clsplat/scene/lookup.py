@@ -80,7 +80,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 
 
 def unread_cameras(path: Path) -> str:
-    """Return a sentence about an unsupported camera file of another program at or below `path`; "" without one."""
+    """Return a sentence about an unsupported camera file of another program at or below `path`, or "" without one."""
     folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
     for folder, names in folders:
         for file in [folder / name for name in names if name.endswith((".json", ".xml", ".csv"))][:8]:

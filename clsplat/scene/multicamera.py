@@ -33,7 +33,7 @@ class MulticameraReader(Reader):
     expects = f"{VIDEOS}/ next to sparse/0 or {TRANSFORMS}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether an entry of `videos` has the name of a camera; otherwise, it may be the source of a scene."""
+        """Return whether an entry of `videos` has the name of a camera.  Otherwise, it may be the source of a scene."""
         names = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
         return bool(names) and not names.isdisjoint(_camera_names(path))
 
@@ -112,7 +112,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
 
 
 def _natural_order(frame: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts frames by name, with 10 after 9."""
+    """Return a key that sorts frame names in natural order, with 10 after 9."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", frame.name)]
 
 

@@ -94,7 +94,7 @@ class Reader(ABC):
         return f"the {self.name} dataset in {self.folder.relative_to(self.root).as_posix()} is used{self.choice}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether a folder contains a dataset of this format, by default whether it has the file `expects`."""
+        """Return whether a folder contains a dataset of this format.  By default, it must have the file `expects`."""
         return (path / self.expects).is_file()
 
     @abstractmethod

@@ -189,7 +189,7 @@ class Scene:
 
     @property
     def image_sizes(self) -> str:
-        """The three most frequent sizes of the images in pixels, as in `800x600 and 600x800`."""
+        """The three most frequent image sizes in pixels, as in `800x600 and 600x800`."""
         sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in self.views)
         *others, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
         return f"{', '.join(others)} and {last}" if others else last

@@ -344,8 +344,8 @@ logger = logging.getLogger("clsplat")
 class NerfstudioReader(Reader):
     """Read a nerfstudio scene, with its views in order of name.
 
-    The lists `train_filenames` and `test_filenames` define the split if the file has one of them; images on neither
-    list are left out.  Otherwise, every `holdout`-th view is a test view.  With a `time` in every frame, the scene is
+    The lists `train_filenames` and `test_filenames` define the split if the file has one of them; images in neither
+    list are omitted.  Otherwise, every `holdout`-th view is a test view.  If every frame has a `time`, the scene is
     dynamic.
     """
 

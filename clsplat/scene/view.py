@@ -174,9 +174,9 @@ class View:
     def photograph(self, background: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
-        background: the color behind transparent pixels, one number or three in [0, 1]; default: that of the scene.  The
-        background of a render is `picture.background`.  Raises DataError when the file cannot be read or does not fit
-        the camera, and ValueError for an invalid background.
+        background: the color behind transparent pixels, one or three numbers in [0, 1]; default: that of the scene.
+        The background of a render is `picture.background`.  Raises DataError when the file cannot be read or does not
+        fit the camera, and ValueError for an invalid background.
         """
         red, green, blue = to_color(self.background if background is None else background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)

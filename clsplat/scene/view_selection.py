@@ -189,7 +189,7 @@ def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ..
 
 
 def _require_one_match(name: str, matches: Sequence[int], names: Sequence[str], source: str) -> Sequence[int]:
-    """Return `matches` if they are views of one photograph.  Raises DataError for no or several photographs."""
+    """Return `matches` if they are views of one photograph.  Raises DataError for zero or several photographs."""
     if len({photograph_name(names[i]) for i in matches}) == 1:
         return matches
     if matches:

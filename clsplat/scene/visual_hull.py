@@ -126,9 +126,9 @@ def _centers(cells: Cells, center: Floats, half_side: float, resolution: int) ->
 
 
 def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
-    """Return which balls, [M], are inside all silhouettes, and which are on the edge of some and outside of none.
+    """Return two masks, [M]: balls inside all silhouettes, and balls on the edge of some but outside of none.
 
-    Only the views that see a ball count.  Balls that too few views see are in neither group.
+    Only views in which a ball is visible count.  Balls visible in too few views are in neither mask.
     """
     is_full, remaining, view_counts = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:

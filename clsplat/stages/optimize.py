@@ -119,7 +119,7 @@ class ValidatedTraining(Training):
             self.require_measurement(sum(stage.steps for stage in earlier_stages))
 
     def require_measurement(self, first: int) -> None:
-        """Raise ConfigError if `keep: best` measures nothing until the last step.
+        """Raise ConfigError if `keep: best` would not measure any step.
 
         first: global step before the training.
         """

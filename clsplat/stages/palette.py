@@ -251,7 +251,7 @@ LABEL, CLUSTER_WEIGHT = "cluster/label", "cluster/weight"  # [1] an integer belo
 
 
 def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDArray[np.floating]) -> None:
-    """Store the cluster of each Gaussian, [N], and its weight there, [N]."""
+    """Store the cluster of each Gaussian, [N], and its weight in the cluster, [N]."""
     for name, column in ((LABEL, labels), (CLUSTER_WEIGHT, weights)):
         if name not in gaussians.tables:
             gaussians.add(name, 1)

@@ -129,9 +129,9 @@ def is_overfit(run: Run) -> bool:
 
 
 def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
-    """Return the name of the held-out split, and the last PSNR of its views and of training views.
+    """Return the name of the held-out split, its last PSNR, and the last PSNR of the training views.
 
-    The split is validation if it was measured, otherwise test.  The PSNR of training views that were not measured is
+    The split is validation if it was measured, otherwise test.  If the training views were not measured, their PSNR is
     from the training log.
     """
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
@@ -164,7 +164,7 @@ class StageTime:
 
 @dataclass(frozen=True)
 class Times:
-    """The time of a step's stages on the device, averaged over the sampled steps."""
+    """The device times of a step's stages, averaged over the sampled steps."""
 
     samples: int
     milliseconds: float  # of all stages

@@ -156,7 +156,7 @@ class CellRun:
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError if an input file on this machine differs from the file that was hashed for the key."""
+        """Raise DataError if an input file on this machine differs from the file whose hash is in the key."""
         for path, digest in self.files.items():
             if hash_content(Path(path)) != digest:
                 raise DataError(

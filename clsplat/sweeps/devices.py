@@ -69,7 +69,7 @@ class DeviceSlot:
 
 
 def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
-    """Return the device that a Dask worker describes; None if the worker is of another program or version."""
+    """Return the device of a Dask worker, or None if the worker belongs to another program or version."""
     try:
         values = json.loads(str(worker["metrics"][METRIC_KEY]))
         if values["code"] != code_digest():

@@ -21,10 +21,10 @@ def is_store(folder: Path) -> bool:
 
 
 def store_status(root: Path) -> dict[str, Any]:
-    """Return the `cells` of a store with their states, the number of cells in each state, and further totals.
+    """Return the `cells` of a store with their states, the number of cells in each state, and other totals.
 
     A cell is published, failed, running, silent (no heartbeat for a minute), stopped, or waiting.  Other keys: `store`,
-    `time` (now), `counts` (cells by state), and `events` (their number by kind).  Raises DataError if the folder is no
+    `time` (now), `counts` (cells by state), and `events` (counts by kind).  Raises DataError if the folder is not a
     store.
     """
     store = Store.open(root)

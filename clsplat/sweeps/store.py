@@ -179,7 +179,7 @@ class CellAttempt:
 
     @property
     def last_beat(self) -> float:
-        """The time when the lease was last renewed, by the clock of the store."""
+        """The time at which the lease was last renewed, by the clock of the store."""
         for path in (self.path / LEASE, self.path):
             with suppress(OSError):
                 return path.stat().st_mtime
@@ -476,7 +476,7 @@ class Store:
             return clock.stat().st_mtime
 
     def log_event(self, event: str, **values: Any) -> None:
-        """Append an event, with the current time, to the event file of this process."""
+        """Append an event with the current time to the event file of this process."""
         path = without_links(self.root, EVENTS, f"{self._process_name}.jsonl")
         with raising_output_error(path):
             make_folder(path.parent)

@@ -28,7 +28,7 @@ class PathInRun(AfterValidator):
 
 
 def path_in_run(*suffixes: str) -> PathInRun:
-    """Return the marker of a field that is the path of a file with one of `suffixes`, or of a folder."""
+    """Return the marker for a field with the path of a file that has one of `suffixes`, or of a folder."""
 
     def check(text: str) -> str:
         fault = invalid_output_reason(text)
@@ -226,7 +226,7 @@ class Training(Stage):
             self.run(run)
 
     def act_between(self, run: Run) -> None:
-        """Run the stages that are due and do not edit; a failed stage runs again on resume."""
+        """Run the due stages that do not edit the model.  A stage that fails runs again on resume."""
         for index, stage in enumerate(self.inner):
             is_due = run.stage_step > 0 and (stage.is_due(run.step, self.has_ended(run)) or stage.is_overdue(run))
             if index < run.during_index or stage.edits or not is_due:

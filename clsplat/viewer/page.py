@@ -179,7 +179,7 @@ def view_entries(
     budget: float = BUDGET,
     progress: Callable[[Iterable[View]], Iterable[View]] = lambda views: views,
 ) -> list[dict[str, Any]]:
-    """Return the data of every view of a scene, as photographs.js reads it.
+    """Return the data of every view of a scene in the format of photographs.js.
 
     read: returns a photo, RGB at the camera's size.  budget: MB of photos; if they exceed it, only every n-th one is
     included.  progress: wraps the iteration over views, for example in a progress bar.

@@ -139,7 +139,7 @@ def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 
 def _limit_densify(densify: Densify, block: Block) -> Densify:
-    """Limit a densify stage to the growth box of a block, and its Gaussians in proportion to the block's pairs."""
+    """Limit a densify stage to a block's growth box, and the number of Gaussians in proportion to the block's pairs."""
     updates: dict[str, Any] = {"inside": block.growth_box}
     if densify.max_gaussians is not None:
         updates["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)

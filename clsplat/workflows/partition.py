@@ -305,7 +305,7 @@ class Partitioner:
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:
-        """Return the device memory for training, bytes.  gaussians: initial number; views: indices."""
+        """Return the device memory for training, in bytes.  gaussians: initial count; views: indices of views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
         cached_bytes = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))

@@ -112,7 +112,7 @@ class FieldCase:
         return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
 
     def grid_positions(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the positions of samples in the grid's cube, [S, 3], and their variances, [S]."""
+        """Return the positions of samples relative to the grid's cube, [S, 3], and their variances, [S]."""
         assert self.shape.grid is not None
         means, variances = (table.reshape(-1, 3) for table in ref.frustums(self.cones, edges.astype(np.float64)))
         return ref.grid_positions(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)

@@ -57,7 +57,7 @@ def project_records(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[A
 
 
 def check_record(device: Device, case: Case, label: str) -> Results:
-    """Compare the records of a scene with the reference."""
+    """Compare the splat records of a scene with the reference."""
     kernel = "project_forward"
     records, keys, radius = project_records(device, case)
     truth, (width, height) = case.project(), case.size
@@ -152,7 +152,7 @@ def check_long_splats(device: Device, case: Case, rng: np.random.Generator, labe
 
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Return the gradients of all parameters, and of the projected means, from sums over pixels, [N, PIXEL_SUMS]."""
+    """Compute the gradients of all parameters and of the projected means from sums over pixels, [N, PIXEL_SUMS]."""
     grad_mean2d, grad_conic = sums_to_gradients(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
@@ -267,7 +267,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the gradients of long splats for sums over a blended image; in other formulas, their terms cancel."""
+    """Compare the gradients of long splats for sums over a blended image.  In other formulas, their terms cancel."""
     for aspect in ASPECTS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)

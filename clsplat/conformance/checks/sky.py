@@ -111,7 +111,7 @@ def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("sky_update")
 def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
-    """Compare three updates; texels outside the view stay unchanged."""
+    """Compare three updates, and check that texels outside the view stay unchanged."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
     visible = view.skies.runs(view.camera, side).shown.get()

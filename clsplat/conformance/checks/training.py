@@ -76,7 +76,7 @@ def _random_pixel_sums(
 
 
 def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare one fused update: moments with the reference's gradients, and values with the device's moments."""
+    """Compare one fused update: moments for the reference's gradients, and values for the device's moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -249,7 +249,7 @@ STEPS = 8
 
 
 def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
-    """Return a random mask of rows that are visible in a view, [N]: few rows, in few of the blocks of 16."""
+    """Return a random mask, [N], of the rows visible in a view: a few rows in some of the blocks of 16."""
     blocks = rng.random(-(-count // 16)) < 0.4
     return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
 

@@ -157,7 +157,7 @@ def _falloff(
 
 
 def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
-    """Return the slopes of a curve from 0 to 1 at 0, 1/4, 1/2, 3/4 and 1."""
+    """Return the slopes at 0, 1/4, 1/2, 3/4 and 1 of a curve from 0 to 1."""
     slopes = np.exp(np.insert(row[5 + 4 * channel : 9 + 4 * channel], 2, 0.0))
     return np.asarray(slopes / _curve(np.ones(1), slopes))
 

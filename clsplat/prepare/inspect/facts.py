@@ -378,7 +378,7 @@ def _relative_path(file: Path, parts: Parts) -> str:
 
 
 def _pose(view: View, extent: float | None) -> tuple[float, ...]:
-    """Return the pose of a view, with a translation in units of the extent, rounded so that equal poses are equal."""
+    """Return the pose of a view, with the translation in units of the extent, rounded so that equal poses match."""
     return tuple((view.world_to_camera / [1, 1, 1, extent or 1]).ravel().round(9))
 
 

@@ -246,7 +246,7 @@ def _folders(runs: Sequence[RunFolder]) -> str:
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
     """Return a name for the scene of each run: its folder and image size.
 
-    If two names would be equal, they also contain all scene settings.
+    All scene settings are appended to names that are not unique.
     """
     names = []
     for run in runs:

@@ -103,7 +103,7 @@ class ModuleState:
         self.scalars = dict(scalars)
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:
-        """Return whether `load` accepts this state.  If not, the module starts from scratch."""
+        """Return whether `load` accepts this state.  If not, the module starts with its initial state."""
         return True
 
     def start(self, run: Run) -> None:

@@ -198,7 +198,7 @@ class GridState(ColorState):
     def differentiate(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradients of the input of `transform` and of the grid, [row].  gradient: that of the result."""
+        """Return the gradients of the input of `transform` and of the grid, [row].  gradient: of the result."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         result = workspace.array("grad_colored", image.shape)
         unclamped = workspace.array("grid passed", (3, *image.shape[1:]))
@@ -256,7 +256,7 @@ class GridState(ColorState):
         self._center()
 
     def _center(self) -> None:
-        """Subtract from the grids at each luminance their mean over photographs and positions."""
+        """Subtract the mean over photographs and positions from the grids, at each level of luminance."""
         photographs, _, levels, rows, columns = self.shape
         self.device.program("color_grid_table.cl").color_grid_center(
             groups=ENTRIES * levels,
