@@ -41,13 +41,13 @@ def main(*leading: str) -> None:
     sys.exit(code)
 
 
-def _report(error: BaseException, debugging: bool) -> int:
+def _report(error: BaseException, is_debugging: bool) -> int:
     """Print a line for an error or for an interruption by the user, and return the exit code."""
     if isinstance(error, WrappedError | typer.Abort):
         error = error.__cause__ or error
     if isinstance(error, KeyboardInterrupt):  # outside a run; a run says how to continue
         error = Interrupted("stopped")
-    if debugging:
+    if is_debugging:
         traceback.print_exception(error)
     if hasattr(error, "format_message"):  # from typer
         message, code = _usage(error), 2

@@ -315,7 +315,7 @@ class Model:
             LOG.warning("%s: the model has no origin; its coordinates are written unchanged", path)
             return self.to_splat_file()
         means: Any = self.means + self.origin
-        if float32_holds(means, self.log_scales):
+        if is_float32_precise(means, self.log_scales):
             means = means.astype(np.float32)
         elif writing_format(path).keeps_all:
             LOG.info("%s: x, y, and z are doubles, since floats are too coarse for world coordinates", path)
@@ -357,7 +357,7 @@ LOG = logging.getLogger("clsplat")
 COARSE = 0.05  # spacing of positions that becomes visible, relative to the median scale
 
 
-def float32_holds(means: NDArray[np.floating], log_scales: Floats) -> bool:
+def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
     """Return whether float32 is precise enough for the means, [N, 3], of Gaussians with these scales, [N, 3].
 
     Also returns True for means beyond MAX_NUMBER, which are not valid coordinates.
@@ -383,7 +383,7 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     comment, tables = dict(file.rendering), dict[str, Any](file.parameters)
     origin: NDArray[np.floating] = np.array(comment.pop("origin", np.zeros(3)), np.float64)
     finite = tables["means"][~not_finite({"means": tables["means"]})]
-    if not origin.any() and not float32_holds(finite, tables["log_scales"]):
+    if not origin.any() and not is_float32_precise(finite, tables["log_scales"]):
         finite = finite.astype(np.float64)
         origin = far_origin(np.median(finite, axis=0), finite)
         tables["means"] = np.asarray(tables["means"] - origin, np.float32)
@@ -392,7 +392,7 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
         scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
         rotation, shift = file.placement[:3, :3] / (scale or 1), file.placement[:3, 3]
         origin = scale * rotation @ origin
-        if not float32_holds(shift[None], model.log_scales + np.log(abs(scale) or 1)):
+        if not is_float32_precise(shift[None], model.log_scales + np.log(abs(scale) or 1)):
             origin, shift = origin + shift, np.zeros(3)
         try:
             model = model.transformed(scale, rotation, shift)

@@ -95,8 +95,8 @@ def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float
         sky_weights += np.bincount(texels.ravel(), weight.ravel(), side**2)
         values = photo.image[photo.mask].astype(np.float64) / 255
         for channel in range(3):
-            weighted = weight * values[:, channel, None]
-            color_sums[:, channel] += np.bincount(texels.ravel(), weighted.ravel(), side**2)
+            weighted_values = weight * values[:, channel, None]
+            color_sums[:, channel] += np.bincount(texels.ravel(), weighted_values.ravel(), side**2)
     if not sky_weights.any():
         return None
     is_sky = sky_weights > 0

@@ -131,7 +131,7 @@ def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -
     return {"oneOf": [*([{"enum": names}] if names else []), *with_settings]}
 
 
-def _settings(title: str, required: Sequence[str], optional: bool) -> dict[str, Any]:
+def _settings(title: str, required: Sequence[str], is_optional: bool) -> dict[str, Any]:
     node: dict[str, Any] = {"$ref": f"#/$defs/{title}"}
     node |= {"required": list(required)} if required else {}
-    return {"anyOf": [node, {"type": "null"}]} if optional else node
+    return {"anyOf": [node, {"type": "null"}]} if is_optional else node

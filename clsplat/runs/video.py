@@ -94,7 +94,7 @@ def make_video(
     used_scene = _scene(model, scene, content, downscale, is_required=not request.is_file or extras.side == PHOTOGRAPH)
     origin = used_scene.origin if used_scene else content.origin
     content = content.in_scene(used_scene) if used_scene else content
-    plan = plan_video(request, used_scene, content_points(content, used_scene), moves=is_moving(content), origin=origin)
+    plan = plan_video(request, used_scene, content_points(content, used_scene), is_moving(content), origin)
     background = content.rendering.background or (used_scene.background if used_scene else "black")
     opened_device = open_verified(device)
     canvas = Canvas(make_painter(content, opened_device, background))

@@ -303,7 +303,7 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     center = centers.mean(axis=0)
-    if not share_center(centers):
+    if not have_same_center(centers):
         return 1.1 * float(np.linalg.norm(centers - center, axis=1).max())
     finite = np.zeros((0, 3)) if points is None else points.astype(np.float64)
     finite = finite[np.isfinite(finite).all(axis=1)]
@@ -311,7 +311,7 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     return float(np.median(distances)) or 1.0
 
 
-def share_center(centers: Floats) -> bool:
+def have_same_center(centers: Floats) -> bool:
     """Return whether camera centers, [V, 3], are equal up to rounding."""
     return bool(np.ptp(centers, axis=0).max() <= ROUNDING * np.abs(centers).max())
 

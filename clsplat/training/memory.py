@@ -134,7 +134,7 @@ def plan(
     sizes = list(bytes_by_table.values())
     gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # for penalties and edits
     motion_bytes = 4 * components[MOTION] + MOVED_GAUSSIAN if MOTION in components else 0
-    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + motion_bytes
+    gaussian_bytes = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + motion_bytes
     fixed_bytes = photographs + FRAME_PIXEL * pixels
-    host = sum(4 * components.get(name, 0) for name in fractions)
-    return MemoryPlan(gaussian, FRAME_PAIR, fixed_bytes, max(sizes), limits.memory, limits.allocation, host)
+    host_bytes = sum(4 * components.get(name, 0) for name in fractions)
+    return MemoryPlan(gaussian_bytes, FRAME_PAIR, fixed_bytes, max(sizes), limits.memory, limits.allocation, host_bytes)

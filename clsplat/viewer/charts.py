@@ -86,8 +86,8 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
         counts[min(bins - 1, int(bins * value / largest))] += 1
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     parts = _svg_start(title)
-    y_ticks = _ticks(0, max(counts), integers=True)
-    for tick, label in zip(y_ticks, _tick_labels(y_ticks, integers=True), strict=True):
+    y_ticks = _ticks(0, max(counts), is_integer=True)
+    for tick, label in zip(y_ticks, _tick_labels(y_ticks, is_integer=True), strict=True):
         parts += _grid_line(HEIGHT - BOTTOM - tick / max(counts) * height, label)
     for i, count in enumerate(counts):
         if count:
@@ -148,9 +148,9 @@ def _are_integers(values: Sequence[float]) -> bool:
     return all(float(value).is_integer() for value in values)
 
 
-def _ticks(low: float, high: float, integers: bool = False) -> list[float]:
+def _ticks(low: float, high: float, is_integer: bool = False) -> list[float]:
     """Return three to six round numbers between low and high, or fewer if only integers are allowed."""
-    min_step = max((high - low) / 4, 1.0 if integers else 0.0)
+    min_step = max((high - low) / 4, 1.0 if is_integer else 0.0)
     power = 10 ** math.floor(math.log10(min_step))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= min_step)
     first = math.ceil(low / step - 1e-9)
@@ -164,9 +164,9 @@ def _decade_ticks(low: float, high: float) -> list[float]:
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
-def _tick_labels(values: Sequence[float], integers: bool = False) -> list[str]:
+def _tick_labels(values: Sequence[float], is_integer: bool = False) -> list[str]:
     """Return tick labels with enough digits to tell them apart: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
-    if integers and any(value % 100 for value in values):
+    if is_integer and any(value % 100 for value in values):
         return [f"{value:,.0f}" for value in values]
     candidates = [[_format_number(value, digits) for value in values] for digits in range(3, 10)]
     return next((labels for labels in candidates if len(set(labels)) == len(set(values))), candidates[-1])

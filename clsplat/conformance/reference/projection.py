@@ -384,7 +384,7 @@ def pose_gradient(
     grad_color: NDArray[Any],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `move_camera` at zero."""
-    shift, turn, zoom = np.zeros(3), np.zeros(3), np.zeros(1)
+    grad_shift, grad_turn, grad_zoom = np.zeros(3), np.zeros(3), np.zeros(1)
     for n in np.flatnonzero(splats.visible).tolist():
         foot = footprint(gaussians, n, camera, variance)
         sigmoid, rho, _ = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
@@ -395,8 +395,8 @@ def pose_gradient(
 
         # x_c' = exp([turn]x) x_c + shift, and M = J W: dL/d(turn) = <G_J, J [turn]x>
         j = foot.jacobian
-        turn += np.cross(foot.point, grad_point)
-        turn += [
+        grad_turn += np.cross(foot.point, grad_point)
+        grad_turn += [
             j[0, 2] * g[0, 1] + j[1, 2] * g[1, 1] - j[1, 1] * g[1, 2],
             j[0, 0] * g[0, 2] - j[0, 2] * g[0, 0] - j[1, 2] * g[1, 0],
             j[1, 1] * g[1, 0] - j[0, 0] * g[0, 1],
@@ -407,10 +407,10 @@ def pose_gradient(
         grad_c = grad_color[n] * (unclamped_color(gaussians, n, camera, degree) > 0)
         basis_gradient = sh_basis_gradient(direction, degree)
         grad_d = basis_gradient.T @ (gaussians.sh[n, : len(basis_gradient)] @ grad_c)
-        shift += grad_point + camera.rotation @ (grad_d - direction * (direction @ grad_d)) / distance
-        zoom += camera.fx * focal_gradient(camera, foot, grad_mean2d[n], g, 0)
-        zoom += camera.fy * focal_gradient(camera, foot, grad_mean2d[n], g, 1)
-    return shift, turn, zoom
+        grad_shift += grad_point + camera.rotation @ (grad_d - direction * (direction @ grad_d)) / distance
+        grad_zoom += camera.fx * focal_gradient(camera, foot, grad_mean2d[n], g, 0)
+        grad_zoom += camera.fy * focal_gradient(camera, foot, grad_mean2d[n], g, 1)
+    return grad_shift, grad_turn, grad_zoom
 
 
 def focal_gradient(

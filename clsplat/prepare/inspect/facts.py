@@ -32,7 +32,7 @@ from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.quality import SIDE, is_blank, is_blurred, sharpness_values
 from clsplat.scene.reader import Parts
 from clsplat.scene.reprojection import reprojection_errors, require_points_in_front
-from clsplat.scene.scene import camera_extent, outlier_cameras, share_center
+from clsplat.scene.scene import camera_extent, have_same_center, outlier_cameras
 from clsplat.scene.times import distinct_times, group_by_camera
 from clsplat.scene.view import NO_FILE, View, fits_camera, load_exposures
 
@@ -350,7 +350,7 @@ def measure_dataset(parts: Parts) -> Facts:
         else [],
         timestamps=len(distinct_times(views)),
         moving_cameras=len(group_by_camera(views)) if distinct_times(views) else 0,
-        same_center=len(views) > 1 and share_center(centers),
+        same_center=len(views) > 1 and have_same_center(centers),
         same_pose=_equal_groups(names, [(v.time, v.downscale, *_pose(v, extent)) for v in views]),
         same_but_case=[group for group in _equal_groups(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,

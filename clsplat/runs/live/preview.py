@@ -328,7 +328,7 @@ class LiveState:
         """Return the time since the last request of a page, s."""
         return time.monotonic() - self.last_request
 
-    def pause(self, paused: bool) -> None:
+    def pause(self, is_paused: bool) -> None:
         """Pause or resume the training."""
-        self.paused = paused
+        self.paused = is_paused
         self.requests.wake()

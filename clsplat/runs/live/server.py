@@ -298,9 +298,9 @@ class Handlers:
             raise RequestError(503, "busy; request it again")
         return Response(200, data, "image/jpeg", {"Cache-Control": "private, max-age=3600"})
 
-    def _pause(self, paused: bool) -> Response:
+    def _pause(self, is_paused: bool) -> Response:
         if not self.live.ended:
-            self.live.pause(paused)
+            self.live.pause(is_paused)
         return Response.json({"paused": self.live.paused})
 
     def _require_scene(self) -> ShownRun:

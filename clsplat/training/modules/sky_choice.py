@@ -24,7 +24,7 @@ LOG = logging.getLogger("clsplat")
 
 def sky_fraction(run: Run) -> float | None:
     """Return the fraction of training and validation photographs that show a sky; None if the fraction is unknown."""
-    if _reason_unknown(run):
+    if _explain_unknown(run):
         return None
     background = run.model_settings.background
     sky_count, count = _count_skies(run, (background if isinstance(background, Auto) else Auto()).share)
@@ -79,7 +79,7 @@ def sky_reason(run: Run) -> str:
     return background.reason.partition(";")[0]
 
 
-def _reason_unknown(run: Run) -> str:
+def _explain_unknown(run: Run) -> str:
     """Return the reason for which no sky can be detected in the photographs; empty if it can be detected."""
     if run.scene.points is None:
         return "the dataset has no points to tell distant regions from near ones"
@@ -94,7 +94,7 @@ def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
 
 def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     """Decide whether the model gets a sky, and return the decision and the reason for it."""
-    if reason := _reason_unknown(run):
+    if reason := _explain_unknown(run):
         return "off", reason
     sky_count, count = _count_skies(run, background.share)
     text = (

@@ -55,22 +55,22 @@ def with_times(views: Sequence[View], times: Times) -> list[View]:
     return [replace(view, time=float(time)) for view, time in zip(views, np.linspace(*times, len(views)), strict=True)]
 
 
-def assign_times(views: Sequence[View], times: Times | None, moves: bool) -> list[View]:
+def assign_times(views: Sequence[View], times: Times | None, is_moving: bool) -> list[View]:
     """Return views with timestamps: the requested ones, the existing ones, or the full range for a moving model.
 
-    moves: whether the model moves.  Raises ConfigError if timestamps were requested for a model that does not move.
+    is_moving: whether the model moves.  Raises ConfigError if timestamps were requested for a model that does not move.
     """
     if times is not None:
-        require_motion(moves)
+        require_motion(is_moving)
         return with_times(views, times)
-    if moves and any(view.time is None for view in views):
+    if is_moving and any(view.time is None for view in views):
         return with_times(views, FULL_RANGE)
     return list(views)
 
 
-def require_motion(moves: bool) -> None:
+def require_motion(is_moving: bool) -> None:
     """Raise ConfigError unless the model moves."""
-    if not moves:
+    if not is_moving:
         raise ConfigError("a time was given, but the model does not move; omit the time")
 
 
@@ -140,16 +140,16 @@ class VideoPlan:
 
 
 def plan_video(
-    request: VideoRequest, scene: Scene | None, points: Floats, moves: bool = False, origin: Floats | None = None
+    request: VideoRequest, scene: Scene | None, points: Floats, is_moving: bool = False, origin: Floats | None = None
 ) -> VideoPlan:
     """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene.
 
-    moves: whether the model moves; origin: [3] world coordinates of the points' origin, by default that of the scene.
+    is_moving: whether the model moves; origin: [3] world coordinates of the points' origin, by default the scene's.
     Raises ConfigError if the path needs a scene and there is none, or if times are set without motion, and DataError if
     the path is impossible in the scene.
     """
     plan = _plan_path(request, scene, points, scene.origin if scene and origin is None else origin)
-    return replace(plan, views=assign_times(plan.views, request.times, moves))
+    return replace(plan, views=assign_times(plan.views, request.times, is_moving))
 
 
 def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origin: Floats | None) -> VideoPlan:
