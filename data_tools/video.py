@@ -45,7 +45,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         LOG.info("%s: looking for sharp frames", video)
         sharpnesses, motions = _measure_frames(video)
         if len(sharpnesses) == 1:
-            raise DataError(f"{video}: has only one frame; use a photograph directly, without `clsplat data video`")
+            raise DataError(f"{video}: has only one frame; use a photo directly, without `clsplat data video`")
         frame_indices = sharpest(sharpnesses, motions, frames)
         LOG.info("%d frames, of which %d are written", len(sharpnesses), len(frame_indices))
         write_text(out / RECORD, json.dumps({**settings, "chosen": frame_indices}) + "\n")

@@ -38,18 +38,18 @@ def synthetic(
 
 @app.command()
 def photos(
-    source: Annotated[Path, typer.Argument(help="Folder of photographs; nothing is written to it.")],
+    source: Annotated[Path, typer.Argument(help="Folder of photos; nothing is written to it.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
     long_side: Annotated[int, typer.Option(min=64, help="Image size for features: pixels of the long side.")] = 1600,
     camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
-    matching: Annotated[Matching, typer.Option(help="Which pairs of photographs are matched.")] = "auto",
+    matching: Annotated[Matching, typer.Option(help="Which pairs of photos are matched.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs by structure from motion, and write a COLMAP folder."""
     from clsplat.prepare.cache import place_photographs
 
     count = place_photographs(source, out, long_side, camera_model, matching, mapper)
-    print(f"{count} photographs placed, a COLMAP folder in {out}")
+    print(f"{count} photos placed, a COLMAP folder in {out}")
 
 
 @app.command()
@@ -93,14 +93,14 @@ def cameras(
         Literal["colmap", "nerfstudio", "inria"],
         typer.Option("--format", help="sparse/0/*.bin, transforms.json, or cameras.json of the original 3DGS."),
     ] = "colmap",
-    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photographs, too.")] = "none",
+    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos, too.")] = "none",
 ) -> None:
     """Write the cameras of a scene for other programs."""
     from clsplat.api.pictures import write_cameras
 
     print("\n".join(str(path) for path in write_cameras(scene, out, format_, images)))
     if images == "none" and format_ != "inria":
-        print("the photographs were not copied; to train on this folder, write it with --images copy")
+        print("the photos were not copied; to train on this folder, write it with --images copy")
 
 
 @app.command()

@@ -95,7 +95,7 @@ class Edit:
     def survey(self) -> Survey:
         """The survey of the training views with the Gaussians before the edit.  Raises ConfigError without views."""
         if self._survey is None:
-            raise ConfigError("a rule needs training photographs, and there are none; remove the rule")
+            raise ConfigError("a rule needs training photos, and there are none; remove the rule")
         return self._survey
 
     def at(self, schedule: Schedule) -> float:

@@ -28,14 +28,14 @@ class PixelQuantile(Settings):
     quantile: Share
     """Fraction of the pixels that are below the threshold."""
     of: Literal["pixels"]
-    """Take the quantile over the photographs' pixels."""
+    """Take the quantile over the photos' pixels."""
 
 
 Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explain_schedule(", or {quantile, of}")]
 
 
 def _raise_no_photographs(q: float) -> float:
-    raise ConfigError("a quantile of pixels needs training photographs, and there are none; give a number")
+    raise ConfigError("a quantile of pixels needs training photos, and there are none; give a number")
 
 
 @dataclass(frozen=True)

@@ -98,9 +98,9 @@ class ImageLoss(Loss):
     """A loss on the rendered image."""
 
     symmetric: ClassVar[bool] = False
-    """Whether the value is the same if image and photograph are swapped, as the module `haar` requires."""
+    """Whether the value is the same if image and photo are swapped, as the module `haar` requires."""
     reads_photograph: ClassVar[bool] = True
-    """Whether the loss compares the image with the photograph; training needs at least one such loss."""
+    """Whether the loss compares the image with the photo; training needs at least one such loss."""
 
     def reads(self, step: int) -> Content:
         """Return the planes of the image that the loss needs at a global step: colors, or colors and inverse depth."""

@@ -50,7 +50,7 @@ def _check(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Ma
     shape = image.shape
     if shape != photograph.shape or len(shape) != 3 or shape[2] != 3 or image.size == 0:
         raise ValueError(
-            f"the image has shape {shape}, the photograph {photograph.shape}; "
+            f"the image has shape {shape}, the photo {photograph.shape}; "
             "expected the same [height, width, 3], with at least one pixel"
         )
     if mask is not None and (mask.dtype != np.bool_ or mask.shape != shape[:2] or not mask.any()):
@@ -58,7 +58,7 @@ def _check(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Ma
             f"the mask has shape {mask.shape} and type {mask.dtype}; "
             f"expected bool of shape {shape[:2]}, with at least one unmasked pixel"
         )
-    for name, pixels in (("image", image), ("photograph", photograph)):
+    for name, pixels in (("image", image), ("photo", photograph)):
         if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():
             raise ValueError(f"the {name} has values that are not finite; expected uint8, or floats in [0, 1]")
     return to_8_bits(image), to_8_bits(photograph)

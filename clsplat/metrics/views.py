@@ -227,16 +227,16 @@ def log_color_metrics(averages: dict[str, Any]) -> None:
         return
     psnr_color, reason = averages["psnr_color"], averages.get("psnr_color_reason")
     if psnr_color is None:
-        LOG.warning("no PSNR in the photographs' colors: %s", reason)
+        LOG.warning("no PSNR in the photos' colors: %s", reason)
     elif reason:
         LOG.warning(
-            "in the photographs' colors: PSNR %.2f dB, the mean of %s: %s",
+            "in the photos' colors: PSNR %.2f dB, the mean of %s: %s",
             *(psnr_color, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
         is_notable = psnr_color - averages["psnr"] > NOTABLE_GAIN
-        note = "; the photographs' exposures differ, which PSNR counts as errors" if is_notable else ""
-        LOG.info("in the photographs' colors: PSNR %.2f dB%s", psnr_color, note)
+        note = "; the photos' exposures differ, which PSNR counts as errors" if is_notable else ""
+        LOG.info("in the photos' colors: PSNR %.2f dB%s", psnr_color, note)
 
 
 # PSNR of a dynamic scene, separately for timestamps of training views and others.

@@ -218,7 +218,7 @@ class FieldPlan:
         return (
             f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of "
             f"{self.parameters / MIB:,.0f} MiB, "
-            f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photographs {self.photographs / MIB:,.0f} MiB) "
+            f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photos {self.photographs / MIB:,.0f} MiB) "
             f"in {limits.memory / MIB:,.0f} MiB with buffers up to {limits.allocation / MIB:,.0f} MiB"
         )
 

@@ -17,7 +17,7 @@ from clsplat.opencl.device import constants
 Floats = NDArray[np.float64]
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
-MEANING = "a color c of the model (red, green, blue) is min(1, E c + b) in the photograph"
+MEANING = "a color c of the model (red, green, blue) is min(1, E c + b) in the photo"
 
 # Adam for scalars in a dictionary that also contains their moments and is saved in checkpoints.
 
@@ -100,12 +100,12 @@ class ViewTable:
         if not path.is_file():
             return {}
         try:
-            items = read_json(path, f"{self.name} of photographs")["photographs"].items()
+            items = read_json(path, f"{self.name} of photos")["photographs"].items()
             rows = {view: np.array([float(row[column]) for column in self.columns]) for view, row in items}
         except (AttributeError, KeyError, TypeError, ValueError):
             rows = {"": np.array([np.nan])}
         if not all(np.isfinite(row).all() for row in rows.values()):
             raise DataError(
-                f"{path}: expected {len(self.columns)} finite numbers for each photograph; train again, or remove it"
+                f"{path}: expected {len(self.columns)} finite numbers for each photo; train again, or remove it"
             )
         return rows

@@ -76,7 +76,7 @@ class DepthMaps:
         values = self.read(name, *size)
         fit = fit_scale_and_offset(values[rows, columns], inverse)
         if fit is None:
-            LOG.warning("%s: ignoring the depth map, which does not fit the points of the photograph", name)
+            LOG.warning("%s: ignoring the depth map, which does not fit the points of the photo", name)
             return None
         step = math.ceil(math.sqrt(values.size / MAX_PIXELS))
         y, x = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)

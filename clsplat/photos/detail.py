@@ -80,9 +80,9 @@ class DetailDivisor(Settings):
     step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})
 
     follows: Literal["detail"]
-    """`detail`: the mean spectrum of the training photographs."""
+    """`detail`: the mean spectrum of the training photos."""
     until: Annotated[int, Field(gt=0, le=10**6)]
-    """Global step at which photographs are at full size; up to a million."""
+    """Global step at which photos are at full size; up to a million."""
     largest: Annotated[float, Field(ge=1)] = 8
     """Largest downscale factor."""
     every: EverySteps = 100
@@ -116,9 +116,9 @@ def describe_sizes(sizes: Points) -> str:
     """Return a sentence about the sizes of the photographs during training.  sizes: the downscale factor by step."""
     (_, first), *changes = sizes.points
     if not changes and first == 1:
-        return "photographs are trained on at full size, since smaller ones would lose too much detail"
+        return "photos are trained on at full size, since smaller ones would lose too much detail"
     clauses = [f"{_describe_size(divisor)} from step {step:.0f}" for step, divisor in changes]
-    return f"photographs are trained on at {', '.join([f'{_describe_size(first)} of their size', *clauses])}"
+    return f"photos are trained on at {', '.join([f'{_describe_size(first)} of their size', *clauses])}"
 
 
 def _describe_size(divisor: float) -> str:

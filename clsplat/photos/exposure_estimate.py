@@ -49,7 +49,7 @@ class Exposures:
         """A summary for messages."""
         if not self.log_gains:
             return self.source
-        return f"exposures of {len(self.log_gains)} photographs differ by {self.spread:.1%} {self.source}"
+        return f"exposures of {len(self.log_gains)} photos differ by {self.spread:.1%} {self.source}"
 
 
 UNKNOWN = Exposures({}, "neither tracks nor EXIF give exposures")
@@ -110,7 +110,7 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographRea
     is_known = np.isfinite(log_gains).all(axis=1)
     log_gains -= log_gains[is_known].mean(axis=0) if is_known.any() else 0
     fraction = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
-    source = f"at {shared_count:,} points, which explains {fraction:.0%} of the variance between photographs of a point"
+    source = f"at {shared_count:,} points, which explains {fraction:.0%} of the variance between photos of a point"
     return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, fraction)
 
 

@@ -147,7 +147,7 @@ class Photographs:
         if photograph.empty:
             raise DataError(
                 f"{original.mask_path or original.image_path}: the mask excludes every pixel of '{original.name}'; "
-                "fix the mask, or remove the photograph from the dataset"
+                "fix the mask, or remove the photo from the dataset"
             )
         return replace(photograph, camera=replace(photograph.camera, view=number))
 

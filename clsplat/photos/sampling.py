@@ -96,9 +96,9 @@ class ViewSettings(Settings):
     order: OneOf[Order] = Uniform()
     """Order in which training visits the views."""
     resolution: Annotated[DetailDivisor | AtLeastOne, explain_schedule(", or {follows: detail, until, …}")] = 1.0
-    """Downscale factor on top of `scene.downscale`, at least 1; may be scheduled, or follow the photographs' detail."""
+    """Downscale factor on top of `scene.downscale`, at least 1; may be scheduled, or follow the photos' detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
-    """Transforms of the photograph, in order."""
+    """Transforms of the photo, in order."""
 
     def resolve(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
         """Return settings in which the resolution is a schedule.
@@ -114,7 +114,7 @@ class ViewSettings(Settings):
     def divisor(self, step: int) -> float:
         """Return the downscale factor at a global step.  Raises ConfigError if `resolve` was not called."""
         if isinstance(self.resolution, DetailDivisor):
-            raise ConfigError("`resolution: {follows: detail}` needs photographs; call `resolve` first")
+            raise ConfigError("`resolution: {follows: detail}` needs photos; call `resolve` first")
         return at_step(self.resolution, step)
 
     @property

@@ -49,7 +49,7 @@ class MeanFilter(PhotographTransform):
 
     type: Literal["mean_filter"] = "mean_filter"
     width: NonNegative
-    """Side of the square as a fraction of the photograph's width, rounded to an odd number of px; may be scheduled."""
+    """Side of the square as a fraction of the photo's width, rounded to an odd number of px; may be scheduled."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         return _average(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)

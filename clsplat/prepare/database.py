@@ -93,7 +93,7 @@ def raising_data_error(path: Path, action: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: could not {action} ({str(error).splitlines()[0]}); check the photographs") from error
+        raise DataError(f"{path}: could not {action} ({str(error).splitlines()[0]}); check the photos") from error
 
 
 def count_matched_pairs(database: Path) -> int:

@@ -81,14 +81,14 @@ def diagnose(graph: MatchGraph) -> str:
         problem = f"half of them have {f'at most {count}' if count else 'no'} features"
         return (
             f"{problem if any(graph.features.values()) else 'none has features'}, where thousands are usual: they are "
-            "blurred, dark, or show plain surfaces; take sharp photographs of textured objects"
+            "blurred, dark, or show plain surfaces; take sharp photos of textured objects"
         )
     if not graph.pairs:
-        return "no two of them show the same features; take photographs with more overlap, of a static scene"
+        return "no two of them show the same features; take photos with more overlap, of a static scene"
     groups = graph.groups(FEW_MATCHES)
     if len(groups[0]) < max(MIN_PHOTOGRAPHS, len(graph.features) / 2):
-        return f"{_describe_groups(graph, groups)}; take photographs of one scene, with more overlap"
-    return "take more sharp photographs, a step apart, of a textured, static scene"
+        return f"{_describe_groups(graph, groups)}; take photos of one scene, with more overlap"
+    return "take more sharp photos, a step apart, of a textured, static scene"
 
 
 def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
@@ -129,7 +129,7 @@ def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpn
     is_unsharp = is_blurred(graph.measure_sharpness(name), typical_sharpness)
     note = "; it may be blurred" if is_unsharp else ""
     if not matches:  # only a guess: a photograph without fine detail measures like a blurred one
-        return f"matches no other photograph{note}"
+        return f"matches no other photo{note}"
     best = max(matches, key=lambda other: (matches[other], other))
     if not counts:
         return f"matches only {best}, which is not placed either"

@@ -69,7 +69,7 @@ def find_features(
     log_warnings(figures)
     if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
         LOG.warning(
-            "the photographs are twice as wide as high, like panoramas; "
+            "the photos are twice as wide as high, like panoramas; "
             "for panoramas, use --set find_features.camera_model=EQUIRECTANGULAR"
         )
     if note := shared_camera_note(out / IMAGES, groups):
@@ -96,7 +96,7 @@ def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
     pycolmap = require_pycolmap()
     with raising_data_error(images, "find features"), open_database(pycolmap, database) as db:
         names_by_id = images_without_features(db)
-        for image_id, name in counted(names_by_id.items(), "photographs with features", len(names_by_id)):
+        for image_id, name in counted(names_by_id.items(), "photos with features", len(names_by_id)):
             pixels, (scale_x, scale_y) = read_gray(images / name, options.long_side)
             keypoints, descriptors = sift(pixels, options)
             keypoints[:, :3] *= scale_x, scale_y, (scale_x + scale_y) / 2

@@ -67,11 +67,11 @@ def require_folder(folder: Path) -> None:
     """Raise DataError unless `folder` is a folder.  For a video, the error names the command to extract photographs."""
     if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
         raise DataError(
-            f"{folder}: is a video; run `clsplat data video {shell_quote(folder)} FOLDER` to extract photographs"
+            f"{folder}: is a video; run `clsplat data video {shell_quote(folder)} FOLDER` to extract photos"
         )
     if not folder.is_dir():
         fault = "is a file" if folder.is_file() else "no such folder"
-        raise DataError(f"{folder}: {fault}; expected a folder of photographs")
+        raise DataError(f"{folder}: {fault}; expected a folder of photos")
 
 
 def require_photographs(folder: Path, excluded_folder: Path | None = None) -> None:
@@ -81,7 +81,7 @@ def require_photographs(folder: Path, excluded_folder: Path | None = None) -> No
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
         hints = "".join(f"; {text}" for text in _conversion_hints(unreadable_names))
         raise DataError(
-            f"{folder}: has {pluralize(len(names), 'photograph')}; "
+            f"{folder}: has {pluralize(len(names), 'photo')}; "
             f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){hints}"
         )
 
@@ -117,7 +117,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     Returns the names of the readable photographs, and a dict from the names of the others to the reasons.  Raises
     DataError when too few can be read, or when all are blank.
     """
-    readable_names, read_errors, count = [], dict[str, str](), Count("photographs read", len(names))
+    readable_names, read_errors, count = [], dict[str, str](), Count("photos read", len(names))
     blank_count = 0
     for i, name in enumerate(names, 1):
         count.reach(i)
@@ -135,11 +135,11 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     if times := read_times(photographs):
         write_times(images, {name: times[name] for name in readable_names if name in times})
     if readable_names and blank_count == len(readable_names):
-        raise DataError(f"{photographs}: no photograph shows anything; export or take them again")
+        raise DataError(f"{photographs}: no photo shows anything; export or take them again")
     if len(readable_names) < MIN_PHOTOGRAPHS:
         faults = first_few([f"{name} ({reason})" for name, reason in read_errors.items()])
         raise DataError(
-            f"{photographs}: only {len(readable_names)} of {len(names)} photographs can be read: {faults}; "
+            f"{photographs}: only {len(readable_names)} of {len(names)} photos can be read: {faults}; "
             f"{remedy_for(read_errors)}"
         )
     return readable_names, read_errors
@@ -226,20 +226,20 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
     if errors := figures.get("damaged"):
         names = [f"{name} ({reason})" for name, reason in errors.items()]
         count = figures["photographs"] + len(names)
-        warnings.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy_for(errors)}")
+        warnings.append(f"{len(names)} of {count} photos cannot be read: {first_few(names)}; {remedy_for(errors)}")
     if missing_names := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
         examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing_names])
         alternative = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
         warnings.append(
-            f"{len(missing_names)} of {figures['registered'] + len(missing_names)} photographs could not be placed and "
-            f"are not used: {examples}; to place them, add photographs from viewpoints in between{alternative}"
+            f"{len(missing_names)} of {figures['registered'] + len(missing_names)} photos could not be placed and "
+            f"are not used: {examples}; to place them, add photos from viewpoints in between{alternative}"
         )
     if sizes := figures.get("other_models"):
-        counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photograph")])
+        counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photo")])
         warnings.append(
             f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}: add "
-            "photographs that connect them"
+            "photos that connect them"
         )
     return warnings
 
@@ -256,7 +256,7 @@ def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
         unplaced = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
         count, unused_photos = int(cameras["registered"]), [*faults, *unplaced]
         error = float(cameras["error_px"])
-        text = f"{count} of {count + len(unused_photos)} photographs placed, reprojection error {error:.2f} px"
+        text = f"{count} of {count + len(unused_photos)} photos placed, reprojection error {error:.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
     return text + (f"; left out: {first_few(unused_photos)}" if unused_photos else "")

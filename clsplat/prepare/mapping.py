@@ -92,7 +92,7 @@ def map_cameras(
     names = image_names(pycolmap, source / DATABASE)
     graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
     if reason := no_depth_reason(pycolmap, source / DATABASE):
-        raise DataError(f"{source / IMAGES}: the photographs {reason}")
+        raise DataError(f"{source / IMAGES}: the photos {reason}")
     models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
         placed_count = models[0].num_reg_images() if models else 0
@@ -104,7 +104,7 @@ def map_cameras(
             if attempt.wider and not (extra_pairs := expand_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
                 continue
             if attempt is not first:
-                LOG.info("placed %d of %d photographs; trying again with %s", placed_count, len(names), attempt.label)
+                LOG.info("placed %d of %d photos; trying again with %s", placed_count, len(names), attempt.label)
             count += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.wider:
@@ -119,11 +119,11 @@ def map_cameras(
         if candidates and candidates[0].num_reg_images() > placed_count:
             models, best = candidates, attempt
     if not models:
-        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(graph)}")
+        raise DataError(f"{source / IMAGES}: the {len(names)} photos could not be placed: {diagnose(graph)}")
     database = best.database(source, out)
     if reason := no_depth_reason(pycolmap, database, _names(models[0])):
         counts = f"{models[0].num_reg_images()} of {len(names)}"
-        raise DataError(f"{source / IMAGES}: the {counts} photographs that were placed {reason}")
+        raise DataError(f"{source / IMAGES}: the {counts} photos that were placed {reason}")
     if best.dense:
         graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == PAIR:
@@ -163,7 +163,7 @@ def _run_attempt(
     pycolmap.set_random_seed(0)
     with raising_data_error(source / IMAGES, "place the cameras"):
         run_mapper = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
-        count = Count("photographs placed", len(image_names(pycolmap, database)))
+        count = Count("photos placed", len(image_names(pycolmap, database)))
 
         def on_placed() -> None:
             count.reach(min(max(2, count.done) + 1, count.total))

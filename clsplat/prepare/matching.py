@@ -52,7 +52,7 @@ class Pairing:
     @classmethod
     def read(cls, folder: Path) -> "Pairing":
         """Read the settings that match_features wrote to a folder.  Raises DataError when they are missing."""
-        return cls(**read_json(folder / MATCHING, "how photographs were matched"))
+        return cls(**read_json(folder / MATCHING, "how photos were matched"))
 
 
 def match_features(
@@ -93,21 +93,21 @@ def match_database(database: Path, pairing: Pairing) -> Matching:
     count, matching, neighbors = len(image_names(pycolmap, database)), pairing.matching, pairing.neighbors
     method = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     common_options = _options(pycolmap, pairing.threads)
-    with raising_data_error(database, "match photographs"):
+    with raising_data_error(database, "match photos"):
         if method == "sequential":
             options = pycolmap.SequentialPairingOptions()
             options.overlap, options.quadratic_overlap = neighbors, True
-            LOG.info("matching %d photographs, each with the next %d by name", count, neighbors)
+            LOG.info("matching %d photos, each with the next %d by name", count, neighbors)
             steps = {*range(1, neighbors + 1), *(1 << power for power in range(neighbors))}
             with _count_pairs(database, sum(max(0, count - step) for step in steps)):
                 pycolmap.match_sequential(str(database), pairing_options=options, **common_options)
         elif method == "vocabulary":
-            LOG.info("matching %d photographs, each with the %d most similar", count, 2 * neighbors)
+            LOG.info("matching %d photos, each with the %d most similar", count, 2 * neighbors)
             pairs = _find_similar_pairs(pycolmap, database, 2 * neighbors)
             with _count_pairs(database, len(pairs)):
                 _match_pairs(database, pairs, common_options)
         else:
-            LOG.info("matching all pairs of %d photographs", count)
+            LOG.info("matching all pairs of %d photos", count)
             with _count_pairs(database, count * (count - 1) // 2):
                 pycolmap.match_exhaustive(str(database), **common_options)
     return method
@@ -122,8 +122,8 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         matched_count = db.num_matched_image_pairs()
     if not new_pairs:
         return
-    LOG.info("matching %s of photographs without a camera", pluralize(len(new_pairs), "more pair"))
-    with raising_data_error(database, "match photographs"), _count_pairs(database, matched_count + len(new_pairs)):
+    LOG.info("matching %s of photos without a camera", pluralize(len(new_pairs), "more pair"))
+    with raising_data_error(database, "match photos"), _count_pairs(database, matched_count + len(new_pairs)):
         _match_pairs(database, new_pairs, _options(pycolmap, threads))
 
 

@@ -36,7 +36,7 @@ def shared_camera_note(images: Path, groups: Sequence[Sequence[str]]) -> str:
     if not unknown_groups:
         return ""
     return (
-        f"{sum(map(len, unknown_groups))} photographs have no lens data in EXIF, so those of the same size share a "
+        f"{sum(map(len, unknown_groups))} photos have no lens data in EXIF, so those of the same size share a "
         f"camera ({pluralize(len(unknown_groups), 'camera')} in total); --set find_features.cameras=per_image "
         "calibrates each one"
     )

@@ -45,7 +45,7 @@ class Step(Settings):
 
     def pieces(self, photographs: int) -> tuple[int, str]:
         """Return the number of items that the step processes for a number of photographs, and their plural name."""
-        return photographs, "photographs"
+        return photographs, "photos"
 
     @abstractmethod
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
@@ -74,20 +74,20 @@ class FindFeatures(Step):
     stage: Literal["find_features"] = "find_features"
 
     long_side: Positive = 1600
-    """Longer side in px of the images in which features are detected; larger photographs are reduced."""
+    """Longer side in px of the images in which features are detected; larger photos are reduced."""
     features: Positive = 12288
-    """Maximum number of features per photograph."""
+    """Maximum number of features per photo."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses, EQUIRECTANGULAR for panoramas."""
     cameras: Cameras = "auto"
-    """Photographs of the same size that share a camera; auto: those with the same lens in EXIF, or without a lens."""
+    """Photos of the same size that share a camera; auto: those with the same lens in EXIF, or without a lens."""
 
     def is_done_in(self, source: Path) -> bool:
         return is_scene(source)
 
     def check(self, source: Path, excluded_folder: Path) -> None:
         if is_scene(source):
-            raise DataError(f"{source}: already contains cameras; give a folder that contains only photographs")
+            raise DataError(f"{source}: already contains cameras; give a folder that contains only photos")
         require_photographs(source, excluded_folder.resolve())
         require_pycolmap()
 
@@ -97,7 +97,7 @@ class FindFeatures(Step):
         return find_features(source, out, options, self.camera_model, self.cameras, excluded_folder.resolve())
 
     def summary(self, figures: dict[str, Any]) -> str:
-        photographs = pluralize(figures["photographs"], "photograph")
+        photographs = pluralize(figures["photographs"], "photo")
         return f"features found in {photographs} from {pluralize(figures['cameras'], 'camera')}"
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
@@ -113,9 +113,9 @@ class MatchFeatures(Step):
     stage: Literal["match_features"] = "match_features"
 
     matching: Matching = "auto"
-    """Pairs of photographs to match; auto: exhaustive, or vocabulary for more than 200 photographs."""
+    """Pairs of photos to match; auto: exhaustive, or vocabulary for more than 200 photos."""
     neighbors: Positive = 10
-    """Number of photographs that each is matched with, unless matching is exhaustive."""
+    """Number of photos that each is matched with, unless matching is exhaustive."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not always bit-identical."""
 
@@ -126,7 +126,7 @@ class MatchFeatures(Step):
         return match_features(source, out, self.matching, self.neighbors, self.threads)
 
     def summary(self, figures: dict[str, Any]) -> str:
-        return f"{pluralize(figures['pairs'], 'pair')} of photographs match"
+        return f"{pluralize(figures['pairs'], 'pair')} of photos match"
 
 
 class MapCameras(Step):
@@ -148,9 +148,9 @@ class MapCameras(Step):
     """Number of threads; more than one is faster, but results are not bit-identical."""
     attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
     """Maximum number of attempts.  The second accepts smaller angles and fewer matches; the third matches more pairs of
-    the unplaced photographs, unless all pairs were matched; the last two find more features."""
+    the unplaced photos, unless all pairs were matched; the last two find more features."""
     min_track_length: Literal[2, 3] = 3
-    """Number of photographs in which a point must be visible.  COLMAP drops points visible in only two; keeping them
+    """Number of photos in which a point must be visible.  COLMAP drops points visible in only two; keeping them
     gave 2.5 times as many points on one scene."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
@@ -173,12 +173,12 @@ class Undistort(Step):
     stage: Literal["undistort"] = "undistort"
 
     long_side: Positive | None = None
-    """Longer side of the undistorted images in px; default: that of the photographs."""
+    """Longer side of the undistorted images in px; default: that of the photos."""
     undefined_pixels: UndefinedPixels = "crop"
-    """How to treat pixels that the photograph does not cover: `crop` the image, or keep all of it and `mask` them."""
+    """How to treat pixels that the photo does not cover: `crop` the image, or keep all of it and `mask` them."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
 
     def summary(self, figures: dict[str, Any]) -> str:
-        return f"photographs undistorted to {pluralize(figures['images'], 'pinhole image')}"
+        return f"photos undistorted to {pluralize(figures['images'], 'pinhole image')}"

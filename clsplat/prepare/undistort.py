@@ -34,7 +34,7 @@ def undistort_scene(
     names, manifest = _png_names([view.name for view in scene.views]), Manifest(out)
     for name in names:
         manifest.require_listed(out / "images" / name)
-    views, count = [], Count("photographs undistorted", len(names))
+    views, count = [], Count("photos undistorted", len(names))
     for i, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         pinhole_view = replace(_downscale(_with_lens(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name

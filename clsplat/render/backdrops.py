@@ -60,9 +60,9 @@ class Auto(Backdrop):
     model: EnvironmentMap = EnvironmentMap()
     """The sky to learn."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.15
-    """Fraction of the upper third of a photograph that must be sky for the photograph to count."""
+    """Fraction of the upper third of a photo that must be sky for the photo to count."""
     photographs: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Fraction of the photographs that must count."""
+    """Fraction of the photos that must count."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: whether a sky is learned."""
     reason: str = ""

@@ -150,7 +150,7 @@ def _make_side(
     assert scene is not None
     photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
     if not photo_views:
-        raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photographs; name a model instead")
+        raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photos; name a model instead")
 
     @lru_cache(maxsize=4)
     def photograph(index: int) -> Image:

@@ -205,12 +205,13 @@ class Identity:
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def changes(self, before: "Identity") -> list[str]:
-        """List the changes since `before`, with counts and the first few names: 'the photograph of 2 views (…)'."""
+        """List the changes since `before`, with counts and the first few names: 'the photo of 2 views (…)'."""
         changes = []
         old, new = before._rows, self._rows
         for key in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(key) != new[name].get(key)]
-            changes += [f"the {key} of {_list_views(names)}"] if names else []
+            noun = "photo" if key == "photograph" else key
+            changes += [f"the {noun} of {_list_views(names)}"] if names else []
         moved_names = [name for name in old if name in new and before._splits(name) != self._splits(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
         changes += [f"the split of {_list_views(moved_names)}"] if moved_names else []

@@ -201,9 +201,9 @@ class FileLookup:
     def note(self) -> str:
         """One sentence with the number of inexact matches and how they match; "" if all matches are exact."""
         for i, length in self.matches.items():
-            count = f"{len(self.matches)} of {pluralize(len(self.listing), 'image' if self.strict else 'photograph')}"
+            count = f"{len(self.matches)} of {pluralize(len(self.listing), 'image' if self.strict else 'photo')}"
             criterion = "base name" if length == 1 else "the end of their paths"
-            scaling = ", with cameras scaled to these smaller photographs" if self.downscaled_files else ""
+            scaling = ", with cameras scaled to these smaller photos" if self.downscaled_files else ""
             file = self.paths[i].relative_to(self.root).as_posix()
             return f"{count} matched by {criterion}, such as {file} for {quote(self.listing[i])}{scaling}"
         return ""

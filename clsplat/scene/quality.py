@@ -25,7 +25,7 @@ class Measures:
     """Measurements of the photographs before training."""
 
     photographs: int
-    """Number of training photographs, including those for validation."""
+    """Number of training photos, including those for validation."""
     reprojection_error: float | None = None
     """Mean reprojection error of the points, px at the training resolution; None: unknown."""
     scene: Scene | None = None

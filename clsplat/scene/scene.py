@@ -211,7 +211,7 @@ class Scene:
         rows = {
             "scene": str(self.path),
             "views": f"{len(self.train)} for training, {len(self.test)} for testing",
-            "photographs": f"{self.image_sizes} px",
+            "photos": f"{self.image_sizes} px",
             "points": f"{count:,}" if count else "none",
             "extent": f"{self.extent:.3g} scene units",
         }

@@ -27,9 +27,9 @@ def read_times(folder: Path) -> dict[str, float] | None:
     path = folder / FILE
     if not os.path.lexists(path):  # reading reports a path that is not a file
         return None
-    table = read_json(path, "timestamps of photographs in JSON", limit=LARGEST)
+    table = read_json(path, "timestamps of photos in JSON", limit=LARGEST)
     if not isinstance(table, dict):
-        raise DataError(f"{path}: expected a table with a number for each photograph, by name")
+        raise DataError(f"{path}: expected a table with a number for each photo, by name")
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(
@@ -49,5 +49,5 @@ def add_times(views: list[View], folder: Path) -> list[View]:
         return views
     clock = make_clock(folder / FILE, [(view.name, times.get(view.name)) for view in views])
     if clock is None:
-        raise DataError(f"{folder / FILE}: names none of the {len(views)} photographs; write their relative paths")
+        raise DataError(f"{folder / FILE}: names none of the {len(views)} photos; write their relative paths")
     return [replace(view, time=float(clock(times[view.name]))) for view in views]

@@ -135,7 +135,7 @@ class View:
         if not views:
             raise DataError(
                 f"{self.mask_path}: the mask excludes every pixel of {quote(self.name)}; "
-                "fix the mask, or remove the photograph from the dataset"
+                "fix the mask, or remove the photo from the dataset"
             )
         return views
 
@@ -295,7 +295,7 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
     """
     is_file = path != NO_FILE
     if not is_file and view.image is None:
-        raise DataError(f"the view {quote(view.name)} has no photograph; expected one with an image or an image_path")
+        raise DataError(f"the view {quote(view.name)} has no photo; expected one with an image or an image_path")
     decoded: dict[bool, NDArray[Any]] = {}
 
     def size(upright: bool) -> Size:

@@ -27,9 +27,9 @@ NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 def _require_text(value: Any) -> Any:
     if not isinstance(value, str):
-        raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
+        raise ValueError("expected names of photos as text: put numbers in quotes, as in '0042'")
     if not value.strip():
-        raise ValueError("expected names of photographs that are not empty")
+        raise ValueError("expected names of photos that are not empty")
     return value
 
 
@@ -98,7 +98,7 @@ class ViewSelection(Settings):
                     raise _excluded_error(source, name, key)
                 del matches_of[name]
         if count := len({*lines}) - len(matches_of):
-            LOG.info("%s: skipped %s whose photograph is missing", source, pluralize(count, "name"))
+            LOG.info("%s: skipped %s whose photo is missing", source, pluralize(count, "name"))
         return {i for name, matches in matches_of.items() for i in _require_one_match(name, matches, names, source)}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> list[str]:
@@ -142,7 +142,7 @@ def _excluded_error(source: str, name: str, key: ExcludedBy) -> DataError:
         "holdout": ("is a test view", "from scene.holdout"),
         "train": ("is left out by scene.train", "add it to scene.train"),
     }[key]
-    message = f"{quote(name)} {reason}; expected training photographs: remove it from this list, or {remedy}"
+    message = f"{quote(name)} {reason}; expected training photos: remove it from this list, or {remedy}"
     return MissingViewError(f"{source}: {message}")
 
 
@@ -202,7 +202,7 @@ def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataErr
     similar = get_close_matches(name, [*names, *(PurePosixPath(name).name for name in names)], 1)
     hint = f"the first is {quote(names[0])}: correct or remove the name"
     hint = f"did you mean {quote(similar[0])}?" if similar else hint
-    return MissingViewError(f"{source}: no photograph is called {quote(name)}; {hint}")
+    return MissingViewError(f"{source}: no photo is called {quote(name)}; {hint}")
 
 
 # Split a scene into training, validation and test views.
@@ -238,13 +238,13 @@ class Split:
             test = _select(scene, "holdout", holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; name fewer, "
+                    f"{scene.path}: scene.holdout takes all {len(names)} photos for testing; name fewer, "
                     "or raise `every`, to leave some for training"
                 )
             if not test:
-                remedy = "lower its offset" if holdout.every else "name photographs that are there"
+                remedy = "lower its offset" if holdout.every else "name photos that are there"
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes 0 of {len(names)} photographs for testing; expected some: "
+                    f"{scene.path}: scene.holdout takes 0 of {len(names)} photos for testing; expected some: "
                     f"{remedy}, or set scene.holdout to 0 for none"
                 )
             scene = _with_test(scene, test)
@@ -252,8 +252,8 @@ class Split:
         if self.train is not None:
             remaining = _select_training(scene, "train", self.train, folders) | set(scene.test)
             if remaining == set(scene.test):
-                raise DataError(f"{scene.path}: scene.train leaves no photograph to train on; expected some")
-            LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(remaining), "photograph"))
+                raise DataError(f"{scene.path}: scene.train leaves no photo to train on; expected some")
+            LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(remaining), "photo"))
             views = [view for i, view in enumerate(scene.views) if i in remaining]
             left_out_names = [view.name for i, view in enumerate(scene.views) if i not in remaining]
             test_names = {scene.views[i].name for i in scene.test}
@@ -301,7 +301,7 @@ class Split:
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
-                f"{scene.path}: scene.validation takes {len(fold)} of {len(scene.train)} training photographs; "
+                f"{scene.path}: scene.validation takes {len(fold)} of {len(scene.train)} training photos; "
                 "expected some of them, not all"
             )
         return replace(scene, train=train, validation=tuple(sorted(fold)))
@@ -352,7 +352,7 @@ def _validation_fold(scene: Scene) -> set[int]:
     count = len(order)
     if count < MIN_TRAIN:
         raise DataError(
-            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected at least {MIN_TRAIN} to hold "
+            f"{scene.path}: has {pluralize(count, 'training photo')}; expected at least {MIN_TRAIN} to hold "
             "some out for validation: take more, or set scene.validation to 0"
         )
     fold = order[FOLD_OFFSET::FOLD]

@@ -135,7 +135,7 @@ def advise_on_capture(train: Sequence[View], views: Sequence[View], rerun: str) 
     """Yield advice from the number of training views and the positions of all views."""
     view_count = len({view.name for view in train})
     if view_count < FEW_PHOTOS:
-        count = pluralize(view_count, "training photograph")
+        count = pluralize(view_count, "training photo")
         yield f"only {count}; show every part in at least five, from several sides, then `{rerun}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap

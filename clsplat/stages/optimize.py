@@ -46,7 +46,7 @@ class ValidatedTraining(Training):
     training_keys: ClassVar[frozenset[str]] = frozenset({"patience"})
 
     keep: Literal["last", "best"] = "last"
-    """Model to keep: the last one, or the one with the best PSNR at the validation views (the PSNR in the photographs'
+    """Model to keep: the last one, or the one with the best PSNR at the validation views (the PSNR in the photos'
     colors if all measured views have it)."""
     patience: Annotated[int, Field(gt=0)] | None = None
     """Number of measurements of the validation views without improvement after which the training ends; default: it

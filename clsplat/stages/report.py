@@ -228,13 +228,13 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 LOG = logging.getLogger("clsplat")
 MORE_METRICS = {  # of clsplat/metrics/views.py: name and unit
-    "psnr_color": ("PSNR in the photographs' colors", "dB"),
+    "psnr_color": ("PSNR in the photos' colors", "dB"),
     "psnr_affine": ("PSNR with colors fitted", "dB"),
     "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),
     "psnr_other_moments": ("PSNR at other moments", "dB"),
     "psnr_static": ("PSNR of static pixels", "dB"),
     "flicker": ("flicker of static pixels", "levels"),
-    "flicker_photographs": ("flicker of the photographs there", "levels"),
+    "flicker_photographs": ("flicker of the photos there", "levels"),
 }
 
 
@@ -257,7 +257,7 @@ class HtmlReport(Stage):
             main=_headline(run),
             overfitting_note=overfitting_note(run),
             advice=sentences,
-            photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
+            photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photo')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
             views=views(run),

@@ -26,7 +26,7 @@ class FullSizeDecay(Settings):
     step_keys: ClassVar[frozenset[str]] = frozenset({"until"})
 
     start: Literal["full_size"]
-    """`full_size`: the decay starts at the first step with full-size photographs."""
+    """`full_size`: the decay starts at the first step with full-size photos."""
     until: Annotated[int, Field(gt=0)]
     """Global step at which the rate reaches `final`."""
     initial: Annotated[float, Field(gt=0)]

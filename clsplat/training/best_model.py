@@ -69,7 +69,7 @@ class Best(BaseModel):
     ended: Count | None = None
     """Global step at which training ended with this model; None while it continues."""
     refit: Literal["none", "due", "begun"] = "none"
-    """State of the refit, which repeats training on all training photographs for the same number of steps."""
+    """State of the refit, which repeats training on all training photos for the same number of steps."""
 
     def with_last(self, last: Scores) -> "Best":
         """Return the record after an evaluation in which the model did not improve."""
@@ -91,7 +91,7 @@ class Best(BaseModel):
             overfit = last.overfit_text(self.first_overfit)
             text += f" At step {last.step:,} it is {last.train:.1f} and {last.validation:.1f} dB{overfit}."
         if self.refit != "none":
-            return f"{text} Training is then repeated on all training photographs for {best.step:,} steps."
+            return f"{text} Training is then repeated on all training photos for {best.step:,} steps."
         return f"{text} That model is kept." if self.ended is not None else text
 
 

@@ -62,7 +62,7 @@ class MemoryPlan:
         on_host = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
         return (
             f"memory: {self.required_bytes(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} "
-            f"bytes each and {self.pair} per pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} "
+            f"bytes each and {self.pair} per pair, photos and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} "
             f"fit in {self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 

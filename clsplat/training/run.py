@@ -242,7 +242,7 @@ class Run:
     def training_images(self) -> Iterator[NDArray[np.uint8]]:
         """Yield the photographs of the training views, each [height, width, 3], and report the progress."""
         views = self.scene.split("train")
-        for view in self.status.counted(views, "photographs", len(views)):
+        for view in self.status.counted(views, "photos", len(views)):
             yield self.photographs.get(view).image()
 
 

@@ -37,7 +37,7 @@ class Amount(BaseModel):
     total: Count
     """Total number of units."""
     unit: str
-    """What is counted, in words: steps, views, cells, photographs decoded, …"""
+    """What is counted, in words: steps, views, cells, photos decoded, …"""
 
 
 class Status(BaseModel):

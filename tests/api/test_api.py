@@ -144,7 +144,7 @@ def test_hand_made_view_renders(device, rng):
     renderer = Renderer(model, device)
     assert renderer.render(view).alpha.max() > 0.5
     np.testing.assert_array_equal(renderer.render(view).image, renderer.render(same).image)
-    with pytest.raises(DataError, match="the view 'front' has no photograph"):
+    with pytest.raises(DataError, match="the view 'front' has no photo"):
         same.photograph()
 
 
@@ -214,11 +214,11 @@ def test_metrics_refuse_incomparable_images(metric):
         broken[1, 2, 0] = value
         with pytest.raises(ValueError, match=r"^the image has values that are not finite"):
             metric(broken, black)
-        with pytest.raises(ValueError, match=r"^the photograph has values that are not finite"):
+        with pytest.raises(ValueError, match=r"^the photo has values that are not finite"):
             metric(black, broken)
-    with pytest.raises(ValueError, match=r"shape \(5, 6, 3\), the photograph \(6, 5, 3\); expected the same"):
+    with pytest.raises(ValueError, match=r"shape \(5, 6, 3\), the photo \(6, 5, 3\); expected the same"):
         metric(black, np.zeros((6, 5, 3)))
-    with pytest.raises(ValueError, match=r"shape \(0, 6, 3\), the photograph \(0, 6, 3\); .* at least one pixel"):
+    with pytest.raises(ValueError, match=r"shape \(0, 6, 3\), the photo \(0, 6, 3\); .* at least one pixel"):
         metric(black[:0], black[:0])
     for mask in (np.zeros((5, 6), bool), np.ones((6, 5), bool), np.ones((5, 6))):
         with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of shape \(5, 6\)"):

@@ -76,7 +76,7 @@ def test_scene_from_arrays_trains_to_the_bits_of_its_files(tiny_scene, tmp_path)
     assert equal(second.model, expected.model)
     other = replace(arrays.views[0], image=255 - arrays.views[0].image)
     changed = replace(arrays, views=(other, *arrays.views[1:]))
-    with pytest.raises(ConfigError, match="the photograph of 1 view"):
+    with pytest.raises(ConfigError, match="the photo of 1 view"):
         clsplat.Trainer(changed, "smoke", out=tmp_path / "run", start="resume")
 
 

@@ -112,7 +112,7 @@ def test_log_reports_the_number_of_averaged_views(caplog):
     log_color_metrics({"psnr": 20.0})
     assert not caplog.messages
     for averages, said in (
-        (whole, r"PSNR 24.00 dB; the photographs' exposures differ"),
+        (whole, r"PSNR 24.00 dB; the photos' exposures differ"),
         ({**whole, "psnr_color_views": 1, "psnr_color_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
         (
             {"psnr": 20.0, "psnr_color": None, "psnr_color_reason": "why"},

@@ -81,7 +81,7 @@ def test_size_grows_in_integer_steps_to_full():
 
 def test_settings_that_follow_detail_are_resolved_before_use():
     views = ViewSettings(resolution={"follows": "detail", "until": 900})
-    with pytest.raises(ConfigError, match="needs photographs"):
+    with pytest.raises(ConfigError, match="needs photos"):
         views.divisor(1)
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, 32:] = 255

@@ -35,7 +35,7 @@ def test_gains_are_recovered(rng):
     assert table(result) == pytest.approx(wall.log_gains, abs=2e-3)
     assert result.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
     assert result.explained_variance > 0.95
-    assert f"exposures of 8 photographs differ by {result.spread:.1%} at 400 points" in result.text
+    assert f"exposures of 8 photos differ by {result.spread:.1%} at 400 points" in result.text
 
 
 def test_exif_fills_in_for_photographs_without_tracks(rng):
@@ -52,7 +52,7 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
     for name, gains in truth.items():
         assert result.log_gains[name] == pytest.approx(gains, abs=3e-3)
     assert table(result).mean(axis=0) == pytest.approx(0, abs=1e-12)
-    assert result.text.startswith("exposures of 8 photographs differ by")
+    assert result.text.startswith("exposures of 8 photos differ by")
     assert result.text.endswith(", those of 2 as noted")
     assert result.explained_variance == shown.explained_variance
 

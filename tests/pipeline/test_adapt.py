@@ -29,7 +29,7 @@ class Counted(Adaptation):
 
     def decide(self, training, measures):
         degree = 1 if measures.photographs >= 8 else 0
-        yield Decision(key=self.key, value=degree, reason=f"{measures.photographs} photographs")
+        yield Decision(key=self.key, value=degree, reason=f"{measures.photographs} photos")
         yield Decision(key="optimize.modules.dropout", value={"probability": 0.1}, reason="so it is")
 """
 ADAPT = "adapt=counted"
@@ -115,9 +115,9 @@ def test_decisions_are_repeated_for_other_photographs(tmp_path):
 def test_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     asked = [f"scene.path='{tiny_scene}'", *FEW, ADAPT]
     text = describe(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
-    assert "adapt          8 photographs\n" in text
+    assert "adapt          8 photos\n" in text
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=[*FEW, ADAPT])
-    assert "INFO 8 photographs\n" in (out / "log.txt").read_text()
+    assert "INFO 8 photos\n" in (out / "log.txt").read_text()
     written = load(str(out / "pipeline.yaml"))
     assert [decision.key for decision in written.decisions] == ["model.sh_degree", "optimize.modules.dropout"]
     assert written.settings.plugins.keys() == {"counted"}

@@ -114,9 +114,7 @@ def test_photographs_share_cameras_by_size_and_lens(tmp_path, cameras, groups, c
         shared = {image.name: image.camera_id for image in images}
         assert shared["0.jpg"] == shared["2.jpg"] != shared["1.jpg"] == shared["3.jpg"]
         assert {(item.width, item.height) for item in cameras_found} == {(96, 72), (72, 96)}
-        assert (
-            "2 photographs have no lens data in EXIF, so those of the same size share a camera (1 camera" in caplog.text
-        )
+        assert "2 photos have no lens data in EXIF, so those of the same size share a camera (1 camera" in caplog.text
 
 
 # ---- features
@@ -161,7 +159,7 @@ def test_unreadable_files_come_with_a_conversion_command(tmp_path, caplog):
     assert "1 DNG file cannot be read (e.dng)" in caplog.text
     (tmp_path / "a.jpg").unlink()
     text = refusal(list_photographs, tmp_path)
-    assert "has 2 photographs" in text
+    assert "has 2 photos" in text
     assert "heif-convert" in text
 
 
@@ -186,7 +184,7 @@ def test_misnamed_files_come_with_a_conversion_command(tmp_path):
     assert warnings_for({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
     (tmp_path / "p" / "0.jpg").unlink()
     text = refusal(gather, tmp_path / "p", tmp_path / "images", ["1.jpg", "2.jpg", "h.jpg"])
-    assert "only 2 of 3 photographs can be read: h.jpg (contains HEIC data); convert HEIC files" in text
+    assert "only 2 of 3 photos can be read: h.jpg (contains HEIC data); convert HEIC files" in text
 
 
 @pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
@@ -195,7 +193,7 @@ def test_video_instead_of_a_folder_names_the_command(tmp_path, read):
     (tmp_path / "notes").touch()
     command = f"`clsplat data video {shell_quote(tmp_path / 'my walk.AVI')} FOLDER`"
     assert command in refusal(read, tmp_path / "my walk.AVI")
-    assert "is a file; expected a folder of photographs" in refusal(read, tmp_path / "notes")
+    assert "is a file; expected a folder of photos" in refusal(read, tmp_path / "notes")
     assert "no such folder" in refusal(read, tmp_path / "none.avi")
 
 
@@ -217,9 +215,9 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
     assert result == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
-        "elsewhere": "matches no other photograph; it may be blurred",
+        "elsewhere": "matches no other photo; it may be blurred",
         "plain": "only 40 features: blurred, dark, or a plain surface",
-        "alone": "matches no other photograph",
+        "alone": "matches no other photo",
         "pair": "matches only other, which is not placed either",
         "other": "matches only pair, which is not placed either",
         "few": "few matches, at most 18, with a",
@@ -231,25 +229,25 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
     )
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": result, "other_models": [2]}
     missing, others = warnings_for(figures)
-    assert "1 of 4 photographs could not be placed and are not used: plain (only 40 features: blurred" in missing
+    assert "1 of 4 photos could not be placed and are not used: plain (only 40 features: blurred" in missing
     assert missing.endswith("viewpoints in between, or find more features (find_features.long_side)")
     assert (
         others
-        == "only the largest model is used, without 1 smaller model of 2 photographs: add photographs that connect them"
+        == "only the largest model is used, without 1 smaller model of 2 photos: add photos that connect them"
     )
     missing, others = warnings_for({**figures, "other_models": [3, 1], "denser_tried": True})
     assert missing.endswith("viewpoints in between")
-    assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photograph: add")
+    assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photo: add")
 
 
 def test_failed_mapping_is_described_by_groups(tmp_path):
     result = matched(tmp_path)
     assert diagnose(result) == (
         "they do not connect: 2 groups with good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
-        "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
+        "without a good match (alone, elsewhere, few, plain, soft); take photos of one scene, with more overlap"
     )
     joined = replace(result, pairs={**result.pairs, ("a", "pair"): 30})
-    assert diagnose(joined).startswith("take more sharp photographs"), "seven of twelve belong together"
+    assert diagnose(joined).startswith("take more sharp photos"), "seven of twelve belong together"
     weak = replace(result, pairs={("a", "b"): 20, ("b", "c"): 29})
     assert diagnose(weak).startswith("no two of them overlap enough: 29 matches at most; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
@@ -271,7 +269,7 @@ def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
     result = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
     assert explain_unplaced(result, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
-        "elsewhere.png": "matches no other photograph; it may be blurred",
+        "elsewhere.png": "matches no other photo; it may be blurred",
     }
 
 
@@ -317,7 +315,7 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
             "look as if the camera only rotated",
         ),
         (unrelated_photograph, "no two of them show the same features"),
-        (lambda number: rotated_view(1), "photographs are all the same"),
+        (lambda number: rotated_view(1), "photos are all the same"),
         (
             lambda number: np.full((180, 240, 3), np.linspace(90, 180 + number, 240)[:, None]).astype(np.uint8),
             "none has features, where thousands",
@@ -391,7 +389,7 @@ def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
     matches, cameras = prepared(
         tmp_path, [rotated_view(number) if number < 6 else unrelated_photograph(number) for number in range(14)]
     )
-    with pytest.raises(DataError, match=r"the \d of 14 photographs that were placed look as if"):
+    with pytest.raises(DataError, match=r"the \d of 14 photos that were placed look as if"):
         map_cameras(matches, cameras)
     assert not (cameras / "sparse").exists()
 

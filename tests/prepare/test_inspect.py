@@ -106,7 +106,7 @@ def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
     write_exposures(scene / "images", {name: CameraExposure(one, 2.0, 100.0) for name, one in seconds.items()})
     inspection = Inspection.from_folder(scene)
     assert finding_text(inspection, "warning").startswith(
-        f"1 photograph is blurred ({images[3].name}): remove or retake them"
+        f"1 photo is blurred ({images[3].name}): remove or retake them"
     )
     notes = [finding.text for finding in inspection.findings if finding.level == "note"]
     assert notes[0].startswith(f"{images[5].name}, {images[9].name} look the same")
@@ -204,7 +204,7 @@ def test_truncated_file_is_one_error_among_others(scene, stem):
 def test_photographs_without_poses(tmp_path):
     photograph(tmp_path / "a.png")
     inspection = Inspection.from_folder(tmp_path)
-    assert "contains 1 photograph but no camera poses" in finding_text(inspection, "error")
+    assert "contains 1 photo but no camera poses" in finding_text(inspection, "error")
 
 
 def test_empty_folder(tmp_path):
@@ -370,7 +370,7 @@ def test_truncated_and_rotated_images(tmp_path):
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.from_folder(path)
     assert "the end is missing from 1 image file (05.jpg): copy" in finding_text(inspection, "error")
-    assert "1 photograph is rotated by EXIF" in finding_text(inspection, "note")
+    assert "1 photo is rotated by EXIF" in finding_text(inspection, "note")
 
 
 def test_rotated_images_that_the_reader_turns(tmp_path):
@@ -405,10 +405,10 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
     inspection = Inspection.from_folder(scene)
     if kind != "mask":
         assert any(
-            "1 photograph is black, of a single color, or transparent (01.png)" in f.text for f in inspection.findings
+            "1 photo is black, of a single color, or transparent (01.png)" in f.text for f in inspection.findings
         )
         RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
-        assert "1 photograph: black, of a single color, or transparent: 01.png" in caplog.text
+        assert "1 photo: black, of a single color, or transparent: 01.png" in caplog.text
         make_blank(files, kind)
         inspection = Inspection.from_folder(scene)
     with pytest.raises(DataError) as error:

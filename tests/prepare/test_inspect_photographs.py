@@ -47,11 +47,11 @@ def test_few_photographs_get_advice(tmp_path):
     for i in range(3):
         photograph(tmp_path / f"{i}.png")
     inspection = Inspection.from_folder(tmp_path)
-    assert finding_text(inspection, "warning").startswith("there are only 3 photographs, from which cameras are often")
-    assert inspection.verdict.startswith("cameras are not known yet, and there are only 3 photographs")
+    assert finding_text(inspection, "warning").startswith("there are only 3 photos, from which cameras are often")
+    assert inspection.verdict.startswith("cameras are not known yet, and there are only 3 photos")
     for i in (1, 2):
         (tmp_path / f"{i}.png").unlink()
-    assert "has 1 photograph; expected at least 3, better 30 or more" in finding_text(
+    assert "has 1 photo; expected at least 3, better 30 or more" in finding_text(
         Inspection.from_folder(tmp_path), "error"
     )
 
@@ -83,11 +83,11 @@ def test_blank_photographs_are_refused_as_in_preparation(tmp_path, level):
         cv2.imwrite(str(photos / f"{i}.png"), np.full((48, 64, 3), level, np.uint8))
     inspection = Inspection.from_folder(photos)
     assert inspection.next_step is None
-    assert inspection.verdict.startswith("cannot train: no photograph shows anything (0.png, 1.png")
-    with pytest.raises(DataError, match="no photograph shows anything"):
+    assert inspection.verdict.startswith("cannot train: no photo shows anything (0.png, 1.png")
+    with pytest.raises(DataError, match="no photo shows anything"):
         gather(photos, tmp_path / "linked", list_photographs(photos))
     photograph(photos / "9.png")
-    assert "9 photographs are black or of a single color" in Inspection.from_folder(photos).verdict
+    assert "9 photos are black or of a single color" in Inspection.from_folder(photos).verdict
 
 
 def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):
@@ -101,7 +101,7 @@ def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):
     list_photographs(tmp_path)
     warned = [record.getMessage().removeprefix(f"{tmp_path}: ") for record in caplog.records]
     assert len(warned) == 3
-    damaged = "1 of 4 photographs cannot be read: g.jpg (not an image, or a damaged one); export them again"
+    damaged = "1 of 4 photos cannot be read: g.jpg (not an image, or a damaged one); export them again"
     assert texts(inspection, "warning")[1:] == [*warned, damaged]
 
 
@@ -121,8 +121,8 @@ def test_two_valid_photographs_are_too_few(tmp_path):
         photograph(tmp_path / name)
     (tmp_path / "c.jpg").write_text("text")
     inspection = Inspection.from_folder(tmp_path)
-    assert finding_text(inspection, "error").endswith("only 2 of 3 photographs can be read; export them again")
-    assert finding_text(inspection, "warning").startswith("1 of 3 photographs cannot be read: c.jpg")
+    assert finding_text(inspection, "error").endswith("only 2 of 3 photos can be read; export them again")
+    assert finding_text(inspection, "warning").startswith("1 of 3 photos cannot be read: c.jpg")
 
 
 def write_photographs(folder: Path, factors: list[float]) -> dict[str, Path]:
@@ -156,7 +156,7 @@ def test_brightness_step_is_a_hint_without_exif_exposure(tmp_path):
     ((a, b, ratio),) = compare_photos(files).steps
     assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
     (note,) = texts(Inspection.from_folder(tmp_path), "note")
-    assert note.startswith("1 photograph is more than twice as bright or dark as the one before (1.png to 2.png: 0.45")
+    assert note.startswith("1 photo is more than twice as bright or dark as the one before (1.png to 2.png: 0.45")
     told = CameraExposure(0.01, 2.0, 100.0)
     result = compare_photos(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
     assert not result.steps

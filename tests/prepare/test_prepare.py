@@ -72,8 +72,8 @@ def test_left_out_photographs_are_reported_again(photos, tmp_path, monkeypatch, 
     prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
     caplog.clear()
     prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
-    assert "1 of 5 photographs cannot be read: b.jpg (not an image)" in caplog.text
-    assert "1 of 4 photographs could not be placed and are not used: c.jpg" in caplog.text
+    assert "1 of 5 photos cannot be read: b.jpg (not an image)" in caplog.text
+    assert "1 of 4 photos could not be placed and are not used: c.jpg" in caplog.text
 
 
 def test_steps_after_a_change_are_redone(photos, tmp_path):

@@ -309,7 +309,7 @@ def test_extraction_reports_its_progress(five, tmp_path):
     heard: list[int] = []
 
     def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        if what == "photographs with features":
+        if what == "photos with features":
             heard.append(done)
 
     with listening(hear):
@@ -369,7 +369,7 @@ def test_photographs_in_subfolders_are_found(tmp_path):
         (tmp_path / name).touch()
     assert list_photographs(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
     (tmp_path / "c.tif").unlink()
-    assert "has 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
+    assert "has 2 photos; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
 
 
 def test_damaged_photographs_are_skipped_and_rotated_ones_turned(tmp_path, caplog):
@@ -385,7 +385,7 @@ def test_damaged_photographs_are_skipped_and_rotated_ones_turned(tmp_path, caplo
     summary = find_features(photos, tmp_path / "out")
     images = tmp_path / "out" / "images"
     assert summary == {"photographs": 4, "cameras": 2, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
-    warned = "1 of 5 photographs cannot be read: broken.jpg (not an image, or a damaged one); export them again"
+    warned = "1 of 5 photos cannot be read: broken.jpg (not an image, or a damaged one); export them again"
     assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [warned]
     assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
     assert (images / "0.png").is_symlink()

@@ -51,7 +51,7 @@ def test_time_estimates_scale_with_the_work(photos):
     assert [line.split()[0] for line in lines] == [
         "expected:", "find_features", "match_features", "map_cameras", "undistort", "optimize",
     ]  # fmt: skip
-    assert lines[1].endswith(f"0.1 to {23 * 3 / 60:.1f} min: 23 photographs")
+    assert lines[1].endswith(f"0.1 to {23 * 3 / 60:.1f} min: 23 photos")
     assert lines[2].endswith(f"{253 * 0.05 / 60:.1f} to {253 / 60:.1f} min: 253 pairs")
     assert "2,100 to 14,000 steps of 2 to 19 ms, with 5,000 to 9,600 Gaussians at 80x60 px" in lines[-1]
     assert lines[-1].split()[1:4] == ["0.1", "to", "4.4"]
@@ -97,17 +97,17 @@ def as_cell(asked, state, device, start):
 @pytest.mark.parametrize(
     ("begin", "sets", "complaint"),
     [
-        (describe, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
-        (run_pipeline, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
-        (as_cell, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
+        (describe, "scene.holdout={names: [03.png, other.png]}", "no photo is called 'other.png'"),
+        (run_pipeline, "scene.holdout={names: [03.png, other.png]}", "no photo is called 'other.png'"),
+        (as_cell, "scene.holdout={names: [03.png, other.png]}", "no photo is called 'other.png'"),
         (describe, "scene.holdout={file: list.txt}", "list.txt"),
-        (run_pipeline, "scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is"),
-        (as_cell, "scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
+        (run_pipeline, "scene.validation={names: [other]}", "scene.validation: the list of names: no photo is"),
+        (as_cell, "scene.train={names: [other.png]}", "no photo is called 'other.png'"),
         (describe, "scene.holdout=1", "every image is held out for testing"),
-        (run_pipeline, "scene.holdout={every: 1}", "scene.holdout takes all 23 photographs"),
-        (as_cell, "scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
-        (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train on"),
-        (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected"),
+        (run_pipeline, "scene.holdout={every: 1}", "scene.holdout takes all 23 photos"),
+        (as_cell, "scene.validation=1", "scene.validation takes 20 of 20 training photos"),
+        (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photo to train on"),
+        (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photo; expected"),
         (as_cell, "scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene"),
         (run_pipeline, "scene.masks=masks", "masks do not fit photos before they are undistorted"),
         (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is a test view"),

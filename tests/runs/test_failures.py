@@ -29,7 +29,7 @@ def fail_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exce
     def photograph(photographs, view):
         counts["photograph"] += 1
         if counts["photograph"] == step:
-            raise DataError("the photograph is damaged")
+            raise DataError("the photo is damaged")
         return get(photographs, view)
 
     def kernel(one, **values):
@@ -153,6 +153,6 @@ def test_failed_save_does_not_hide_the_first_error(tiny_scene, tmp_path, monkeyp
         return save(run, keep)
 
     monkeypatch.setattr(checkpoint, "save", full)
-    with pytest.raises(DataError, match="the photograph is damaged"):
+    with pytest.raises(DataError, match="the photo is damaged"):
         train(tiny_scene, tmp_path, *FEW)
     assert "could not be saved (the disk is full); the last good state is " in caplog.text

@@ -275,7 +275,7 @@ def test_every_input_change_is_named(scene, tmp_path):
     cv2.imwrite(str(other), np.zeros((40, 40, 3), np.uint8))
     pose = opened.views[1].world_to_camera.copy()
     pose[0, 3] += 1e-9
-    assert said(with_view(0, image_path=other)) == f"the photograph of 1 view ({opened.views[0].name})"
+    assert said(with_view(0, image_path=other)) == f"the photo of 1 view ({opened.views[0].name})"
     assert said(with_view(9, mask_path=other)) == f"the mask of 1 view ({opened.views[9].name})"
     assert said(with_view(1, world_to_camera=pose)) == f"the camera of 1 view ({opened.views[1].name})"
     assert said(with_view(1, camera=replace(train[1].camera, cx=3.0))) == f"the camera of 1 view ({train[1].name})"
@@ -290,7 +290,7 @@ def test_every_input_change_is_named(scene, tmp_path):
     )
     many = replace(opened, views=tuple(replace(view, image_path=other) for view in opened.views))
     names = ", ".join(view.name for view in train[:3])
-    assert said(many) == f"the photograph of 10 views ({names}, …)"
+    assert said(many) == f"the photo of 10 views ({names}, …)"
 
 
 def test_altered_record_is_damaged(scene):
@@ -319,7 +319,7 @@ def test_run_does_not_resume_with_other_inputs(scene, tmp_path, what):
         content[-1] ^= 8
         (scene / "points3d.ply").write_bytes(content)
     before = sorted((path.name, path.read_bytes()) for path in out.iterdir() if path.is_file())
-    word = {"photograph": "the photograph of 1 view", "pose": "the camera of 1 view", "points": "the points"}[what]
+    word = {"photograph": "the photo of 1 view", "pose": "the camera of 1 view", "points": "the points"}[what]
     for more in (["--dry-run"], []):
         done = command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume", *more, expect=2)
         assert f"{scene}: differs from the inputs of the run: {word}" in done.stderr

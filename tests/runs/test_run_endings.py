@@ -42,7 +42,7 @@ ENDINGS = {
     "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; run the same command again to continue"),
     "the end of a file": (EOFError(), InternalError, "EOFError"),
     "a full disk": (OSError(28, "No space left on device", "/x/y"), OutputError, "/x/y: No space left on device"),
-    "bad data": (DataError("no photograph"), DataError, "no photograph"),
+    "bad data": (DataError("no photo"), DataError, "no photo"),
 }
 
 

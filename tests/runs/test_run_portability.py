@@ -105,9 +105,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
 
 
 def test_summary_names_missing_photographs(done, tmp_path):
-    assert (
-        summarize_placement(FOUND) == "32 of 33 photographs placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
-    )
+    assert summarize_placement(FOUND) == "32 of 33 photos placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
     assert summarize_placement({}) == summarize_placement({"map_cameras": {"registered": "x"}}) == ""
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
     assert summarize_placement(many).endswith("7.jpg, and 2 more")
@@ -116,14 +114,14 @@ def test_summary_names_missing_photographs(done, tmp_path):
         json.dumps({**metrics, "preparation": FOUND | {"undistort": {"seconds": 7.2}}})
     )
     text = "\n".join(summary(tmp_path))
-    assert "; 32 of 33 photographs placed" in text
+    assert "; 32 of 33 photos placed" in text
     assert "undistort 7 s" in text
 
 
 def test_report_starts_with_images_and_cameras(done, tiny_scene):
     text = (done / "report.html").read_text()
     page = Page(text)
-    titles = ["The worst views", "Photographs", "Figures", "Settings"]
+    titles = ["The worst views", "Photos", "Figures", "Settings"]
     places = [text.index(f"<h2>{title}</h2>") for title in titles]
     assert places == sorted(places)
     assert text.count(f"<h1>{tiny_scene.name}</h1>") == 1

@@ -63,7 +63,7 @@ def scene_of(rng, tmp_path):
             name = f"left/ä_{i}.png" if i < 3 else f"right/{i}.png"
             file = tmp_path / "photographs" / name
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(f"photograph {i}".encode())
+            file.write_bytes(f"photo {i}".encode())
             camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
             views.append(View(name, camera, pose, file, lens=distortion))
         points = PointCloud(rng.normal(size=(7, 3)).astype(np.float32), np.float32(rng.integers(0, 256, (7, 3)) / 255))

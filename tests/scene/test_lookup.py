@@ -82,7 +82,7 @@ def test_photograph_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, c
     assert all(Path(file).name.startswith(Path(name).name) for name, file in views.items())
     lines = [line for line in caplog.messages if "matched" in line]
     assert len(lines) == 1
-    assert f"{len(names)} of {len(names)} photograph" in lines[0]
+    assert f"{len(names)} of {len(names)} photo" in lines[0]
     assert files[0] in lines[0]
     notes = [finding.text for finding in Inspection.from_folder(scene).findings if finding.level == "note"]
     assert lines[0].removeprefix(f"{scene}: ") in notes
@@ -140,8 +140,8 @@ def test_cameras_are_scaled_to_reduced_photographs(tmp_path: Path, caplog: pytes
     assert view.image_path == scene / "images_2" / "a.jpg"
     assert (view.camera.width, view.camera.height, view.camera.fx) == (32, 24, 25.0)
     assert load_image(view).shape == (24, 32, 3)
-    assert "2 of 2 photographs matched" in caplog.text
-    assert "cameras scaled to these smaller photographs" in caplog.text
+    assert "2 of 2 photos matched" in caplog.text
+    assert "cameras scaled to these smaller photos" in caplog.text
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse"])

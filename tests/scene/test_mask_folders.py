@@ -95,8 +95,7 @@ def test_image_without_a_mask_counts_fully_and_is_named(tiny_scene, tmp_path, ca
     (masks / first).with_suffix(".png").unlink()
     assert load_mask(applied(tiny_scene, masks).views[0]) is None
     assert (
-        f"{masks}: contains masks for 9 of 10 photographs; all pixels of the others are used, such as {first}"
-        in caplog.text
+        f"{masks}: contains masks for 9 of 10 photos; all pixels of the others are used, such as {first}" in caplog.text
     )
 
 
@@ -106,7 +105,7 @@ def test_folder_without_matching_masks_is_refused(tiny_scene, tmp_path):
     assert message.startswith(f"{tmp_path / 'nowhere'}: no such folder; expected ")
     store(tmp_path / "others" / "x.png", np.zeros((40, 40), np.uint8))
     message = refusal(applied, tiny_scene, tmp_path / "others")
-    assert f"contains no mask for the photographs of {tiny_scene}; expected " in message
+    assert f"contains no mask for the photos of {tiny_scene}; expected " in message
     assert str((tmp_path / "others" / first).with_suffix(".png")) in message
     assert "set scene.masks to another folder" in message
 

@@ -91,7 +91,7 @@ def test_faces_show_their_own_rays(lens: Lens) -> None:
         shown = face.undistort_image(picture_of_rays(lens))
         error = np.abs(shown - face_rays(face)).max(axis=-1)
         assert error[face.shown].max() < 2.5 / lens.camera.fx**2 + 0.01, face.face
-        assert face.pinhole.fx >= lens.camera.fx, "the center is not sampled below the photograph"
+        assert face.pinhole.fx >= lens.camera.fx, "the center is not sampled below the photo"
 
 
 def test_fisheye_faces_mask_what_the_lens_does_not_show() -> None:

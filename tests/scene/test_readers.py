@@ -102,7 +102,7 @@ def test_reader_needs_only_matches_and_read_for_inspection(grid):
 
         def read(self, path: Path, holdout: int) -> Scene:
             if not (path / "grid.txt").read_text():
-                raise DataError(f"{path / 'grid.txt'}: is empty; write the number of photographs")
+                raise DataError(f"{path / 'grid.txt'}: is empty; write the number of photos")
             poses = np.stack([np.eye(3, 4)] * 4)
             poses[:, 0, 3] = range(4)
             camera = Camera(64, 48, 60, 60, 32, 24)

@@ -42,7 +42,7 @@ def test_error_is_the_distance_to_the_projected_point(rng, lens):
     assert np.isnan(result[3]).all(), "behind the camera"
     np.testing.assert_allclose(np.delete(result, 3, axis=0), np.tile(VECTOR, (6, 1)), atol=1e-9)
     straight[:4] = [[1e7, 1e7], [-1e308, 0], [np.inf, 0], [np.nan, 1]]
-    assert np.isnan(reprojection_residuals(view, points, straight)[:4]).all(), "outside the photograph"
+    assert np.isnan(reprojection_residuals(view, points, straight)[:4]).all(), "outside the photo"
 
 
 def test_mean_is_over_points_then_over_views():

@@ -89,14 +89,14 @@ def test_split_file_may_be_next_to_unprepared_photos(folder, tmp_path_factory):
 @pytest.mark.parametrize(
     ("choice", "fault"),
     [
-        (ViewSelection(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
-        (ViewSelection(names=["b.gif"]), "no photograph is called 'b.gif'"),
+        (ViewSelection(names=["bb.png"]), "no photo is called 'bb.png'; did you mean 'b.png'?"),
+        (ViewSelection(names=["b.gif"]), "no photo is called 'b.gif'"),
         (ViewSelection(file="test.txt"), "test.txt: cannot be read"),
         (
             ViewSelection(names=list(LETTERS)),
-            "scene.holdout takes all 24 photographs for testing; name fewer",
+            "scene.holdout takes all 24 photos for testing; name fewer",
         ),
-        (ViewSelection(every=1), "scene.holdout takes all 24 photographs"),
+        (ViewSelection(every=1), "scene.holdout takes all 24 photos"),
     ],
 )
 def test_invalid_list_is_refused(folder, choice, fault):
@@ -160,7 +160,7 @@ def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
     without = read_scene(folder, Split(8, train))
     assert letters(scene.merge_validation(), "train") == letters(without, "train")
     assert scene.merge_validation().validation == ()
-    assert scene.extent == without.extent, "the cameras are known, and only photographs are kept out"
+    assert scene.extent == without.extent, "the cameras are known, and only photos are kept out"
     halved = scene.downscaled(2)
     assert letters(halved, "validation") == fold
 
@@ -171,11 +171,9 @@ def test_explicit_fold_is_used(folder):
 
 
 def test_too_large_fold_is_refused(folder):
-    with pytest.raises(
-        DataError, match="has 3 training photographs; expected at least 4 to hold some out for validation"
-    ):
+    with pytest.raises(DataError, match="has 3 training photos; expected at least 4 to hold some out for validation"):
         read_scene(folder, Split(8, ViewSelection(names=["b", "c", "d"]), "auto"))
-    with pytest.raises(DataError, match="takes 24 of 24 training photographs"):
+    with pytest.raises(DataError, match="takes 24 of 24 training photos"):
         read_scene(folder, Split(0, None, 1))
 
 
@@ -195,14 +193,14 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
         caplog.clear()
         scene = read_scene(folder, Split(choice, missing="skip"))
         assert letters(scene, "test") == "ad"
-        assert "skipped 2 names whose photograph is missing" in caplog.text
+        assert "skipped 2 names whose photo is missing" in caplog.text
         assert letters(read_scene(folder, Split(0, validation=choice, missing="skip")), "validation") == "ad"
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
-    with pytest.raises(DataError, match="no photograph is called 'z'"):
+    with pytest.raises(DataError, match="no photo is called 'z'"):
         read_scene(folder, Split(ViewSelection(names=["a", "c", "z"]), missing="skip"))
-    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name photographs that are there"):
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name photos that are there"):
         read_scene(folder, Split(ViewSelection(names=["c"]), missing="skip"))
-    with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
+    with pytest.raises(DataError, match=r"scene\.train leaves no photo"):
         read_scene(folder, Split(0, train=ViewSelection(names=["c"]), missing="skip"))
 
 
@@ -235,8 +233,8 @@ def test_dataset_without_images_is_refused(folder):
         ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, not -1"),
         ("holdout={offset: 4}", "'offset' needs 'every', as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
-        ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
-        ("holdout={names: [a, '']}", "expected names of photographs that are not empty"),
+        ("holdout={names: [42]}", "expected names of photos as text: put numbers in quotes, as in '0042'"),
+        ("holdout={names: [a, '']}", "expected names of photos that are not empty"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),
@@ -260,7 +258,7 @@ def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, c
 
 
 def test_every_nth_without_test_views_is_refused(folder):
-    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photographs .* lower its offset, or set"):
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photos .* lower its offset, or set"):
         read_scene(folder, Split(ViewSelection(every=100, offset=99)))
 
 

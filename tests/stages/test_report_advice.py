@@ -83,8 +83,8 @@ def run_with(background: Backdrop | None) -> SimpleNamespace:
 
 
 def test_added_sky_is_reported_with_its_reason():
-    added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
-    assert sky_reason(run_with(added)) == "25 of 25 photographs show one"
+    added = Auto(chosen="on", reason="25 of 25 photos show one; 25% of them")
+    assert sky_reason(run_with(added)) == "25 of 25 photos show one"
     assert not any(sky_reason(run_with(other)) for other in (None, EnvironmentMap(), Auto(), Auto(chosen="off")))
 
 
@@ -112,7 +112,7 @@ def test_setting_that_limits_growth_is_named_as_in_set():
 
 
 def test_few_images_are_reported():
-    assert "only 1 training photograph" in "".join(advise_on_capture(views_around([0]), views_around([0]), AGAIN))
+    assert "only 1 training photo" in "".join(advise_on_capture(views_around([0]), views_around([0]), AGAIN))
     many = views_around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
     assert not [*advise_on_capture(many, many, AGAIN)]
 

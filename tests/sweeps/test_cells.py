@@ -56,7 +56,7 @@ def test_key_has_no_paths_and_all_inputs_that_change_bits(tiny_scene, tmp_path):
     assert keys("smoke", tiny_scene, notes, f"scene.holdout={{file: '{tmp_path / 'b'}.txt'}}") != named[0]
     image = next(iter(sorted(moved.rglob("*.png"))))
     image.write_bytes(image.read_bytes() + b"\0")
-    assert keys("smoke", moved, notes) != key, "a photograph has changed"
+    assert keys("smoke", moved, notes) != key, "a photo has changed"
 
 
 def test_fingerprint_matches_the_runs_record_of_its_scene(few_steps, tiny_scene, tmp_path):

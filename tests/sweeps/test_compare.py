@@ -282,7 +282,7 @@ def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
 
 def test_page_of_a_single_run_has_no_best_and_no_seeds(make_run, tmp_path):
     page = page_of(tmp_path, make_run("alone"))
-    assert "Where the run differs most from the photograph" in page
+    assert "Where the run differs most from the photo" in page
     assert page.count('<input type="range"') == 2, "one of each test view"
     text = Page(page).text
     assert not any(words in text for words in ("bold", "deviation", "several seeds", "All runs"))

@@ -135,7 +135,7 @@ def test_failing_cell_does_not_stop_other_cells(finished, tmp_path, monkeypatch)
 
     def failing(pipeline, run, start, show):
         if pipeline.settings.stages[1].steps == 4:
-            raise NumericError("the loss is nan") if run.seed == 0 else DataError("no photograph")
+            raise NumericError("the loss is nan") if run.seed == 0 else DataError("no photo")
         execute(pipeline, run, start, show)
 
     monkeypatch.setattr(runner, "execute", failing)
@@ -148,7 +148,7 @@ def test_failing_cell_does_not_stop_other_cells(finished, tmp_path, monkeypatch)
     assert len(status["failed"]) == 2
     page = (tmp_path / "run" / "compare.html").read_text()
     assert "sweep: 2 runs" in page
-    assert "steps=4-opacity=0.1-seed=1 failed and is not shown: no photograph" in page
+    assert "steps=4-opacity=0.1-seed=1 failed and is not shown: no photo" in page
 
 
 def test_matrix_always_ends_with_a_status(finished, tmp_path, monkeypatch):

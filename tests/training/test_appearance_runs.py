@@ -40,7 +40,7 @@ def test_visits_are_counted_per_image_and_the_mean_is_zero(tiny_scene, tmp_path,
     scalars = run.modules["exposure"].scalars
     updates = [scalars.get(f"colors/{name}/exposure/updates", 0) for name in names]
     assert sum(updates) == 12
-    assert len(set(updates)) > 1, "eight photographs, twelve steps"
+    assert len(set(updates)) > 1, "eight photos, twelve steps"
     for column in ("exposure", "red", "blue"):
         values = [scalars[f"colors/{name}/{column}"] for name in names]
         assert sum(values) == pytest.approx(0, abs=1e-12)
@@ -134,7 +134,7 @@ def test_run_enables_colors_if_exposures_differ(rng, tmp_path):
     run_pipeline(load("smoke", settings), RunState.read(tmp_path / "run"), None, "new")
     actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert actual.chosen == "on"
-    assert "exposures of 8 photographs differ by" in actual.reason
+    assert "exposures of 8 photos differ by" in actual.reason
     photographs = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"

@@ -262,9 +262,7 @@ def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pi
     assert psnr_of(refit, "validation", "trial.jsonl") == {
         step: psnr for step, psnr in psnr_of(best_run, "validation").items() if step <= BEST + 2 * 4
     }
-    assert (
-        f"Training is then repeated on all training photographs for {BEST} steps" in (refit / "report.html").read_text()
-    )
+    assert f"Training is then repeated on all training photos for {BEST} steps" in (refit / "report.html").read_text()
 
 
 @pytest.mark.parametrize("names", ["step_000016", "refit_000002", "refit_000008"])

@@ -94,7 +94,7 @@ def test_step_gradient_is_that_of_its_losses(device, rng, share):
     case.trainer.step(case.photograph, 1)
     result = case.state.tables()
     assert result["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
-    assert not result["moment1"][0].any(), "the other photograph has no update"
+    assert not result["moment1"][0].any(), "the other photo has no update"
     assert case.state.scalars["colors/b/updates"] == 1
 
 

@@ -74,7 +74,7 @@ def test_test_views_use_their_cameras_response(finished, tmp_path):
     try:
         assert evaluate(finished.out)["test"]["1"]["psnr"] != pytest.approx(measured["psnr"], abs=1e-4)
         (finished.out / camera_response.FILE).write_text('{"photographs": {"a": {"center_x": 0}}}')
-        with pytest.raises(DataError, match="expected 17 finite numbers for each photograph"):
+        with pytest.raises(DataError, match="expected 17 finite numbers for each photo"):
             evaluate(finished.out)
     finally:
         (tmp_path / camera_response.FILE).rename(finished.out / camera_response.FILE)

@@ -69,5 +69,5 @@ def test_known_exposures_are_found_again_from_scratch(plain_scene, rng, tmp_path
     assert np.std(known) > 0.25
     assert np.sqrt(np.mean(errors**2)) < 0.08, "measured: 0.05"
     psnr = {name: held_out(tmp_path / name) for name in ("gain", "none")}
-    assert psnr["gain"] > 28.4, "dB; measured: 29.1, and 29.3 of the photographs as they were"
+    assert psnr["gain"] > 28.4, "dB; measured: 29.1, and 29.3 of the photos as they were"
     assert psnr["none"] < psnr["gain"] - 1.2, "dB; measured: 27.0"

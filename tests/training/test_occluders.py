@@ -58,7 +58,7 @@ def test_occluders_cost_little_with_a_matching_module(tmp_path):
     before = {kind: measure(clean, tmp_path / f"clean {kind}", *more) for kind, more in kinds.items()}
     lost = {kind: before["none"] - measure(occluded, tmp_path / kind, *more) for kind, more in kinds.items()}
     print(before, lost)
-    assert min(before.values()) > before["none"] - 0.1, "photographs without anything lose nothing"
+    assert min(before.values()) > before["none"] - 0.1, "photos without anything lose nothing"
     assert lost["none"] > 2
     assert lost["transients"] < lost["none"] / 3, "0.5 to 0.9 dB of 3, by seed"
     assert lost["distractors"] < lost["none"] - 0.7

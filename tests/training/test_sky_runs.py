@@ -110,7 +110,7 @@ def test_decision_is_recorded_with_its_reason(sky_run):
     actual = load(str(sky_run / "pipeline.yaml")).settings.model.background
     assert isinstance(actual, Auto)
     assert actual.chosen == "on"
-    assert actual.reason.startswith("9 of 9 photographs show bright or blue regions above the horizon, without points")
+    assert actual.reason.startswith("9 of 9 photos show bright or blue regions above the horizon, without points")
     assert "in 15% or more" in actual.reason
     assert f"model.background: on, since {actual.reason}" in (sky_run / "log.txt").read_text()
 
@@ -119,7 +119,7 @@ def test_key_changes_no_bits_without_visible_sky(tiny_scene, tmp_path, few_steps
     pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
     run_pipeline(pipeline, RunState.read(tmp_path / "run"), None, "new")
     actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
-    assert (actual.chosen, actual.reason) == ("off", "the photographs have transparency")
+    assert (actual.chosen, actual.reason) == ("off", "the photos have transparency")
     assert digest(tmp_path / "run") == digest(few_steps)
     assert not (tmp_path / "run" / "point_cloud_sky.json").exists()
     folder = Yard(rng, clear=False).write(tmp_path / "wall")
@@ -130,12 +130,12 @@ def test_key_changes_no_bits_without_visible_sky(tiny_scene, tmp_path, few_steps
 @pytest.mark.parametrize(
     ("alpha", "masked", "size", "chosen", "why"),
     [
-        (255, None, 1, "on", "9 of 9 photographs show"),
-        (254, None, 1, "off", "the photographs have transparency"),
-        (254, "below", 1, "off", "the photographs have transparency"),
-        (255, "sky", 1, "off", "0 of 9 photographs show"),
-        (255, "edge", 1, "on", "9 of 9 photographs show"),
-        (255, "edge", 8, "on", "9 of 9 photographs show"),
+        (255, None, 1, "on", "9 of 9 photos show"),
+        (254, None, 1, "off", "the photos have transparency"),
+        (254, "below", 1, "off", "the photos have transparency"),
+        (255, "sky", 1, "off", "0 of 9 photos show"),
+        (255, "edge", 1, "on", "9 of 9 photos show"),
+        (255, "edge", 8, "on", "9 of 9 photos show"),
     ],
 )
 def test_counted_opaque_pixels_can_show_sky(tmp_path, rng, alpha, masked, size, chosen, why):
@@ -291,7 +291,7 @@ def test_sky_gaussians_match_its_colors_in_all_directions(rng, sky_run):
 
 
 def test_sky_of_transparent_photographs_is_warned_of(tiny_scene, yard, tmp_path, caplog):
-    transparent = "the photographs are transparent, so the sky would learn the color that clsplat puts behind them"
+    transparent = "the photos are transparent, so the sky would learn the color that clsplat puts behind them"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]", "model.background={type: envmap, side: 8}")
     for scene, is_warned in ((tiny_scene, True), (yard[1], False)):
         caplog.clear()

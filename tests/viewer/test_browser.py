@@ -138,7 +138,7 @@ def test_filmstrip_images_jump_to_their_cameras(opened):
     opened.rest()
     assert opened.run("viewer.at") == 2
     assert opened.run("document.getElementById('caption').textContent") == "0003.png"
-    assert opened.run("document.getElementById('comparison').hidden"), "a training view has no photograph in the page"
+    assert opened.run("document.getElementById('comparison').hidden"), "a training view has no photo in the page"
     pose = opened.run(POSE)
     np.testing.assert_allclose(pose[:3], scene(Path()).views[2].position, atol=1e-6)
     np.testing.assert_allclose(np.reshape(pose[3:], (3, 3)), scene(Path()).views[2].world_to_camera[:, :3], atol=1e-6)
@@ -174,7 +174,7 @@ def test_navigation(opened):
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
         before = after
     assert opened.run("viewer.at") == -1
-    assert opened.run("document.getElementById('frame').hidden"), "no photograph belongs to this camera"
+    assert opened.run("document.getElementById('frame').hidden"), "no photo belongs to this camera"
     assert radius > 1
 
 

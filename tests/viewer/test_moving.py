@@ -94,7 +94,7 @@ def test_browser_draws_each_photograph_at_its_time(tmp_path):
         browser.key(".")
         assert browser.run("[viewer.moment, viewer.photographs.chosen]") == [0.6, -1], "away from it"
         skips = [browser.key(key) or browser.run("viewer.moment") for key in "..,,,,"]
-        assert skips == [1.0, 1.0, 0.6, 0.35, 0.0, 0.0], "from one moment of the photographs to the next"
+        assert skips == [1.0, 1.0, 0.6, 0.35, 0.0, 0.0], "from one moment of the photos to the next"
         assert "was taken at another time" in browser.run("document.getElementById('caption').textContent")
         browser.run("viewer.clock.to(0.25)")
         browser.rest()

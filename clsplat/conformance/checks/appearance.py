@@ -120,7 +120,7 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
         floor = 0.1 * float(np.abs(moment).max())
         yield compare_max("color_grid_update", f"{name}, {label}", tables[name][1], moment, bound, floor=floor)
-        yield match("color_grid_update", f"{name} of other photographs, {label}", tables[name][[0, 2]], 0.0)
+        yield match("color_grid_update", f"{name} of other photos, {label}", tables[name][[0, 2]], 0.0)
 
 
 @CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")

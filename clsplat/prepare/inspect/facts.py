@@ -89,7 +89,7 @@ def compare_photos(
     """Compare consecutive photographs, sorted by name.  exposures: by name, or None to read them from EXIF."""
     names = sorted(files)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "comparing") as pool:
-        results = counted(pool.map(_measure_photo, (files[name] for name in names)), "photographs compared", len(names))
+        results = counted(pool.map(_measure_photo, (files[name] for name in names)), "photos compared", len(names))
         measures = dict(zip(names, results, strict=True))
     photos = {name: result for name, result in measures.items() if not isinstance(result, DataError)}
     if exposures is None:

@@ -49,12 +49,12 @@ def check_photo_folder(facts: Facts) -> Iterator[Finding]:
     count, read_errors = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
-    contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
+    contents = f"{pluralize(count, 'photo')} but" if count else "no readable photos and"
     readable_count, warnings = count - len(read_errors), facts.left_out
     if facts.unplaced:
         yield from _check_capture(facts, readable_count)
     else:
-        remedy = f"only {readable_count} of {count} photographs can be read; {remedy_for(read_errors)}"
+        remedy = f"only {readable_count} of {count} photos can be read; {remedy_for(read_errors)}"
         if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
             remedy, warnings = facts.refusal.removeprefix(f"{facts.path}: "), []
         yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
@@ -65,12 +65,12 @@ def check_photo_folder(facts: Facts) -> Iterator[Finding]:
 def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
     """Yield findings about photographs without cameras.  readable_count: the number of readable photographs."""
     if readable_count < MIN_VIEWS:
-        fault = f"there {_are(readable_count, 'photograph', 'only ')}, from which cameras are often not found"
+        fault = f"there {_are(readable_count, 'photo', 'only ')}, from which cameras are often not found"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
         is_all_blank = len(blank) == readable_count
-        blank_text = f"{_are(len(blank), 'photograph')} black or of a single color"
-        fault = "no photograph shows anything" if is_all_blank else blank_text
+        blank_text = f"{_are(len(blank), 'photo')} black or of a single color"
+        fault = "no photo shows anything" if is_all_blank else blank_text
         yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
 
@@ -107,7 +107,7 @@ def check_view_count(train: int) -> Iterator[Finding]:
     """Yield a warning if a scene has few training views.  train: the number of training views."""
     if train < MIN_VIEWS:
         fault = f"there {_are(train, 'training view', 'only ')}"
-        yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
+        yield Finding("warning", fault, "expect floaters and blur far from the photos; take 30 or more")
 
 
 def _check_unreadable(facts: Facts) -> Iterator[Finding]:
@@ -132,7 +132,7 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         fault, _, remedy = photographs.no_content.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
     if photographs.blank:
-        fault = f"{_are(len(photographs.blank), 'photograph')} black, of a single color, or transparent"
+        fault = f"{_are(len(photographs.blank), 'photo')} black, of a single color, or transparent"
         yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "remove or export them again")
     if photographs.cut:
         fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_join(photographs.cut)})"
@@ -151,12 +151,12 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         )
         is_serious = colmap and facts.registered and fraction > MAX_LEFT_OUT
         remedy = "they are not used for training" + (
-            "; more overlapping photographs or colmap exhaustive_matcher may register them" if colmap else ""
+            "; more overlapping photos or colmap exhaustive_matcher may register them" if colmap else ""
         )
         if facts.registered:
             yield Finding("warning" if is_serious else "note", fault, remedy)
     if photographs.exif_turned:
-        fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by EXIF"
+        fault = f"{_are(len(photographs.exif_turned), 'photo')} rotated by EXIF"
         yield Finding(
             "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
@@ -170,20 +170,18 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
 def _check_comparison(facts: Facts) -> Iterator[Finding]:
     blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
-        fault = f"{_are(len(blurred), 'photograph')} blurred ({_join(blurred)})"
+        fault = f"{_are(len(blurred), 'photo')} blurred ({_join(blurred)})"
         yield Finding("warning", fault, "remove or retake them: the model learns the blur")
     for names in facts.comparison.same[:MAX_NAMES]:
         yield Finding("note", f"{_join(names)} look the same", "one of them is enough")
     if jumps:
         examples = _join([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({examples})"
-        yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own exposure")
+        yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photo its own exposure")
     if steps := facts.comparison.steps:
         examples = _join([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
-        fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({examples})"
-        remedy = (
-            "EXIF lacks an exposure; if it changed, --set optimize.modules.exposure={} gives each photograph its own"
-        )
+        fault = f"{_are(len(steps), 'photo')} more than twice as bright or dark as the one before ({examples})"
+        remedy = "EXIF lacks an exposure; if it changed, --set optimize.modules.exposure={} gives each photo its own"
         yield Finding("note", fault, remedy)
 
 
@@ -191,7 +189,7 @@ def _check_cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
         remedy = "this is allowed; steps on larger views take longer"
-        yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
+        yield Finding("note", f"the photos have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
         name = f"the {camera.model} camera {camera.width}x{camera.height} of {pluralize(camera.views, 'view')}"
         if not camera.faces and not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
@@ -200,7 +198,7 @@ def _check_cameras(facts: Facts) -> Iterator[Finding]:
         if not camera.centered:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
         if camera.kept < MIN_KEPT:
-            fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"
+            fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photo"
             yield Finding(
                 "warning", fault, "use a lens with less distortion, or crop and undistort the images yourself"
             )
@@ -220,7 +218,7 @@ def _check_poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", "there are no test views", "quality is measured on training views only")
     if facts.same_center:
         fault = "all cameras are at the same position"
-        yield Finding("warning", fault, "they show no depth; take photographs from different positions")
+        yield Finding("warning", fault, "they show no depth; take photos from different positions")
     if facts.outlier_cameras:
         fault = (
             f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_join(facts.outlier_cameras)})"
@@ -230,7 +228,7 @@ def _check_poses(facts: Facts) -> Iterator[Finding]:
         )
     for names in facts.same_pose[:MAX_NAMES] if not facts.same_center else ():
         fault = f"{_join(names)} have exactly the same pose"
-        yield Finding("note", fault, "if they are copies of one photograph, training counts it twice; keep one of them")
+        yield Finding("note", fault, "if they are copies of one photo, training counts it twice; keep one of them")
     if facts.few_points:
         counts = [f"{name}: {facts.points_per_view[name]}" for name in facts.few_points]
         verb = "shows" if len(counts) == 1 else "show"
@@ -242,7 +240,7 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            remedy = "training starts from a plane sweep, or from random points if the photographs are transparent"
+            remedy = "training starts from a plane sweep, or from random points if the photos are transparent"
             yield Finding("note", "there are no points", remedy)
         return
     if points.count < MIN_POINTS:
@@ -341,7 +339,7 @@ MAX_CAMERAS = 4  # number of cameras to list
 
 def summarize(facts: Facts) -> dict[str, str]:
     """Return the main facts as lines of text, by label."""
-    fallback = "photographs without cameras" if facts.unplaced else "none found"
+    fallback = "photos without cameras" if facts.unplaced else "none found"
     lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _image_counts(facts)}
     if capture := facts.capture:
         lines["sizes"] = _counts(capture.sizes)

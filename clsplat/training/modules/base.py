@@ -145,7 +145,7 @@ class TrainingModule(Settings):
 
     order: ClassVar[int] = 0
     """Modules must be listed in ascending order of this number.  Modules below 20 change the camera, model, background,
-    or photograph; below 30, layers in front of the scene; below 40, colors; and below 99, the images that are compared.
+    or photo; below 30, layers in front of the scene; below 40, colors; and below 99, the images that are compared.
     The order is a number, not a list of modules, so that plug-ins can be ordered too."""
     side_files: ClassVar[Mapping[str, str]] = {}
     """Titles of the files that the module writes to the run folder, by file name; the names start with `view_`."""

@@ -35,7 +35,7 @@ Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"
 GRID_MEANING = (
     f"{MEANING}; [E | b] is interpolated trilinearly; file: matrices [photographs, luminance, height, width, 3, 4], "
     "float32, the outer ones on the edges of the image, at black and white of {} red + {} green + {} blue; "
-    "matrix: the mean of a photograph's matrices"
+    "matrix: the mean of a photo's matrices"
 ).format(*LUMINANCE)
 
 
@@ -81,7 +81,7 @@ class BilateralGrid(Appearance):
             raise DataError(f"its grids do not have the shape [photographs, {ENTRIES}, nz, ny, nx]")
         rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if rows != list(range(count)):
-            raise DataError(f"it has color grids for {count} photographs, but scalars for other rows")
+            raise DataError(f"it has color grids for {count} photos, but scalars for other rows")
 
     def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
         if self.rate != "auto":

@@ -73,7 +73,7 @@ class CameraOptimizer(TrainingModule):
     """Learning rate of rotations, rad; may be scheduled.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of translations, relative to that depth; may be scheduled.  auto: 2e-4 to 2e-6; with few visits per
-    photograph, large enough for a translation of 0.01, up to 2e-3."""
+    photo, large enough for a translation of 0.01, up to 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: 1e-4 to 1e-6; with few
     visits per camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
@@ -118,7 +118,7 @@ class CameraOptimizer(TrainingModule):
         path = model.with_name(VIEW_POSES)
         if not path.is_file():
             return scene
-        data = read_json(path, "poses of photographs")
+        data = read_json(path, "poses of photos")
         rows = data.get("photographs") if isinstance(data, dict) else None
         if not isinstance(rows, dict):
             raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
@@ -281,9 +281,9 @@ class CameraState(ModuleState):
         views, names = self.apply_to(run.original).views, {view.name for view in self.views}
         cameras = self.zoomed_cameras
         data = {
-            "meaning": "optimized poses, rows of [R | t], world to camera; learned: true for training photographs; "
+            "meaning": "optimized poses, rows of [R | t], world to camera; learned: true for training photos; "
             "others move with them as a whole"
-            + ("; focal_lengths: in x and y, px, at the full size of the undistorted photographs" if cameras else ""),
+            + ("; focal_lengths: in x and y, px, at the full size of the undistorted photos" if cameras else ""),
             "photographs": {
                 view.name: {
                     "learned": view.name in names,
@@ -298,7 +298,7 @@ class CameraState(ModuleState):
         angles = [math.degrees(math.hypot(*change.rotation)) for change in changes]
         distances = [math.hypot(*change.translation) / change.depth for change in changes]
         LOG.info(
-            "poses of %d photographs in %s: rotated by up to %.3f° (median %.3f°), moved by up to %.2g of the depth "
+            "poses of %d photos in %s: rotated by up to %.3f° (median %.3f°), moved by up to %.2g of the depth "
             "(median %.2g)",
             *(len(names), VIEW_POSES, max(angles), np.median(angles), max(distances), np.median(distances)),
         )

@@ -51,11 +51,11 @@ class Distractors(TrainingModule):
 
     type: Literal["distractors"] = "distractors"
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
-    """Number of Gaussians per photograph."""
+    """Number of Gaussians per photo."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which they are rendered."""
     cover: NonNegative = 0.1
-    """Weight of the loss on their mean alpha over the photograph; may be scheduled."""
+    """Weight of the loss on their mean alpha over the photo; may be scheduled."""
 
     def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
@@ -73,7 +73,7 @@ class Distractors(TrainingModule):
         photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
         shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
         if not photographs or not rows or rows % photographs or {n: t.shape for n, t in tables.items()} != shapes:
-            raise DataError("its distractor tables do not have the same number of rows for each photograph")
+            raise DataError("its distractor tables do not have the same number of rows for each photo")
 
 
 class DistractorsState(ModuleState):
@@ -90,7 +90,7 @@ class DistractorsState(ModuleState):
     def start(self, run: Run) -> None:
         views = run.scene.split("train")
         photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
-        progress = run.status.counted(photographs, "photographs", len(photographs))
+        progress = run.status.counted(photographs, "photos", len(photographs))
         self.load({}, initial_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in progress]))
 
     def can_load(self, scalars: Scalars, tables: Tables) -> bool:

@@ -75,7 +75,7 @@ class Appearance(TrainingModule):
     device_planes: ClassVar[int] = 6  # the transformed image, and its gradient
 
     rate: RateOrAuto = "auto"
-    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photograph;
+    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photo;
     if exposures are unknown, large enough for a gain of 2.7, up to 5e-2.  At most 0.5."""
 
     when: Literal["always", "auto"] = "always"
@@ -139,7 +139,7 @@ class Appearance(TrainingModule):
         path = model.with_name(VIEW_COLORS)
         if not path.is_file():
             return None
-        data, classes = read_json(path, "colors of photographs"), variants(Appearance)
+        data, classes = read_json(path, "colors of photos"), variants(Appearance)
         name = data.get("type") if isinstance(data, dict) else None
         if not isinstance(name, str) or name not in classes:
             names = ", ".join(classes)
@@ -273,7 +273,7 @@ class ColorState(ModuleState):
         exposures = estimate_exposures(run)
         self.start_from(exposures.log_gains)
         self.scalars[KNOWN] = float(bool(exposures.log_gains))
-        LOG.info("colors of photographs: %s", exposures.text)
+        LOG.info("colors of photos: %s", exposures.text)
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
         self.rate = self.settings.rate_schedule(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
@@ -302,7 +302,7 @@ class ColorState(ModuleState):
                 np.save(file, array, allow_pickle=False)
         green_gains = [matrix[1, 1] for matrix in report.matrices.values()]
         LOG.info(
-            "colors of %d photographs in %s: green is multiplied by %.2f to %.2f",
+            "colors of %d photos in %s: green is multiplied by %.2f to %.2f",
             *(len(green_gains), VIEW_COLORS, min(green_gains), max(green_gains)),
         )
 
@@ -377,7 +377,7 @@ def estimate_exposures(run: Run) -> Exposures:
             photograph = run.photographs.get(view)
             return photograph.image(), photograph.counted_pixels()
 
-        progress = run.status.counted(views, "photographs", len(views))
+        progress = run.status.counted(views, "photos", len(views))
         exposures = measure_exposures(run.scene.tracks, progress, read) if run.scene.tracks else UNKNOWN
         is_complete = len(exposures.log_gains) == len(set(names))
         run.cache[key] = exposures if is_complete else complete_exposures(exposures, exif_exposures(views))

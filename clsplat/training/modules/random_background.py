@@ -24,14 +24,14 @@ class RandomBackground(TrainingModule):
 
     type: Literal["random_background"] = "random_background"
     when: Literal["always", "transparent"] = "always"
-    """`transparent`: only if the photographs have transparent pixels."""
+    """`transparent`: only if the photos have transparent pixels."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.when == "always" or (scene is not None and has_visible_background(scene))
 
     def create_state(self, run: Run) -> ModuleState:
         if self.when == "transparent":
-            LOG.info("random background in training, since photographs have transparent pixels")
+            LOG.info("random background in training, since photos have transparent pixels")
         run.photographs.keep_transparency()
         return RandomBackgroundState(run.device, run.seed)
 

@@ -62,7 +62,7 @@ def start_sky(run: Run, source: Model | None) -> None:
         return
     if is_transparent(run.scene):
         LOG.warning(
-            "model.background: the photographs are transparent, so the sky would learn the color that clsplat puts "
+            "model.background: the photos are transparent, so the sky would learn the color that clsplat puts "
             "behind them; remove model.background"
         )
     texels, free = _first_texels(run, background.side)
@@ -83,7 +83,7 @@ def _explain_unknown(run: Run) -> str:
     """Return the reason for which no sky can be detected in the photographs; empty if it can be detected."""
     if run.scene.points is None:
         return "the dataset has no points to tell distant regions from near ones"
-    return "the photographs have transparency" if is_transparent(run.scene) else ""
+    return "the photos have transparency" if is_transparent(run.scene) else ""
 
 
 def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
@@ -98,7 +98,7 @@ def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
         return "off", reason
     sky_count, count = _count_skies(run, background.share)
     text = (
-        f"{sky_count} of {count} photographs show bright or blue regions above the horizon, without points, in "
+        f"{sky_count} of {count} photos show bright or blue regions above the horizon, without points, in "
         f"{background.share:.0%} or more of their upper third"
     )
     is_sky = sky_count >= background.photographs * count
@@ -115,7 +115,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
         return texels
     upper_colors = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
     if not upper_colors:
-        LOG.warning("masks exclude the upper thirds of all photographs; the sky starts black")
+        LOG.warning("masks exclude the upper thirds of all photos; the sky starts black")
     mean = np.mean(upper_colors, axis=0) if upper_colors else np.zeros(3)
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
@@ -123,6 +123,6 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
 def _detect_skies(run: Run, scene: Scene) -> list[SkyEvidence]:
     """Detect the sky in each training photograph of a scene, at the first of its sizes."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
-    progress = run.status.counted(views, "photographs", len(views))
+    progress = run.status.counted(views, "photos", len(views))
     photographs = ((view, run.photographs.get(view)) for view in progress)
     return list(detect_sky(scene, ((view, photo.image(), photo.counted_pixels()) for view, photo in photographs)))

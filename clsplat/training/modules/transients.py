@@ -51,7 +51,7 @@ class Transients(TrainingModule):
     tail_ratio: Annotated[float, Field(ge=0)] = 6.0
     """Size of the 99% quantile, as a multiple of that quantile, above which pixels are masked; 0: always."""
     box_size: Annotated[float, Field(ge=0, lt=1)] = 0.04
-    """Side of the box as a fraction of the photograph's width, rounded to an odd number of px, at least 3."""
+    """Side of the box as a fraction of the photo's width, rounded to an odd number of px, at least 3."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
     """Decay of the histogram, per step."""
 
