@@ -60,13 +60,13 @@ def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Fl
     Each increment of the amplitudes takes fewer steps than the previous one.  If there is no detail to gain, the
     factor is always 1.
     """
-    first = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
+    first_divisor = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
     mean = Spectrum(np.mean([spectrum.cumulative for spectrum in spectra], axis=0))
-    lowest = mean.amplitude(first) if first > 1 else mean.total
+    lowest = mean.amplitude(first_divisor) if first_divisor > 1 else mean.total
     if not 0 < lowest < (1 - NO_DETAIL) * mean.total:
         return np.zeros(1), np.ones(1)
     amplitudes = np.linspace(lowest, mean.total, KNOTS)
-    divisors = np.array([first, *(mean.divisor(amplitude) for amplitude in amplitudes[1:-1]), 1.0])
+    divisors = np.array([first_divisor, *(mean.divisor(amplitude) for amplitude in amplitudes[1:-1]), 1.0])
     return until * np.log(amplitudes / lowest) / np.log(mean.total / lowest), divisors
 
 
@@ -114,11 +114,11 @@ class DetailDivisor(Settings):
 
 def describe_sizes(sizes: Points) -> str:
     """Return a sentence about the sizes of the photographs during training.  sizes: the downscale factor by step."""
-    (_, first), *changes = sizes.points
-    if not changes and first == 1:
+    (_, first_divisor), *changes = sizes.points
+    if not changes and first_divisor == 1:
         return "photos are trained on at full size, since smaller ones would lose too much detail"
     clauses = [f"{_describe_size(divisor)} from step {step:.0f}" for step, divisor in changes]
-    return f"photos are trained on at {', '.join([f'{_describe_size(first)} of their size', *clauses])}"
+    return f"photos are trained on at {', '.join([f'{_describe_size(first_divisor)} of their size', *clauses])}"
 
 
 def _describe_size(divisor: float) -> str:

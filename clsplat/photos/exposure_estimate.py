@@ -100,11 +100,11 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographRea
     point, values = (np.concatenate([sample[i] for sample in samples]) for i in (0, 1))
     log_gains, shared_count, residuals = np.full((len(samples), 3), np.nan), 0, np.zeros(2)
     for channel in range(3):
-        usable = (values[:, channel] > DARKEST) & (values[:, channel] < BRIGHTEST)
-        photograph_counts = np.bincount(point[usable], minlength=len(tracks.positions))
-        usable &= photograph_counts[point] > 1
+        is_usable = (values[:, channel] > DARKEST) & (values[:, channel] < BRIGHTEST)
+        photograph_counts = np.bincount(point[is_usable], minlength=len(tracks.positions))
+        is_usable &= photograph_counts[point] > 1
         shared_count = max(shared_count, int(np.count_nonzero(photograph_counts > 1)))
-        arguments = photograph[usable], point[usable], values[usable, channel], len(samples)
+        arguments = photograph[is_usable], point[is_usable], values[is_usable, channel], len(samples)
         log_gains[:, channel], residual = _fit(*arguments)
         residuals += residual, _fit(*arguments, rounds=0)[1]
     is_known = np.isfinite(log_gains).all(axis=1)
@@ -123,12 +123,12 @@ def sample_points(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Ma
     in_front = z > 0
     depth = np.where(in_front, z, 1)
     xy = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
-    inside = in_front & (xy[0] >= 0) & (xy[0] < width) & (xy[1] >= 0) & (xy[1] < height)
-    column, row = (np.floor(np.where(inside, value, 0)).astype(np.intp) for value in xy)
+    is_inside = in_front & (xy[0] >= 0) & (xy[0] < width) & (xy[1] >= 0) & (xy[1] < height)
+    column, row = (np.floor(np.where(is_inside, value, 0)).astype(np.intp) for value in xy)
     if mask is not None:
-        inside &= mask[row, column]
+        is_inside &= mask[row, column]
     sums = cv2.boxFilter(image, cv2.CV_32S, (SIDE, SIDE), normalize=False)
-    return rows[inside], sums[row[inside], column[inside]] / (255.0 * SIDE**2)
+    return rows[is_inside], sums[row[is_inside], column[is_inside]] / (255.0 * SIDE**2)
 
 
 def _fit(

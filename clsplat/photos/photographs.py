@@ -114,8 +114,8 @@ class Photographs:
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        cached = self._cache.get(_key(view))
-        return update_camera(cached.camera, view) if cached else upload_camera(self.device, view)
+        photograph = self._cache.get(_key(view))
+        return update_camera(photograph.camera, view) if photograph else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view, with the view's current camera.

@@ -199,9 +199,9 @@ class Lens:
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
-        focals = MODELS[self.model][0]
-        cx, cy = self.params[focals : focals + 2]
-        return self.params[0], self.params[focals - 1], cx, cy, self.params[focals + 2 :]
+        focal_count = MODELS[self.model][0]
+        cx, cy = self.params[focal_count : focal_count + 2]
+        return self.params[0], self.params[focal_count - 1], cx, cy, self.params[focal_count + 2 :]
 
     @property
     def has_distortion(self) -> bool:
@@ -254,9 +254,9 @@ class Lens:
         angle = np.arctan2(np.hypot(x, y), z)
         with np.errstate(all="ignore"):
             x, y = self.distort(x, y, z)
-            inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
+            is_inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
         circle_angle = max(side_angles.min(), MIN_CIRCLE) - RIM / self._split[0]
-        return np.asarray(inside & (angle < min(fold_angle, circle_angle)))
+        return np.asarray(is_inside & (angle < min(fold_angle, circle_angle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
         """Return whether any white pixel of the photograph's mask, [H, W, C], is visible in this face."""
@@ -389,8 +389,8 @@ class Lens:
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
-        inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
-        return inside & (np.abs(back_u - u) < MAX_DIFFERENCE) & (np.abs(back_v - v) < MAX_DIFFERENCE)
+        is_inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
+        return is_inside & (np.abs(back_u - u) < MAX_DIFFERENCE) & (np.abs(back_v - v) < MAX_DIFFERENCE)
 
 
 def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) -> tuple[Floats, Floats]:

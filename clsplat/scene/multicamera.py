@@ -41,15 +41,15 @@ class MulticameraReader(Reader):
         frames = _frames(path)
         cameras, points = _camera_views(path, frames)
         test = every_nth(sorted(cameras), holdout)
-        views, held_out = list[View](), set[int]()
+        views, test_indices = list[View](), set[int]()
         for number, (name, camera) in enumerate(sorted(cameras.items())):
             count, mask = len(frames[name]), path / STATIC / f"{name}.png"
             for i, file in enumerate(frames[name]):
-                held_out |= {len(views)} if number in test else set()
-                time, static = i / (count - 1), mask if os.path.isfile(mask) else None
+                test_indices |= {len(views)} if number in test else set()
+                time, static_path = i / (count - 1), mask if os.path.isfile(mask) else None
                 view = replace(camera, name=f"{name}/{file.name}", image_path=file, mask_path=None)
-                views.append(replace(view, time=time, static_path=static))
-        return make_scene(path, views, held_out, points)
+                views.append(replace(view, time=time, static_path=static_path))
+        return make_scene(path, views, test_indices, points)
 
 
 def _candidate_names(image: str) -> tuple[str, str]:

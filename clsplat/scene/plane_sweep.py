@@ -15,7 +15,7 @@ from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View
 
 Floats = NDArray[np.floating]
-Places = NDArray[np.integer]
+Indices = NDArray[np.integer]
 LONG_SIDE = 160  # px, of the compared photographs
 PLANES = 64  # evenly spaced in inverse depth
 MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to the point that the cameras look at
@@ -106,7 +106,9 @@ def _best_planes(
 ) -> NDArray[np.int64]:
     """Return the index of each pixel's best plane, [H, W], judged by the better half of the adjacent views.
 
-    The index is 0 where no plane is clearly the best: in uniform areas, and where no adjacent view shows the surface.
+    The best plane has the lowest cost.  The cost is the mean color difference to the better half of the adjacent views
+    (rounded up), since the others may not show the surface.  The index is 0 where no plane is clearly the best: in
+    uniform areas, and where no adjacent view shows the surface.
     """
     view, image = views[i], images[i]
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
@@ -138,7 +140,7 @@ def _calibration(view: View) -> Floats:
     return np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
 
 
-def _unproject(view: View, rows: Places, columns: Places, depth: Floats) -> Floats:
+def _unproject(view: View, rows: Indices, columns: Indices, depth: Floats) -> Floats:
     """Return the world positions, [M, 3], of M pixels at depths `depth`, [M]."""
     c = view.camera
     rays = np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(depth))], axis=1)
@@ -146,7 +148,7 @@ def _unproject(view: View, rows: Places, columns: Places, depth: Floats) -> Floa
     return points
 
 
-def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Places, Floats]:
+def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Indices, Indices, Floats]:
     """Return which points, [M, 3], project into the image of a view, and the rows, columns and depths of all, [M].
 
     Points behind the camera have depth 1.

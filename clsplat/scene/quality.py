@@ -73,8 +73,8 @@ def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]
     x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
     z = np.where(z > 0, z, np.inf)
     column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
-    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
-    return np.asarray(z[inside])
+    is_inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
+    return np.asarray(z[is_inside])
 
 
 def near_plane(scene: Scene) -> float:
@@ -127,12 +127,12 @@ DARK, PLAIN = 8, 2  # gray levels of 255: upper bounds of the levels of a black 
 
 def is_blank(pixels: NDArray[Any]) -> bool:
     """Return whether an image, [H, W] or [H, W, C], is black, of one color, or transparent everywhere."""
-    unit = 255 / np.iinfo(pixels.dtype).max
+    scale = 255 / np.iinfo(pixels.dtype).max
     channels = pixels.reshape(*pixels.shape[:2], -1)
     if channels.shape[2] == 4 and not channels[:, :, 3].all():  # the outline of a silhouette is visible
         return not channels[:, :, 3].any()
-    for part in (channels[::16, ::16, :3], channels[:, :, :3]):  # the sparse sample usually suffices
-        low, high = part.min(axis=(0, 1)) * unit, part.max(axis=(0, 1)) * unit
+    for sample in (channels[::16, ::16, :3], channels[:, :, :3]):  # the sparse sample usually suffices
+        low, high = sample.min(axis=(0, 1)) * scale, sample.max(axis=(0, 1)) * scale
         if high.max() >= DARK and (high - low).max() > PLAIN:
             return False
     return True

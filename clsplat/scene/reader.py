@@ -81,10 +81,10 @@ class Reader(ABC):
         cls.subclasses[:] = [kind for kind in cls.subclasses if (kind.__module__, kind.__qualname__) != name] + [cls]
 
     def __init__(self) -> None:
-        missing = [field for field in ("name", "expects") if not hasattr(self, field)]
-        if missing:
+        missing_attributes = [field for field in ("name", "expects") if not hasattr(self, field)]
+        if missing_attributes:
             kind = f"{type(self).__module__}.{type(self).__name__}"
-            raise ConfigError(f"the reader {kind} has no {' and no '.join(missing)}; add it to the class")
+            raise ConfigError(f"the reader {kind} has no {' and no '.join(missing_attributes)}; add it to the class")
 
     @property
     def note(self) -> str:

@@ -42,11 +42,11 @@ def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
     """Return a scene at full size with the cameras of `views`; the observed pixels of its points do not change."""
     tracks, residuals = scene.tracks, dict[str, Floats]()
     if tracks is not None:
-        for old, new in zip(scene.views, views, strict=True):
-            if old.name in tracks.residuals:
-                positions = tracks.positions[tracks.rows[old.name]]
-                displacement = project_points(old, positions) - project_points(new, positions)
-                residuals[old.name] = tracks.residuals[old.name] + displacement
+        for old_view, new_view in zip(scene.views, views, strict=True):
+            if old_view.name in tracks.residuals:
+                positions = tracks.positions[tracks.rows[old_view.name]]
+                displacement = project_points(old_view, positions) - project_points(new_view, positions)
+                residuals[old_view.name] = tracks.residuals[old_view.name] + displacement
         tracks = replace(tracks, residuals={**tracks.residuals, **residuals})
     return replace(scene, views=tuple(views), tracks=tracks)
 

@@ -116,10 +116,10 @@ class Scene:
 
         test: the names of the test views.  Raises DataError like make_scene, and for an unknown name.
         """
-        if unknown := set(test) - {view.name for view in views}:
-            raise DataError(f"test: no view is called {quote(min(unknown))}; expected names of views")
-        held_out = {i for i, view in enumerate(views) if view.name in test}
-        return make_scene(IN_MEMORY, list(views), held_out, points, background)
+        if unknown_names := set(test) - {view.name for view in views}:
+            raise DataError(f"test: no view is called {quote(min(unknown_names))}; expected names of views")
+        test_indices = {i for i, view in enumerate(views) if view.name in test}
+        return make_scene(IN_MEMORY, list(views), test_indices, points, background)
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""
@@ -191,14 +191,14 @@ class Scene:
     def image_sizes(self) -> str:
         """The three most frequent image sizes in pixels, as in `800x600 and 600x800`."""
         sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in self.views)
-        *others, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
-        return f"{', '.join(others)} and {last}" if others else last
+        *first_sizes, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
+        return f"{', '.join(first_sizes)} and {last}" if first_sizes else last
 
     @property
     def cameras(self) -> dict[str, str]:
         """The name of the camera of each view, by view name: the first view with an equal lens or camera."""
-        first: dict[object, str] = {}
-        return {view.name: first.setdefault(view.lens or view.camera, view.name) for view in self.views}
+        first_names: dict[object, str] = {}
+        return {view.name: first_names.setdefault(view.lens or view.camera, view.name) for view in self.views}
 
     def __repr__(self) -> str:
         fold = f", {len(self.validation)} for validation" if self.validation else ""
@@ -335,8 +335,8 @@ def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
     if holdout <= 0:
         return set()
     photographs = [photograph_name(name) for name in names]
-    held_out = set(sorted(set(photographs))[offset::holdout])
-    return {i for i, photograph in enumerate(photographs) if photograph in held_out}
+    test_photographs = set(sorted(set(photographs))[offset::holdout])
+    return {i for i, photograph in enumerate(photographs) if photograph in test_photographs}
 
 
 def scene_name(folder: str | Path) -> str:

@@ -296,14 +296,14 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
     is_file = path != NO_FILE
     if not is_file and view.image is None:
         raise DataError(f"the view {quote(view.name)} has no photo; expected one with an image or an image_path")
-    decoded: dict[bool, NDArray[Any]] = {}
+    images: dict[bool, NDArray[Any]] = {}
 
     def size(upright: bool) -> Size:
-        decoded[upright] = read_image(path, upright) if is_file else cast(NDArray[Any], view.image)
-        height, width = decoded[upright].shape[:2]
+        images[upright] = read_image(path, upright) if is_file else cast(NDArray[Any], view.image)
+        height, width = images[upright].shape[:2]
         return width, height
 
-    pixels = decoded[needs_rotation(view, path if is_file else Path(view.name), size)][:, :, channels]
+    pixels = images[needs_rotation(view, path if is_file else Path(view.name), size)][:, :, channels]
     return view.lens.undistort_image(np.ascontiguousarray(pixels)) if view.lens and pixels.size else pixels
 
 
@@ -337,8 +337,8 @@ def fit_to_photograph(view: View) -> View:
     if view.lens is None:
         return replace(view, camera=view.camera.resized(width, height))
     scales = (*(x_scale, y_scale)[: MODELS[view.lens.model][0]], x_scale, y_scale)
-    camera_size = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
-    lens = intern_lens(replace(view.lens, width=width, height=height, params=camera_size))
+    params = *(a * b for a, b in zip(view.lens.params, scales, strict=False)), *view.lens.params[len(scales) :]
+    lens = intern_lens(replace(view.lens, width=width, height=height, params=params))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 

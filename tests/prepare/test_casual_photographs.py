@@ -231,10 +231,7 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
     missing, others = warnings_for(figures)
     assert "1 of 4 photos could not be placed and are not used: plain (only 40 features: blurred" in missing
     assert missing.endswith("viewpoints in between, or find more features (find_features.long_side)")
-    assert (
-        others
-        == "only the largest model is used, without 1 smaller model of 2 photos: add photos that connect them"
-    )
+    assert others == "only the largest model is used, without 1 smaller model of 2 photos: add photos that connect them"
     missing, others = warnings_for({**figures, "other_models": [3, 1], "denser_tried": True})
     assert missing.endswith("viewpoints in between")
     assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photo: add")
