@@ -83,15 +83,15 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     count, missing = len(masks_by_name), [name for name, mask in masks_by_name.items() if mask is None]
     if len(missing) == count:
         fault = f"contains no mask for the photos of {scene.path}" if folder.is_dir() else "no such folder"
-        names = " or ".join(str(folder / file) for file in reversed(_mask_names(unmasked[0])))
+        names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))
         raise DataError(
             f"{folder}: {fault}; expected {names} for the first of {count}, with usable pixels "
             "white: rename the files, or set scene.masks to another folder"
         )
-    if unmasked:
-        ratio = f"{count - len(unmasked)} of {pluralize(count, 'photo')}"
+    if missing:
+        masked = f"{count - len(missing)} of {pluralize(count, 'photo')}"
         LOG.warning(
-            "%s: contains masks for %s; all pixels of the others are used, such as %s", folder, ratio, unmasked[0]
+            "%s: contains masks for %s; all pixels of the others are used, such as %s", folder, masked, missing[0]
         )
     return _without_hidden_faces(replace(scene, views=views))
 
