@@ -20,7 +20,7 @@ LIVE = "--live"  # its port is optional
 
 
 def main(*leading: str) -> None:
-    """Run the command line.  An error prints one line, with --debug also its traceback.
+    """Run the command line.  An error prints one line, and with --debug also its traceback.
 
     leading: arguments to insert before those of the process.
     """
@@ -59,7 +59,7 @@ def _report(error: BaseException, is_debugging: bool) -> int:
 
 
 def _usage(error: Any) -> str:
-    """Return a line of text: the fault of the command line, and where to find help."""
+    """Return a line of text with the error in the command line and the command that shows help."""
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "clsplat"
     if type(error).__name__ == "NoArgsIsHelpError":

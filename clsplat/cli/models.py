@@ -111,7 +111,7 @@ def view(
         int | None, typer.Option(min=1, metavar="N", help="Include only the N most important Gaussians; default: all.")
     ] = None,
 ) -> None:
-    """Write an HTML page to walk through a model next to its photos; it opens offline."""
+    """Write an HTML page that shows a model next to its photos and opens offline."""
     prefix = "replaced; " if path_exists(out) else ""
     with terminal.counts_on_terminal():
         page = commands.view(
@@ -229,7 +229,7 @@ def lod(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Write a model in levels of detail for the web (streamed SOG); with photos, each level is trained."""
+    """Write a model in levels of detail for the web (streamed SOG).  With photos, each level is trained."""
     from clsplat.workflows.lod import table
 
     result = commands.write_levels(

@@ -198,7 +198,7 @@ def check(
 def _show_findings(
     result: dict[str, Any], as_json: bool, text: str, verdict: str, error: type[ClsplatError] | None
 ) -> None:
-    """Show the result of `check` and its verdict; raise `error` with the verdict if there is one."""
+    """Show the result of `check` and its verdict.  If there is an `error`, raise it with the verdict."""
     if as_json:
         terminal.show_json(result)
     else:
@@ -358,5 +358,5 @@ def worker(
         bool, typer.Option("--insecure", help="Without TLS: anyone who can reach the scheduler's port can run code.")
     ] = False,
 ) -> None:
-    """Offer this machine's devices to a Dask scheduler, one process per device, until the scheduler ends."""
+    """Offer this machine's devices to a Dask scheduler, one process per device, until the scheduler exits."""
     commands.run_worker(scheduler, device, tls=(tls_ca, tls_cert, tls_key), insecure=insecure)

@@ -33,7 +33,7 @@ def doctor(
         Path | None, typer.Option("--html", metavar="FILE", help="Write an HTML report, to attach to an issue.")
     ] = None,
 ) -> None:
-    """Compare every kernel with the float64 reference; exit code 4 if the device computes wrongly."""
+    """Compare every kernel with the float64 reference; exit code 4 if the device computes wrong results."""
     from clsplat.conformance.doctor import check_html_path, write_page
 
     if as_json:

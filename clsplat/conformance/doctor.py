@@ -111,7 +111,7 @@ class DeviceReport:
 
     @property
     def failures(self) -> dict[str, list[str]]:
-        """A sentence for each failure, by schedule; the key of memory and speed is ''."""
+        """A sentence for each failure, by schedule.  The key of memory and speed is ''."""
         by_schedule = {**self.schedules, "": self.once}
         return {name: [text for result in results for text in result.failures] for name, results in by_schedule.items()}
 
@@ -124,7 +124,7 @@ class DeviceReport:
         return None
 
     def data(self) -> dict[str, Any]:
-        """Return the report as plain data; values that are not finite are None."""
+        """Return the report as plain data, with None for values that are not finite."""
         verdict = self.verdict
         return {
             "schema": SCHEMA,

@@ -148,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
-    """Format the size of a trained model: the numbers of scene and `sky` Gaussians, or of parameters of a field."""
+    """Format the size of a trained model: the numbers of scene and `sky` Gaussians, or of a field's parameters."""
     text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
     return f"{text} and {sky:,} of the sky" if sky else text
 
@@ -159,7 +159,7 @@ def shell_quote(path: object) -> str:
 
 
 def shorten(text: str, limit: int = QUOTE_LIMIT) -> str:
-    """Return the text, with the middle cut out if it is longer than `limit` characters."""
+    """Return the text, without its middle if it is longer than `limit` characters."""
     size = limit - 3
     return text if len(text) <= limit else f"{text[: size - size // 2]} … {text[-(size // 2) :]}"
 

@@ -238,7 +238,7 @@ def _open_lock_file(path: Path) -> tuple[io.FileIO | None, bool]:
 
 
 def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
-    """Lock the file; return False if it is no longer at its path.  Without locks, the creator of the file owns it."""
+    """Lock the file, or return False if it is not at its path anymore.  Without locks, the file's creator owns it."""
     try:
         if not _system_lock(file):
             raise OutputError(in_use_message(folder, read_owner(file)))

@@ -98,7 +98,7 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def stop_at_once() -> None:
-    """Raise KeyboardInterrupt; during an import, which it would break, wait for the import to end."""
+    """Raise KeyboardInterrupt.  During an import, which the exception would break, wait until it has finished."""
     wait_seconds = time.monotonic() - _received.since if _received.number else 0.0
     if wait_seconds < IMPORT_SECONDS and _is_importing():
         _thread.start_new_thread(_resend_signal, (_received.number or signal.SIGINT,))  # `threading` would take a lock

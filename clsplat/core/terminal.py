@@ -106,7 +106,7 @@ def logging_to(path: Path) -> Iterator[None]:
     """Append the log to a file, with the time of each line and the traceback of an exception in the block.
 
     The file includes debug lines at any log level.  Raises OutputError if the file cannot be opened; later failures
-    only warn.
+    only log a warning.
     """
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or use another folder")

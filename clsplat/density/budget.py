@@ -21,7 +21,7 @@ class Budget(Settings):
 
     @property
     def statistics(self) -> set[str]:
-        """Names of the statistics that the budget reads."""
+        """The names of the statistics that the budget reads."""
         return set()
 
     @abstractmethod

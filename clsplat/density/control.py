@@ -104,7 +104,7 @@ class Box(Settings):
         return self.model_copy(update={"low": low, "high": high})
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return the mask, [N], of the points, [N, 3] in scene units, inside the box; points with NaN are outside."""
+        """Return a mask, [N], of the points inside the box.  points: [N, 3]; points with NaN are outside."""
         is_inside = ~np.isnan(points).any(axis=1)
         for axis, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             values = points[:, axis].astype(np.float64)

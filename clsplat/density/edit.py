@@ -245,7 +245,7 @@ class Rule(Settings):
 
     @property
     def statistics(self) -> set[str]:
-        """Names of the statistics that the rule reads."""
+        """The names of the statistics that the rule reads."""
         return set()
 
     @property

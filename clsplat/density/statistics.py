@@ -156,7 +156,7 @@ class SplatStats:
         return self.gaussians[PREFIX + name]
 
     def divisor(self, name: str) -> Array:
-        """Return the sums that divide a statistic, [S]."""
+        """Return the sums, [S], by which a statistic is divided."""
         return self.gaussians[PREFIX + self.columns[name].divisor]
 
     def factor(self, name: str) -> int:

@@ -174,7 +174,7 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
 
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:
-    """Return the absolute value that only a fraction TAIL of the values exceeds; 0 for no values."""
+    """Return the absolute value that only a fraction TAIL of the values exceeds, or 0 if there are no values."""
     sizes = np.abs(values).ravel()
     index = min(int((1 - TAIL) * sizes.size), sizes.size - 1)
     return np.float32(np.partition(sizes, index)[index] if sizes.size else 0)

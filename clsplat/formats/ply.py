@@ -193,7 +193,7 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
 
 
 def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
-    """Return the sections of a binary file by name, up to an element with a list; the first of equal names counts."""
+    """Return the sections of a binary file by name, up to an element with a list.  Of equal names, the first counts."""
     sections: dict[str, Section] = {}
     for element in elements:
         if element.has_list:

@@ -90,7 +90,7 @@ def is_sibling(name: str) -> bool:
 class Files:
     """The files of a SOG, each of which is read only once.
 
-    They are members of a ZIP, in any folder inside it, or files in the folder of a meta.json.
+    They are members of a ZIP, in any of its folders, or files in the folder of a meta.json.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, size: int = MAX_FILE) -> None:
@@ -167,7 +167,7 @@ def read_sog(path: Path) -> SplatFile:
 
 
 def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
-    """Raise DataError if `size` bytes cannot contain `count` splats, and MemoryLimitError if memory cannot."""
+    """Raise DataError if `size` bytes cannot contain `count` splats, MemoryLimitError if the memory is too small."""
     if count > MIN_LIMIT + PIXELS_PER_BYTE * size:
         raise DataError(f"{path}: declares {count} splats, but its files have only {size} bytes; copy it again")
     require_memory(path, count, degree)

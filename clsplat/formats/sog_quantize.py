@@ -107,9 +107,9 @@ def scaled_step(rest: Floats, step: float, max_step: float) -> float:
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
-    """Return the metric of visible errors of SH [N, 3 K]: a matrix [K, K] with a trace of about K.
+    """Return the metric of visible errors of SH, [N, 3 K]: a matrix, [K, K], with a trace of about K.
 
-    The result is the same, bit for bit, for any number of threads.
+    The result is bit-identical for any number of threads.
     """
     largest = robust_max(rest)
     count = rest.shape[1] // 3
@@ -195,7 +195,7 @@ def tree_palette(
 
 
 def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Transform SH, [N, 3 K], so that their squared Euclidean distances are errors in the metric `form`, [K, K]."""
+    """Transform SH, [N, 3 K], so that squared Euclidean distances equal errors in the metric `form`, [K, K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
     table, transformed = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
@@ -283,7 +283,7 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
 
 
 def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the mask of distances, [N], below the gap that separates a sky; all are below if there is no gap."""
+    """Return a mask, [N], of the distances below the gap that separates a sky.  Without a gap, all are below."""
     ordered, count = np.sort(distances), len(distances)
     counts = np.arange(1, count + 1)
     near_counts = np.searchsorted(ordered, ordered / GAP, side="right")

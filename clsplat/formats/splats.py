@@ -187,7 +187,7 @@ def inverse_opacities(logit: Floats) -> NDArray[np.float64]:
 
 
 def logs(scales: Floats) -> NDArray[np.float32]:
-    """Return the logarithms of scales; those of 0 become FLAT_LOG_SCALE."""
+    """Return the logarithms of scales, with FLAT_LOG_SCALE for a scale of 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(scales.astype(np.float64))
     return np.where(scales == 0, FLAT_LOG_SCALE, log_scales).astype(np.float32)
@@ -225,7 +225,7 @@ def _signs(parameters: Parameters, axes: Sequence[float]) -> Parameters:
 def transform(
     parameters: Parameters, scale: float, rotation: NDArray[np.float64], translation: Any
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the tables that change by x -> scale · rotation x + translation.
+    """Return the tables that the transform x -> scale · rotation x + translation changes.
 
     Raises ValueError for a matrix that is not a rotation, and for a scale that is not positive.
     """

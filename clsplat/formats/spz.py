@@ -192,7 +192,7 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
 
 
 def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
-    """Return the bytes of the planes; values outside their range are clipped, with a warning.
+    """Return the bytes of the planes.  Values outside their range are clipped, with a warning.
 
     weights: base-2 logarithms, [N], from `log_weights`.  Gaussians with fine SH steps come first, because
     similar bytes compress better; Gaussians with equal steps keep their order.
@@ -336,7 +336,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
 
 
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
-    """Decode the bytes of an SPZ file, and return the splats and the declared axes, or ''.  Raises like `read_spz`."""
+    """Decode an SPZ file; return the splats and the declared axes, or ''.  Raises the errors of `read_spz`."""
     is_version_4 = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
     header, parameters, axes = (_decode_version_4 if is_version_4 else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)

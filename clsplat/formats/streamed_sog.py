@@ -1,7 +1,7 @@
 """Read and write streamed SOG of PlayCanvas, version 1: levels of detail in SOG files, and a tree of boxes.
 
     lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
-    a node          bound {min, max}, and two children, or as a leaf lods: by level a file, an offset and a count
+    a node          bound {min, max}, and two children; a leaf has lods: a file, an offset and a count by level
     L_i/meta.json   a SOG folder of level L with consecutive runs of leaves; level 0 is the finest
 
 A viewer chooses the level of each leaf by its distance.  Reading returns the finest level.
@@ -60,7 +60,7 @@ def read_lod(path: Path) -> SplatFile:
 
 
 def find_level_faults(path: Path) -> list[str]:
-    """Return a message for each missing or damaged file of the coarser levels; `read_lod` checks the finest."""
+    """Return a message for each missing or damaged file of the coarser levels; `read_lod` checks the finest level."""
     meta, faults = _meta(path), []
     levels = _runs(path, meta)
     unused_files: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
@@ -220,7 +220,7 @@ class Node:
 
 
 def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
-    """Build the tree of all levels, which are ordered from the finest and not empty."""
+    """Build the tree of all levels.  The levels start with the finest, and none is empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach, max_extent = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])

@@ -1,8 +1,8 @@
 """Defer Adam updates of the SH bands above 0 until a view sees their Gaussians.
 
 The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  The
-updates of a block of rows that no view sees are therefore recorded, and applied in order when a view sees the block;
-the results are bit-identical to those of immediate updates.  This covers 81 % of the values of a Gaussian of SH degree
+updates of a block of rows that no view sees are therefore recorded, and applied in order when a view sees the block.
+The results are bit-identical to those of immediate updates.  This covers 81 % of the values of a Gaussian of SH degree
 3.  Means, scales, quaternions, and opacities are not deferred, because they determine which Gaussians are visible, and
 their moments keep changing them.
 """

@@ -209,7 +209,7 @@ class Gaussians:
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The names of the tables that training changes: the parameters, and the motion if there is one."""
+        """The names of the trained tables: the parameters, and the motion if there is one."""
         return (*PARAMETERS, *([MOTION] if self.is_moving else []))
 
     @property

@@ -42,7 +42,7 @@ def examine(path: Path) -> dict[str, Any]:
     """Return a summary of a model file.
 
     Its keys include `model` (the path), `format`, `gaussians`, `sh_degree`, `mode`, `moves`, `ranges`, `bounds` in
-    scene units, counts of `degenerate` Gaussians, `findings` as text, and `valid` (whether there are no findings).
+    scene units, counts of `degenerate` Gaussians, `findings` as text, and `valid` (True without findings).
     Raises DataError if the file cannot be read.
     """
     codec = detect(model_file(path))
@@ -114,7 +114,7 @@ def verdict(report: dict[str, Any]) -> str:
 
 
 def _find_activated(model: Model) -> list[str]:
-    """Return findings about values that seem to be activated already."""
+    """Return findings about values to which the activation function seems to be applied already."""
     if len(model) < MIN_COUNT:
         return []
     findings = []

@@ -80,7 +80,7 @@ class ViewLosses:
 
 @dataclass(frozen=True)
 class ViewGradients(ViewLosses):
-    """A view's frame, its losses, and the pixel sums from which gradients follow; valid until the next view."""
+    """A view's frame, its losses, and the pixel sums from which gradients are computed; valid until the next view."""
 
     pixel_sums: Array  # [PIXEL_SUMS or more, S]
 
@@ -123,7 +123,7 @@ class PenaltyInputs:
 
     @property
     def items(self) -> int:
-        """The number of work-items of a kernel in which a work-item processes LANES Gaussians."""
+        """The number of work-items of a kernel that processes LANES Gaussians per work-item."""
         return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
 
     def sums(self, name: str) -> Array:

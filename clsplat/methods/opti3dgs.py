@@ -1,4 +1,4 @@
-"""Train on photos whose finest details return while a wavelet filter is learned (AutoOpti3DGS, Nguyen et al. 2025)."""
+"""Restore the finest details of photos while a wavelet filter is learned (AutoOpti3DGS, Nguyen et al. 2025)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

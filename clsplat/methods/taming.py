@@ -23,17 +23,17 @@ def normalize_by_median(values: NDArray[np.floating]) -> Floats:
 
 
 def pixel_weights(render: RenderedView) -> Floats:
-    """Return the error of a view's pixels plus the edges of its photograph, each scaled to [0, 1], [height, width]."""
+    """Return a view's pixel errors plus its photograph's edges, each scaled to [0, 1], [height, width]."""
     is_unmasked = render.counted_pixels()
     edges = np.abs(scipy.ndimage.laplace(render.photograph.image().mean(axis=2), mode="nearest"))
     return normalize(render.error().astype(np.float64), is_unmasked) + normalize(edges, is_unmasked)
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return two sums over sampled views for each Gaussian, [N]: of the losses, and of its terms times the loss.
+    """Return two sums over sampled views for each Gaussian, [N]: the losses, and its terms times the losses.
 
-    Only views that see the Gaussian count.  Its terms are its depth, its radius, and over the pixels where it is
-    blended, the sum of `pixel_weights`, the number of pixels, and the sum of its blend weights.
+    Only views in which the Gaussian is visible count.  Its terms are its depth, its radius, and three sums over the
+    pixels where it is blended: `pixel_weights`, the number of pixels, and its blend weights.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
     sampled_views = survey.sample_views(views)

@@ -48,7 +48,7 @@ class Network:
         return self._trunk_outputs(skip, tiles), width
 
     def direction(self, tiles: int) -> tuple[Array, int]:
-        """Return the array that contains the encoded direction, and the direction's first row, as `position` does."""
+        """Return the array that contains the encoded direction, and the direction's first row."""
         rows = self.shape.width + self.shape.direction_rows
         return self._table("direction", tiles, rows), self.shape.width
 
@@ -339,7 +339,7 @@ class Encoding:
 def parts_per_level(device: Device, levels: int) -> int:
     """Return the number of parts in which the entries of each level are summed; the sums do not depend on it.
 
-    Each part reads all samples, so that a CPU uses only enough parts to keep its cores busy.
+    Each part reads all samples, so a CPU uses only enough parts to keep its cores busy.
     """
     parts = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
     return max(1, parts // levels)

@@ -179,7 +179,7 @@ class FieldShape(Settings):
 
     @property
     def grid_rows(self) -> int:
-        """Number of rows of the grid's features, which come first in the encoded position."""
+        """The number of rows of the grid's features, which come first in the encoded position."""
         return self.grid.features if self.grid else 0
 
     @property
@@ -213,7 +213,7 @@ class FieldShape(Settings):
 
     @property
     def network_parameters(self) -> int:
-        """Number of parameters of all layers, rounded up to full lines; the grid's entries follow."""
+        """The number of parameters of all layers, rounded up to full lines.  The grid's entries follow."""
         return -(-self.layers[-1].end // LINE) * LINE
 
     @property

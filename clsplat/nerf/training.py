@@ -271,7 +271,7 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
 
 
 def _is_in_cube(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
-    """Return whether each point, [M, 3], is inside a cube, as [M] booleans."""
+    """Return a mask, [M], of the points, [M, 3], that are inside a cube."""
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 
 

@@ -254,7 +254,7 @@ class Device:
         return array
 
     def program(self, file: str | Path, **defines: int | str) -> "Program":
-        """Return the program of `cl_kernels/<file>`, or of an absolute path, which is built once per set of macros.
+        """Return the program of `cl_kernels/<file>`, or of an absolute path.  It is built once per set of macros.
 
         The macros are this device's tuning and `defines`.  Raises KernelError if the file is missing or does not build.
         """
@@ -396,7 +396,7 @@ def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> boo
 
 
 def group_multiple(kernel: Any, device: Any) -> int:
-    """Return the number of items that a device runs together; group sizes should be multiples of it."""
+    """Return the number of work-items that a device runs together.  Group sizes should be multiples of it."""
     return int(kernel.get_work_group_info(cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device))
 
 
@@ -417,7 +417,7 @@ class Kernel:
             )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch over `items`, rounded up to full work-groups, or over `groups`; if a size is 0, do nothing."""
+        """Launch with `items`, rounded up to full work-groups, or with `groups`.  If a size is 0, do nothing."""
         total = items or groups
         size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]

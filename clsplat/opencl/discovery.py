@@ -62,7 +62,7 @@ class DeviceInfo:
 def list_devices() -> list[DeviceInfo]:
     """Return all devices of all runtimes, in the loader's order.
 
-    A device that cannot be queried is left out, with a warning.
+    A device that cannot be queried is omitted, with a warning.
     """
     infos = []
     for p, platform in enumerate(platforms()):

@@ -142,7 +142,7 @@ def _loading_fault(variables: Mapping[str, str]) -> str | None:
 
 
 def _add_intel_runtime() -> None:
-    """Register Intel's CPU runtime if pip installed it: its driver file contains a placeholder path.
+    """Register Intel's CPU runtime if pip installed it, because its driver file contains a placeholder path.
 
     Unless OCL_ICD_VENDORS is set, write a folder of driver files with the system's drivers and Intel's.  On Windows,
     unless OCL_ICD_FILENAMES is set, the loader uses the library in addition to those in the registry.

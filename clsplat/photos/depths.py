@@ -86,7 +86,7 @@ class DepthMaps:
 
 
 def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
-    """Return the scale and the offset that convert values of a depth map to inverse depths; None if they do not fit.
+    """Return the scale and the offset that convert values of a depth map to inverse depths, or None if none fit.
 
     values, inverse: [K].  The fit minimizes absolute differences by iteratively reweighted least squares.
     """

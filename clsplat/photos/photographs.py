@@ -137,7 +137,7 @@ class Photographs:
         return photograph
 
     def get_usable(self, view: View, original: View, number: int | None = None) -> Photograph:
-        """Return the photograph of a view, or of the larger `original` if the mask excludes all pixels of the smaller.
+        """Return the photograph of a view, or of the larger view `original` if the mask excludes all pixels of `view`.
 
         number: the index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
         """

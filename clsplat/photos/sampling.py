@@ -119,7 +119,7 @@ class ViewSettings(Settings):
 
     @property
     def changes(self) -> list[float]:
-        """The global steps between which the downscale factor is constant or linear; empty if it never changes."""
+        """The global steps between which the downscale factor is constant or linear; empty if it is always constant."""
         resolution = self.resolution
         if isinstance(resolution, DetailDivisor):
             return [float(step) for step in resolution.changes]

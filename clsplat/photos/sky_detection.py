@@ -80,7 +80,7 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
 
 
 def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
-    """Return the initial colors of an environment map, [side * side, 3], and which texels are sky, [side * side].
+    """Return the initial colors of an environment map, [side * side, 3], and a mask of sky texels, [side * side].
 
     A texel is sky if a photograph shows sky in or near it, or if no photograph shows it.  Its color is the mean of its
     sky pixels, or that of all sky pixels if it has none.  Returns None if no photograph shows sky.

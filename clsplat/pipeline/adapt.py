@@ -1,4 +1,4 @@
-"""Choose settings based on the photos (`adapt:`): classes decide from measurements, and explain their decisions."""
+"""Choose settings based on the photos (`adapt:`).  Classes decide from measurements, and explain their decisions."""
 
 import json
 from abc import abstractmethod
@@ -116,7 +116,7 @@ class Photos(Adaptation):
 
 
 def _max_per_pixel(measures: Measures) -> tuple[float, str]:
-    """Return how many Gaussians per pixel a small set of photos can constrain, and the reason as text."""
+    """Return the number of Gaussians per pixel that a small set of photos can constrain, and the reason as text."""
     sky = measures.sky
     count = next(count for fraction, count in MAX_PER_PIXEL if (sky or 0.0) >= fraction)
     sky_text = "" if sky is None else f", {sky:.0%} of them with sky"

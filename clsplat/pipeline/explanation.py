@@ -130,7 +130,7 @@ def explain(error: ValidationError, root: type[BaseModel], path: Path, document:
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
     """Return the key path and a description of the first fault.
 
-    A misspelled key comes before a missing key, because the first often causes the second.
+    A misspelled key is reported before a missing key, because it is often the reason for it.
     """
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     key_path, model, annotation = _follow(first["loc"], root)

@@ -127,7 +127,8 @@ def load_experiment(
 ) -> Experiment | None:
     """Read and check a pipeline file with `matrix:` and all its cells; return None for a file without `matrix:`.
 
-    execution: keys that replace the file's `execution:`; the experiment's text, which may be shared, omits them.
+    execution: keys that replace the file's `execution:`.  They are omitted from the experiment's text, which may be
+    shared.
     Raises ConfigError with the file and line.
     """
     path = find(name)

@@ -85,7 +85,7 @@ class _Node:
         self.items = item_annotation(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":
-        """Return the node of a key; a missing one is created from its default.  Raises OverrideError."""
+        """Return the node of a key.  A missing node is created from its default.  Raises OverrideError."""
         if isinstance(self.data, list) and self.is_keyed(name):
             if all(item["type"] != name for item in self.data):
                 self.put(name, {}, text)

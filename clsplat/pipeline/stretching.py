@@ -46,7 +46,7 @@ class Axis:
         return min(math.floor(step * self.factor), MAX_STEP)
 
     def scale_interval(self, every: float) -> float:
-        """Return a stretched interval; 1 stays 1, and no interval becomes shorter."""
+        """Return a stretched interval.  1 stays 1, and intervals never become shorter."""
         interval = Fraction(str(every)) * self.factor
         if every == 1 or interval <= 1:
             return 1
@@ -97,9 +97,9 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
 
 
 def last_edit(training: Training) -> int:
-    """Return the last step at which Gaussians grow or the size of photos changes; 0 if the settings set no limit.
+    """Return the last step at which Gaussians are added or the size of photos changes; 0 if no setting limits it.
 
-    If training ended earlier, it would end with small photos, or before its last pruning.
+    A shorter training would end with small photos, or before its last pruning.
     """
     stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
     return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])

@@ -34,7 +34,7 @@ KeyPath = tuple[str | int, ...]
 
 @dataclass
 class Document:
-    """Plain dicts, lists, and scalars, and the line number of each value, from 1."""
+    """Plain dicts, lists, and scalars, and the line number of each value, counted from 1."""
 
     data: Any
     lines: dict[KeyPath, int] = field(default_factory=dict)

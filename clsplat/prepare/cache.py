@@ -220,7 +220,7 @@ def _find_fault(folder: Path) -> str:
 
 
 def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return the reason to run a step: a damaged result, or the difference from the newest one.  "" if it exists."""
+    """Return the reason to run a step: a damaged result, or its difference from the newest result.  "" if it exists."""
     if folder.exists():
         fault = _find_fault(folder)
         return fault and f"{fault}; the result is recomputed"

@@ -23,8 +23,8 @@ with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:
 def require_pycolmap() -> ModuleType:
     """Import and return pycolmap.  Raises ConfigError when it is not installed.
 
-    Importing pycolmap installs a SIGTERM handler that dumps and exits, and reports any exception as a broken install.
-    Therefore signals wait until the import has finished, and then get their handlers back.
+    The import installs a SIGTERM handler that dumps and exits, and reports any exception as a broken install.
+    Signals are therefore deferred until the import has finished, and their handlers are restored.
     """
     signals: list[None] = []
     try:
@@ -57,7 +57,7 @@ def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
 
 
 def images_without_features(db: Any) -> dict[int, str]:
-    """Return the names of the images without features in an open database, by image ID, in order of their names."""
+    """Return the names of the images without features in an open database, by image ID, sorted by name."""
     return {
         image.image_id: image.name
         for image in sorted(db.read_all_images(), key=lambda image: image.name)

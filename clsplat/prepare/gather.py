@@ -245,9 +245,9 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
 
 
 def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence: the number of placed photographs, their mean reprojection error, and the ones left out.
+    """Return a sentence with the number of placed photographs, their mean reprojection error, and the omitted ones.
 
-    figures: the figures of the steps, as `step_facts` returns them.  The sentence is "" if they are incomplete.
+    figures: the result of `step_facts`.  The sentence is "" if they are incomplete.
     """
     cameras = figures.get("map_cameras", {})
     try:

@@ -1,7 +1,6 @@
-"""Find cameras and points from matches with pycolmap, in several attempts until all photographs are placed.
+"""Find cameras and points from matches with pycolmap, in several attempts until all photographs have cameras.
 
-Another attempt follows if some photographs are not placed.  The model with the most photographs is kept, and the
-earliest among equal ones.
+The model with the most photographs is kept; of equal models, the earliest.
 """
 
 import logging
@@ -180,9 +179,9 @@ def _run_attempt(
 
 
 def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tuple[str, str]]) -> Path:
-    """Write the features and matches of an attempt to its database, or continue an interrupted call; return its path.
+    """Write the features and matches of an attempt to its database; return the path.  Continue an interrupted call.
 
-    The pairs depend only on the first database and the previous model, so they are the same after a killed call.
+    The pairs depend only on the first database and the previous model, so they are the same after an interruption.
     """
     database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():

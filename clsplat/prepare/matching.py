@@ -78,7 +78,7 @@ def match_features(
 
 
 def max_pair_count(photographs: int, matching: Matching, neighbors: int) -> int:
-    """Return an upper bound of the number of pairs that match_features matches for a number of photographs."""
+    """Return an upper bound on the number of pairs that match_features matches, given the number of photographs."""
     all_pairs = photographs * (photographs - 1) // 2
     is_exhaustive = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
     return all_pairs if is_exhaustive else min(all_pairs, 2 * neighbors * photographs)

@@ -89,7 +89,7 @@ def _good_pairs(pycolmap: ModuleType, db: Any, image_ids: Set[int]) -> list[_Pai
 
 
 def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
-    """Return whether the points of two photographs do not move; such pairs say nothing about the camera's motion."""
+    """Return whether the points of two photographs do not move, so that the pair does not show the camera's motion."""
     return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel)
 
 

@@ -60,7 +60,7 @@ class DeviceCamera:
 
 
 def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
-    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`; the size of planes does not change."""
+    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`.  The plane size does not change."""
     values = camera.values.copy()
     for name in ("fx", "fy"):
         values[name] = float(values[name]) * zoom
@@ -72,7 +72,7 @@ def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoo
 
 
 def update_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
-    """Return `camera` with the values of a view of the same image size, uploaded if they differ."""
+    """Return `camera` with the values of a view of the same image size.  They are uploaded only if they differ."""
     values = camera_values(view, camera.tile)
     if values == camera.values:
         return camera

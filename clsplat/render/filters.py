@@ -42,7 +42,7 @@ class WorldFilter(Settings):
 
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
-        """Write `filter_variance`, [S] scene units², for the current means.  near: minimum depth, scene units."""
+        """Write `filter_variance`, [S] scene units², for the current means.  near: minimum depth in scene units."""
 
 
 class NoWorldFilter(WorldFilter):

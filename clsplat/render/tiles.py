@@ -1,8 +1,8 @@
 """List the splats of each tile, front to back.
 
-Two algorithms produce the same result.  Radix sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in that
-order, and then sorts them stably by tile.  Bitonic emits the pairs in the order of indices, and sorts each tile by
-(depth, index).  Both break ties by index.
+Two algorithms produce the same result.  `radix` sorts the Gaussians by depth, emits their (tile, Gaussian) pairs in
+that order, and then sorts them stably by tile.  `bitonic` emits the pairs in the order of indices, and sorts each tile
+by (depth, index).  Both break ties by index.
 """
 
 import time

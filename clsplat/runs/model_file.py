@@ -382,7 +382,7 @@ class ModelFile:
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
     ) -> dict[str, Any]:
-        """Return metrics by split and downscale factor, under the keys that metrics.json uses."""
+        """Return metrics by split and downscale factor, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for downscale in downscales or [self.downscale]:
             scene = self.photographs.downscaled(downscale)

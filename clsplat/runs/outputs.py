@@ -30,7 +30,7 @@ from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write metrics.json: the results of a run, and for each stage name the first output of its last stage."""
+    """Write metrics.json: the results of a run, and the first output of the last stage of each name."""
     training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
     seconds = {
         **run.status.seconds,
@@ -171,6 +171,6 @@ def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -
 
 
 def declared_outputs(pipeline: Pipeline) -> list[str]:
-    """Return the output files that the settings of the stages name, as paths in the run folder."""
+    """Return the output files named in the settings of the stages, as paths in the run folder."""
     fields = [(stage, *entry) for stage in pipeline.stages for entry in stage.named_outputs().items()]
     return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

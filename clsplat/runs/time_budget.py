@@ -214,7 +214,7 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
 
 
 def _add_reports(settings: PipelineFile) -> PipelineFile:
-    """Return settings in which each training makes at least REPORTS reports."""
+    """Return settings in which each training run writes at least REPORTS reports."""
 
     def with_reports(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})

@@ -191,7 +191,7 @@ def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, 
 
 
 def _find_cells(out: Path, is_done: bool) -> dict[str, RunState]:
-    """Return the states of the cells' folders, by name: of existing folders, and of all cells if the matrix is done."""
+    """Return the states of the existing cell folders by name, or of all cells if the matrix is done."""
     folders = [path for path in out.iterdir() if path.is_dir() and not path.is_symlink()]
     cells = {path.name: state for path in folders if (state := RunState.read(path)).phase}
     with suppress(ConfigError):  # reported for the file of the pipeline
@@ -219,7 +219,7 @@ def verdict(result: dict[str, Any]) -> str:
 
 
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
-    """Return advice on how to restore the files of a run: from an intact checkpoint, or by starting over."""
+    """Return advice on how to restore the files of a run: from an intact checkpoint, or by starting it again."""
     if state.phase is Phase.DONE and "cells" not in state.status and not state.bad_files and PIPELINE in state.names:
         return "ignore them: all outputs are intact, and only longer training needs these files"
     intact_files = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}

@@ -383,7 +383,7 @@ class Lens:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph covers: distortion maps their rays into it and back."""
+        """A mask, [H, W], of the pixels of `pinhole` that the photograph shows: their rays map into it and back."""
         if self.is_wide:
             return np.concatenate([self._sees(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)

@@ -196,7 +196,7 @@ class _Binary:
         return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, label: str) -> int:
-        """Skip `size` bytes and return the offset of the first; `label` describes them in messages."""
+        """Skip `size` bytes and return the offset of the first byte.  label: describes them in messages."""
         available = len(self.data) - self.offset
         if size > available:
             raise DataError(
@@ -359,7 +359,7 @@ class ColmapReader(Reader):
                 parts.observed[view.name] = len(image.points)
 
     def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
-        """Return the images, renamed like their files, and the files and masks of the images."""
+        """Return the images, renamed to match their files, and the files and masks of the images."""
         folder = image_folder(path, self.root)
         root = self.root if self.root and folder.is_relative_to(self.root) else folder.parent
         files = FileLookup(root, folder, [image.name for image in images])

@@ -106,7 +106,7 @@ def _read_orientation(exif: bytes) -> int:
 
 
 def find_orientation(exif: bytes) -> int | None:
-    """Return the offset of the orientation value (2 bytes) in a TIFF block; None if the block has none."""
+    """Return the offset of the orientation value (2 bytes) in a TIFF block, or None if there is none."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
         return None
@@ -281,7 +281,7 @@ Value = float | str
 
 @dataclass(frozen=True)
 class CameraExposure:
-    """The camera settings that determine how bright a photograph is."""
+    """The camera settings that determine the brightness of a photograph."""
 
     seconds: float
     aperture: float  # f-number

@@ -141,7 +141,7 @@ class FileLookup:
         return False
 
     def _target(self, name: str) -> Parts:
-        """Return the normalized parts of the path of a name, relative to `root` if possible; () for an invalid name."""
+        """Return the normalized parts of a name's path, relative to `root` if possible, or () for an invalid name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
         if not parts or parts[-1] == ".." or min(name) < " ":

@@ -54,7 +54,7 @@ LOG = logging.getLogger("clsplat")
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
-    """Return the mask file of each image, called `NAME.jpg.png` (as by COLMAP) or `NAME.png`; None without a mask."""
+    """Return the mask file of each image, `NAME.jpg.png` (as in COLMAP) or `NAME.png`; None without a mask."""
     if not folder.is_dir():
         return [None] * len(names)
     files = FileLookup(folder, folder, names, _mask_names, strict=True)

@@ -95,7 +95,7 @@ def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArr
 
 
 def _neighbors(i: int, views: Sequence[View]) -> list[int]:
-    """Return the indices of the views nearest to the i-th, of which the viewing directions differ by at most 60°."""
+    """Return the indices of the views nearest to view i whose viewing directions differ from its by at most 60°."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
     similar_views = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
     return sorted(similar_views, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]

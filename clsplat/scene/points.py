@@ -44,7 +44,7 @@ class PointTable(NamedTuple):
     def cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the finite points, and log how many points are dropped.
 
-        clock: the clock of the frames; without it, the points have no times.  Raises DataError for times in another
+        clock: the clock of the frames.  Without it, the points have no times.  Raises DataError for times in another
         unit.
         """
         finite, times = self.is_finite(), None

@@ -34,7 +34,7 @@ class Measures:
 
     @cached_property
     def sky(self) -> float | None:
-        """The fraction of the training photographs that show the sky; None: unknown.  The first use reads them all."""
+        """The fraction of training photographs that show the sky, or None if unknown.  The first access reads all."""
         return self.measure_sky()
 
 
@@ -58,7 +58,7 @@ def near_depth(scene: Scene) -> float | None:
 
 
 def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
-    """Return the depths of the points that a view observes, [K], scene units."""
+    """Return the depths of the points that a view observes, [K] scene units."""
     if scene.tracks is None:
         return points_in_image(view, scene.points)
     points = scene.tracks.positions[scene.tracks.rows.get(view.name, [])]
@@ -67,7 +67,7 @@ def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
 
 
 def points_in_image(view: View, cloud: PointCloud | None) -> NDArray[np.float64]:
-    """Return the depths of the points inside the image of a view, [K], scene units; only a sample of a large cloud."""
+    """Return the depths of the points inside the image of a view, [K] scene units.  Large clouds are sampled."""
     points = np.zeros((0, 3)) if cloud is None else cloud.positions
     points = np.asarray(points[:: 1 + len(points) // MAX_POINTS], np.float64)
     x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]

@@ -29,7 +29,7 @@ LOG = logging.getLogger("clsplat")
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points from structure from motion, and the photographs that show them."""
+    """Structure-from-motion points, and the photographs that show them."""
 
     positions: NDArray[np.floating]  # [M, 3], scene units
     rows: Mapping[str, NDArray[np.int64]]  # rows of `positions` by view name, in order of the point ids
@@ -298,7 +298,7 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     """Return the radius of the cameras: 1.1 x the largest distance of a camera from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
-    have the same center, the result is the median distance of the points from it, or without points its distance from
+    have the same center, the result is the median distance of the points from it or, without points, its distance from
     zero.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]

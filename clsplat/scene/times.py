@@ -21,7 +21,7 @@ class Clock:
     def normalize_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the timestamps of the points of the file `path` as times in [0, 1], in the same shape.
 
-        Raises DataError if some are outside of the range of the scene by more than a single-precision rounding error.
+        Raises DataError if some are outside the range of the scene by more than a single-precision rounding error.
         """
         span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
         slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)

@@ -110,7 +110,7 @@ class Transforms:
         return read_points_ply(path, clock) if path else None
 
     def points_path(self) -> Path | None:
-        """Return the path of the points: `ply_file_path`, or else `points3d.ply` if it exists; None without both."""
+        """Return the path of the points: `ply_file_path`, else `points3d.ply` if it exists, else None."""
         name = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
         if name is not None:
             return safe_join(self.path.parent, name, str(self.path))
@@ -137,7 +137,7 @@ class FrameFiles(FileLookup):
     def views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
         """Return the views of the frames with photographs.
 
-        missing: what to do about missing photographs.  Raises DataError for invalid values and missing files.
+        missing: how to handle missing photographs.  Raises DataError for invalid values and missing files.
         """
         rows = self.existing_indices(source, missing)
         self.find_masks(source, rows)

@@ -176,7 +176,7 @@ class _NameIndex:
 
 
 def _path_suffixes(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Yield every end of each path, as parts, with the index of the path."""
+    """Yield every suffix of each path as a tuple of parts, with the index of the path."""
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
@@ -289,7 +289,7 @@ class Split:
     def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
         """Return the scene with some of its training views moved to the validation views.
 
-        left_out: names of views that are not in the scene because of `train`.  Raises DataError like `apply`.
+        left_out: names of views that are not in the scene because of `train`.  Raises the errors of `apply`.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
@@ -308,7 +308,7 @@ class Split:
 
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
-    """Return the scene with the views at the indices `test` as test views, and with the extent of the others."""
+    """Return the scene with the views at the indices `test` as test views.  The extent is that of the other views."""
     train = remaining_views(scene.path, len(scene.views), test)
     points = None if scene.points is None else scene.points.positions
     extent = camera_extent([scene.views[i] for i in train], points)
@@ -318,7 +318,7 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
 def _select_training(
     scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
 ) -> set[int]:
-    """Return the indices of the selected training views; key: the name of the setting, for messages."""
+    """Return the indices of the selected training views.  key: the name of the setting, for messages."""
     names = [scene.views[i].name for i in scene.train]
     test_names = [scene.views[i].name for i in scene.test]
     excluded: ExcludedNames = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
@@ -346,7 +346,7 @@ def _select(
 
 
 def _validation_fold(scene: Scene) -> set[int]:
-    """Return the indices of the views of every 8th training photograph by name, and of at least two photographs."""
+    """Return the indices of the views of every 8th training photograph, sorted by name; at least two photographs."""
     names = [photograph_name(scene.views[i].name) for i in scene.train]
     order = sorted(set(names))
     count = len(order)

@@ -93,7 +93,7 @@ def advise_on_training_views(
 def advise_on_fit(
     metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, rerun: str, train_longer: str
 ) -> Iterator[str]:
-    """Yield advice if the model overfits, if its growth was limited, or if it fits the photos badly, in this order.
+    """Yield advice if the model overfits, if its growth was limited, or if it fits the photos poorly, in this order.
 
     growth: the limit that stopped growth, and the command that trains without it.  rerun: the command that repeats the
     run.  train_longer: the command that trains longer.

@@ -188,7 +188,7 @@ class ValidatedTraining(Training):
 
 
 def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of averages in dB, or None; in the photographs' colors if all averages have it for all views."""
+    """Return the PSNR of averages in dB, or None.  It is after color fitting if all views of all averages have one."""
     has_color = all(
         average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
     )
@@ -344,7 +344,7 @@ class Optimize(ValidatedTraining):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that penalties and rules read in addition to the parameters."""
+        """The tables of the Gaussians that penalties and rules read in addition to the parameters."""
         parts: list[Penalty | Densify] = [*(loss for loss in self.losses if isinstance(loss, Penalty)), *self._density]
         return {name for part in parts for name in part.tables}
 
@@ -372,7 +372,7 @@ class Optimize(ValidatedTraining):
         return StepTrainer(*parts, *settings, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
-        """Run the edits that were due at the previous step."""
+        """Run the edits due at the previous step."""
         if run.stage_step == 0 or run.edited:
             return
         run.image_downscale = views.divisor(run.step)

@@ -214,7 +214,7 @@ class VisibleError:
         return points
 
     def _optimal_vectors(self, products: Floats, labels: NDArray[np.int64], vectors: Floats) -> Floats:
-        """Return the optimal vector for the Gaussians of each label; sums are in the order of the Gaussians."""
+        """Return the optimal vector for the Gaussians of each label.  Sums are in the order of the Gaussians."""
         entries, size = len(vectors), self.mean.shape[1]
         i, j = np.triu_indices(size)
         form, right_sides = np.empty((entries, size, size)), np.empty(vectors.shape)

@@ -53,7 +53,7 @@ class Render(Stage):
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
-    """Return the paths of the renders of views.  Views whose names differ only in their suffix keep it."""
+    """Return the paths of the renders of views.  Views whose names differ only in the suffix keep their suffix."""
     paths = [image_path(folder, view, suffix) for view in views]
     counts = Counter(paths)
     return [path if counts[path] == 1 else folder / f"{view}{suffix}" for path, view in zip(paths, views, strict=True)]
@@ -66,7 +66,7 @@ def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
 
 
 class Viewer(Stage):
-    """Write a page that shows the model from any viewpoint and next to its photos; it opens offline in any browser.
+    """Write a page that shows the model from any viewpoint and next to its photos, and opens offline in any browser.
 
     If the page would exceed 200 MB, it shows only the most important Gaussians, with a warning.
     """

@@ -29,7 +29,7 @@ from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 
 
 def cameras(run: Run) -> list[Markup]:
-    """Draw the cameras of each split, and the Gaussians around them, from above and from the side."""
+    """Draw the cameras of each split and the Gaussians around them, from above and from the side."""
     points = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     return safe_charts(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
 
@@ -62,7 +62,7 @@ def training_charts(run: Run) -> list[Markup]:
 
 
 def _psnr_lines(run: Run, trial: bool = False) -> list[Line]:
-    """Return the measured PSNR of each split over the steps, by the last measurement of each step.
+    """Return the measured PSNR of each split over the steps; the last measurement of a step counts.
 
     trial: whether to return the PSNR of the training before a refit.
     """

@@ -197,7 +197,7 @@ class Batch:
 
 
 def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
-    """Let running cells save their state and stop.  Before the first cell, and at the second signal, stop at once."""
+    """Let running cells save their state and stop.  Stop immediately before the first cell and at the second signal."""
     if stop.is_set() or not has_started.is_set():
         stop_at_once()
     stop.set()

@@ -48,7 +48,7 @@ def code_digest() -> str:
 
 @cache
 def tools_digest() -> str:
-    """Return a hash of the versions of further libraries that affect the output of `prepare`."""
+    """Return a hash of the versions of other libraries that affect the output of `prepare`."""
     return _digest(_versions("pycolmap"))
 
 

@@ -29,7 +29,7 @@ PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
     """Return the command that executes a run on a device.  The run ends when its standard input is closed.
 
-    The option -P keeps the working folder out of the import path.
+    The option -P removes the working folder from the import path.
     """
     plugin_options = [argument for path in plugins for argument in ("--plugin", str(path))]
     device_options = ["--device", device] if device else []

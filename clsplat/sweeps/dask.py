@@ -1,7 +1,7 @@
 """Run cells with Dask: on a cluster of this machine, or through a scheduler elsewhere.
 
 Dask keeps track of workers and provides a queue.  The store makes it possible to resume and stop cells, and accepts one
-result per cell.  Each device has at most one cell at a time, because a worker that dies loses all cells in its queue.
+result per cell.  Each device has at most one cell at a time, because a worker that crashes loses its entire queue.
 """
 
 import asyncio
@@ -55,7 +55,7 @@ SETTINGS = {
 
 
 def require_certificates(tls: Tls) -> None:
-    """Raise ConfigError, which names the file, if a file cannot be read, or if key and certificate do not match."""
+    """Raise ConfigError with the path if a file cannot be read, or if key and certificate do not match."""
     for key in ("ca", "cert", "key"):
         try:
             read_file(Path(getattr(tls, key)))

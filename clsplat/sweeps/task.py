@@ -1,4 +1,4 @@
-"""Run a cell in one or more attempts until it is published, has failed, or is stopped; used by all engines."""
+"""Run a cell in one or more attempts until it is published, fails, or is stopped.  All engines use this module."""
 
 import logging
 import os

@@ -253,7 +253,7 @@ def attach_gradients(gaussians: Gaussians) -> None:
 
 
 def add_gradients(gaussians: Gaussians, gradients: GaussianGradients) -> GaussianGradients:
-    """Add the gradients of a view to the mean, and return the mean; the next call overwrites it."""
+    """Add the gradients of a view to the mean, and return the mean, which the next call overwrites."""
     _add_to_mean(gaussians, {name: gradients[name] for name in gaussians.trained}, GRADIENT, VIEWS)
     return gradients.replace({name: gaussians[GRADIENT + name] for name in gaussians.trained})
 
@@ -287,7 +287,7 @@ def add_to_average(gaussians: Gaussians) -> None:
 
 
 def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], prefix: str, counts: str) -> None:
-    """Add values, keyed by parameter, to the means in the tables with this prefix.  counts: table of counts by row."""
+    """Add values, by parameter, to the means in the tables with this prefix.  counts: table of counts by row."""
     program, count = gaussians.device.program("average.cl"), gaussians.count
     for name, array in values.items():
         program.add_to_average(

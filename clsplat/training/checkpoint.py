@@ -88,7 +88,7 @@ class State(BaseModel):
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
-        """Return whether the current stage has done all its steps in a resolved pipeline."""
+        """Return whether the current stage has completed all its steps in a resolved pipeline."""
         (stage,) = pipeline["stages"][self.stage_index].values()
         return bool(stage.get("steps") == self.stage_step)
 
@@ -155,7 +155,7 @@ def copy_model(run: Run) -> Tables:
 
 
 def restore_best(run: Run, tables: Tables, best: Best) -> None:
-    """Replace the run's model by the copy of its best model."""
+    """Replace the run's model with the copy of its best model."""
     from_modules, parameters = split(tables, MODULES)
     reload_modules(run, best.modules, from_modules)
     run.model = run.model_settings.model(Gaussians(run.device, parameters), best.degree)

@@ -14,7 +14,7 @@ VIEWS = 16  # number of views rendered to measure the fraction of visible Gaussi
 
 
 def offload_harmonics(run: Run) -> None:
-    """Move the harmonics to the host before training, if the settings require it or they do not fit on the device.
+    """Move the harmonics to the host before training if the settings require it, or if they do not fit on the device.
 
     Call this before Adam allocates their moments, which need twice the memory of the harmonics.
     """

@@ -84,7 +84,7 @@ class Stage(Settings):
     def act(self, run: Run) -> None:
         """Run the stage and report it in status.json.  A failure during an edit leaves the run inconsistent.
 
-        A failed stage is repeated from its start on resume, so its records are dropped.
+        On resume, a failed stage is repeated from its start, so its records are dropped.
         """
         edit = run.editing_tables() if self.edits else nullcontext()
         with run.status.stage(self.stage), edit, run.records.stage():

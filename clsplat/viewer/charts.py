@@ -191,7 +191,7 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
     """Return SVG plans of cameras, and of points around them, [N, 3]: from above and from the side.
 
     views: groups of views by their name in the legend.  Each camera shows its name on hover.
-    There are no plans for fewer than two cameras.
+    The result is empty for fewer than two cameras.
     """
     views = {name: group for name, group in views.items() if group}
     all_views = [view for group in views.values() for view in group]

@@ -151,7 +151,7 @@ def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
 
 
 def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
-    """Pack the three smaller components of unit quaternions (x, y, z, w), with the largest made positive, [N]."""
+    """Pack the three smaller components of unit quaternions (x, y, z, w), whose largest is made positive, [N]."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     largest, smaller = smallest_three(unit)

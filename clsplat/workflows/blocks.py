@@ -78,7 +78,7 @@ def block_seconds(
 
 
 def _gaussian_range(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the initial and the maximum number of Gaussians of a block; without a limit, the latter is a guess."""
+    """Return the initial and the maximum number of Gaussians of a block.  Without a limit, the maximum is a guess."""
     initial_count, pixels = int(block.start.sum()), size[0] * size[1]
     limits = [
         max_gaussians(stage, pixels) or block.pairs * MAX_PER_PIXEL * pixels for stage in _optimize_stages(pipeline)

@@ -36,7 +36,7 @@ SOG_FOLDER, SOG = "fitted", "model.sog"
 
 @dataclass(frozen=True)
 class Ladder:
-    """Prunes and fine-tunes a model in steps, the rungs, each in its run folder."""
+    """Prunes and fine-tunes a model in steps, called rungs, each in a separate run folder."""
 
     out: Path
     tuning: Tuning
@@ -256,7 +256,7 @@ class Search:
         return self.target.best(self.points, self.source.psnr)
 
     def data(self) -> dict[str, Any]:
-        """Return the record of the search as JSON data."""
+        """Return the record of the search as data for JSON."""
         chosen = self.chosen
         return {
             **self.identity,

@@ -159,8 +159,8 @@ LABELS = {"sha256": "the model's bytes"}  # of keys of an identity, for messages
 def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str, remedy: str) -> Iterator[None]:
     """Create and lock a folder, write the identity of the work to its record, and remove files of killed processes.
 
-    identity: inputs and options of the work, by key; content: a noun for messages, such as "a search"; remedy: what to
-    give instead of this folder.
+    identity: inputs and options of the work, by key; content: a noun for messages, such as "a search"; remedy: the
+    alternative to this folder, such as "another --out".
     Raises ConfigError if the folder belongs to something else, and OutputError if another process uses it.
     """
     _require_same_identity(out, identity, record, content, remedy)

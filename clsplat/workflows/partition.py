@@ -130,7 +130,7 @@ class Membership:
 
     @property
     def assignment(self) -> NDArray[np.bool_]:
-        """Whether each view trains each block, [V, B]: `view_blocks`, and at least one view for each block."""
+        """Whether each view trains each block, [V, B]: pairs in `view_blocks`, and at least one view for each block."""
         blocks = self.view_blocks
         for block in np.flatnonzero(~blocks.any(axis=0)):
             blocks[self.coverage[:, block].argmax(), block] = True

@@ -92,7 +92,7 @@ def check_grid(
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
-    """Compare the smoothness of a grid, and three updates of it, which do not change the other grids."""
+    """Compare the smoothness of a grid and three updates, and check that the other grids do not change."""
     label, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = random_grids(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)

@@ -58,7 +58,7 @@ def flatten_map(texels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare an image and the gradient of the map; finished pixels have a negative transmittance."""
+    """Compare an image and the gradient of the map.  Finished pixels have a negative transmittance."""
     view, label = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels per side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)

@@ -259,7 +259,7 @@ def train(
 ) -> dict[str, NDArray[np.float32]]:
     """Update a model once for each view, and return the harmonics and their moments.
 
-    seen: for each view, the mask of visible rows, [N]; gradients: those of the harmonics, [N, components].
+    seen: for each view, the mask of visible rows, [N]; gradients: of the harmonics, [N, components].
     """
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)

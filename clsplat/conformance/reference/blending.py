@@ -37,7 +37,7 @@ def density(x: Floats) -> Floats:
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
-    """Return the mass of a normal distribution within ½ of `dy`, and the mean and variance of this part.
+    """Return the mass of a normal distribution within ½ of `dy`, and its mean and variance there.
 
     dy: at least 0, in px; s: standard deviation, in px.
     """
@@ -334,7 +334,7 @@ def inverse_depth_loss(
 
 
 def overlay(layer: NDArray[Any], transmittance: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """Return the composite of a layer on black, [3, H, W], and an image behind it; further planes are unchanged."""
+    """Return the composite of a layer on black, [3, H, W], and an image behind it.  Other planes are unchanged."""
     return np.concatenate([layer + transmittance * image[:3], image[3:]])
 
 

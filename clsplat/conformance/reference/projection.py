@@ -416,7 +416,7 @@ def pose_gradient(
 def focal_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
 ) -> float:
-    """Return dL/dfx (axis 0) or dL/dfy (axis 1), through the screen position and through J.
+    """Return dL/dfx (axis 0) or dL/dfy (axis 1), including the paths through the screen position and through J.
 
     The limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
     """

@@ -24,7 +24,7 @@ def adam_step(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the new parameter and moments (Kingma and Ba 2015), with epsilon outside the root, as in PyTorch.
 
-    step: number of the update, from 1; seen: mask of the rows to update, [N], all if it is None.
+    step: number of the update, from 1; seen: mask of the rows to update, [N], or None for all.
     """
     first = beta1 * moment1 + (1 - beta1) * grad
     second = beta2 * moment2 + (1 - beta2) * grad**2
@@ -199,7 +199,7 @@ def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
 
 
 def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
-    """Lift screen matrices, [N,2,2], to the scene, [N,3,3], with the splat's shape held constant."""
+    """Lift screen matrices, [N,2,2], to the scene, [N,3,3], keeping the splat's shape constant."""
     matrices = np.zeros((len(on_screen), 3, 3))
     for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
         jacobian = mean_jacobian(camera, gaussians.means[n])

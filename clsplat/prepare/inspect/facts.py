@@ -1,4 +1,4 @@
-"""Measure the properties of a dataset that decide whether and how well it trains."""
+"""Measure the properties of a dataset that determine whether and how well it can be trained on."""
 
 import logging
 import os
@@ -307,7 +307,7 @@ class Facts:
 
     @property
     def few_points(self) -> list[str]:
-        """Names of the views that show fewer than MIN_SEEN points, in ascending order of the number of points."""
+        """The names of the views that show fewer than MIN_SEEN points, in ascending order of the number of points."""
         counts = self.points_per_view
         return sorted((name for name, count in counts.items() if count < MIN_SEEN), key=counts.__getitem__)
 
@@ -492,7 +492,7 @@ def read_parts(path: Path) -> Parts:
 
 
 def _list_photographs(parts: Parts) -> None:
-    """List the photographs in a folder without cameras, and the warnings that the preparation would log."""
+    """List the photographs in a folder without cameras, and the warnings that preparing them would log."""
     parts.on_disk = list(image_files(parts.path, recursive=True))
     with captured_log(logging.WARNING) as parts.left_out:
         try:

@@ -272,7 +272,7 @@ def _check_coverage(points: PointFacts) -> Iterator[Finding]:
 
 
 def _are(count: int, word: str, prefix: str = "") -> str:
-    """Return a count with a noun and its verb: `3 views are`, or with a prefix: `are only 3 views`."""
+    """Return a count with a noun and a verb, such as `3 views are`, or `are only 3 views` with a prefix."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {prefix}{pluralize(count, word)}" if prefix else f"{pluralize(count, word)} {verb}"
 
@@ -298,12 +298,12 @@ class Inspection:
 
     @property
     def trainable(self) -> bool:
-        """Whether the dataset can be trained on as it is; photographs without cameras cannot."""
+        """Whether training can use the dataset unchanged, which is not the case for photographs without cameras."""
         return self.next_step is None and all(finding.level != "error" for finding in self.findings)
 
     @property
     def next_step(self) -> str | None:
-        """How to find the cameras of photographs.  None for datasets with cameras and for unusable photographs."""
+        """Advice on finding the cameras of photographs.  None for datasets with cameras and unusable photographs."""
         facts = self.facts
         if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
             return None
@@ -313,7 +313,7 @@ class Inspection:
 
     @property
     def verdict(self) -> str:
-        """The findings in one sentence: the first error or warning, and the number of further ones."""
+        """The findings in one sentence: the first error or warning, and the number of others."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
         findings, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
         more = f" (and {pluralize(len(findings) - 1, f'more {kind}')})" if len(findings) > 1 else ""

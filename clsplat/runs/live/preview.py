@@ -221,7 +221,7 @@ PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
 
 class Pictures:
-    """Reads photos as JPEG, one at a time; the CPU time is subtracted from the budget of previews."""
+    """Reads photos as JPEG, one at a time.  The CPU time is subtracted from the budget of the previews."""
 
     def __init__(
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit

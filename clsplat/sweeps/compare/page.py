@@ -42,7 +42,7 @@ MAX_SEEDS = 3  # of more seeds, only the number is shown
 
 @dataclass(frozen=True)
 class TableCell:
-    """A mean as text, with the standard deviation if there is more than one run."""
+    """A mean formatted as text, with the standard deviation if there is more than one run."""
 
     text: str
     deviation: str = ""
@@ -159,7 +159,7 @@ def _measured_sizes(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
 
 
 def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
-    """Return a list with the group of test metrics at the training size; empty if they were not measured."""
+    """Return the column group of test metrics at the training size as a list; empty if they were not measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 
@@ -372,7 +372,7 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
 
 
 def _sizes(scene: SceneSettings) -> list[str]:
-    """Return an explanation of image sizes as a list; empty if all training images had full size."""
+    """Return an explanation of the image sizes as a list of one line; empty if all training images had full size."""
     first, *others = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
     if first == "full size" and not others:
         return []

@@ -52,8 +52,8 @@ class CameraOptimizer(TrainingModule):
     with photographs use the dataset's cameras.
 
     With `focal`, the photographs of one camera share a factor for both of its focal lengths; the principal point is
-    fixed.  Factors are not centered, so a single camera can change.  Leave `focal` out if cameras move straight ahead,
-    where a focal length is hard to distinguish from depth.
+    fixed.  Factors are not centered, so a single camera can change.  Omit `focal` if cameras move straight ahead,
+    because focal length is then hard to distinguish from depth.
 
     Use this module for poses from a phone's tracking, or if the reprojection errors of structure from motion exceed a
     pixel.  Otherwise, the poses from structure from motion are usually better than optimized poses.
@@ -277,7 +277,7 @@ class CameraState(ModuleState):
         return replace_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
 
     def write(self, run: Run) -> None:
-        """Write the pose of each photograph, and log how far the cameras moved."""
+        """Write the pose of each photograph, and log the distances that the cameras moved."""
         views, names = self.apply_to(run.original).views, {view.name for view in self.views}
         cameras = self.zoomed_cameras
         data = {

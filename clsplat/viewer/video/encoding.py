@@ -51,7 +51,7 @@ def _find_uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 def _read_integer(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
-    """Read an EBML variable-length integer, with or without its length marker; return it and the offset of its end."""
+    """Read an EBML variable-length integer with or without its length marker; return it and the end offset."""
     length = 9 - data[start].bit_length() if start < len(data) else 1
     value = int.from_bytes(data[start : start + length], "big")
     return (value if keep_marker else value & ((1 << (7 * length)) - 1)), start + length

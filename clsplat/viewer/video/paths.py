@@ -131,7 +131,7 @@ ROUNDS = 20  # of 2-opt
 
 
 def tour_order(rig: Rig) -> Indices:
-    """Return the indices of the views, [V], sorted by name, or from neighbor to neighbor if that tour is shorter."""
+    """Return the indices of the views, [V], sorted by name, or as a nearest-neighbor tour if that is shorter."""
     spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
     features = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
@@ -217,7 +217,7 @@ def check_size(size: str | Size) -> Size:
 
 
 def validate_size(text: str) -> str:
-    """Return a frame size unchanged.  Raises ValueError, as validators do, if it is invalid."""
+    """Return a frame size unchanged.  Raises ValueError, as a validator must, if the size is invalid."""
     try:
         check_size(text)
     except ConfigError as error:
@@ -337,7 +337,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Fly along the views on a smooth curve, by name or from neighbor to neighbor, whichever is shorter."""
+    """Fly along the views on a smooth curve, in order of name or as a nearest-neighbor tour, whichever is shorter."""
     order = tour_order(rig)
     distance = float(np.median(rig.depths))
     keyframes = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[order]
@@ -409,7 +409,7 @@ def _sweep_angles(angles: Floats, frames: int) -> Floats:
 
 
 def _widest_gap(angles: Floats) -> tuple[float, float]:
-    """Return the widest angle without a camera, and the angle of the camera after it, rad."""
+    """Return the widest angle without a camera, and the angle of the camera after it, in radians."""
     ring = np.sort(angles % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
     widest = int(gaps.argmax())

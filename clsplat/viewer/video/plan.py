@@ -51,7 +51,7 @@ def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
 
 
 def with_times(views: Sequence[View], times: Times) -> list[View]:
-    """Return views with evenly spaced timestamps from the first to the last; a single view gets the first."""
+    """Return views with evenly spaced timestamps from the first to the last time.  A single view gets the first."""
     return [replace(view, time=float(time)) for view, time in zip(views, np.linspace(*times, len(views)), strict=True)]
 
 
@@ -173,7 +173,7 @@ def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origi
 
 
 def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
-    """Return the video file of each layer, of which `video` is for the color.  Raises ConfigError for invalid names."""
+    """Return the video file of each layer; `video` is the file of the color.  Raises ConfigError for invalid names."""
     files = {
         layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
         for layer in layers
