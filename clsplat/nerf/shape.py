@@ -122,9 +122,9 @@ class FieldShape(Settings):
         in_one_sentence(f"expected 'auto' or a length from {1 / UNIT_MAX:g} to {UNIT_MAX:g}"),
     ] = "auto"
     """The unit of all lengths in the field, in scene units; `auto`: the median distance of the training cameras from
-    the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes the number."""
+    the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes the length."""
     unit_auto: UnitLength | None = None
-    """Written by a run: the number that `auto` chose.  Other photos choose again while `unit` is that number."""
+    """Written by a run: the length that `auto` chose.  With other photos, `unit` is chosen again if it equals this."""
     near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
     """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
     far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0

@@ -111,10 +111,10 @@ class ValidatedTraining(Training):
     def check_pipeline(self, pipeline: Any) -> None:
         if self.keep == "best" and pipeline.scene.validation == 0:
             raise ConfigError("optimize.keep: best needs validation views; set scene.validation: auto")
-        trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
-        if self.refit and (count := sum(isinstance(stage, ValidatedTraining) for stage in trainings)) > 1:
+        training_stages = [stage for stage in pipeline.stages if isinstance(stage, Training)]
+        if self.refit and (count := sum(isinstance(stage, ValidatedTraining) for stage in training_stages)) > 1:
             raise ConfigError(f"optimize.refit: expected a single stage that trains, got {count}")
-        earlier_stages = list(itertools.takewhile(lambda stage: stage is not self, trainings))
+        earlier_stages = list(itertools.takewhile(lambda stage: stage is not self, training_stages))
         if not any(getattr(stage, "patience", None) for stage in earlier_stages):  # else the first step is unknown
             self.require_measurement(sum(stage.steps for stage in earlier_stages))
 
